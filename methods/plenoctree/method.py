@@ -1,4 +1,5 @@
-"""PlenOctree, as a `bench.types.Method`."""
+"""PlenOctree, as a `bench.types.Method`: its leaves learn from random rays of the photos, with Adam
+(Yu et al. 2021, Section 4.2)."""
 
 from __future__ import annotations
 
@@ -8,19 +9,121 @@ from typing import Literal
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from bench.study import Axis, Study, Variant, turned
 from bench.types import Budget, Probe, Rays, Scene
 from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import TrainedField
+from methods.instant_ngp.training import PixelOptions, PixelTraining
+from methods.kernels.adam import AdamState, sparse_adam_
+from methods.kernels.composite import STOP, composite, visible
 from methods.kernels.types import Occupancy, Pixels, expect
-from methods.plenoctree.kernels.voxel_light import render_voxels
+from methods.kernels.voxel_walk import walk
+from methods.plenoctree.kernels.voxel_light import render_voxels, shade_voxels
 from methods.plenoctree.octree import Extraction, Octree, extract
-from methods.plenoctree.training import OctreeLessons, OctreeTraining
 from methods.rendering.compaction import to_host
 from methods.rendering.frame import Render
 from methods.rendering.sampling import Sampling
 from methods.students.method import Student
+
+
+@dataclass(frozen=True)
+class OctreeLessons(PixelOptions):
+    """How to train leaves, as `sweeps/configs/method/plenoctree.yaml` explains. `rate` is that of
+    the harmonics; `samples` are more than those of a field, each of which changes the whole
+    network."""
+
+    rate: float = 1e-2
+    density_rate: float = 0.03
+    samples: int = 1 << 17
+    final_rate: float = 0.1
+    opacity_entropy: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        expect(self.density_rate >= 0, "density_rate", "0 or more", self.density_rate)
+        expect(self.samples >= 1, "samples", "1 or more", self.samples)
+
+
+class OctreeTraining(PixelTraining):
+    """Trains the leaves that rays see; their set is fixed."""
+
+    options: OctreeLessons
+
+    def __init__(
+        self,
+        octree: Octree,
+        scene: Scene,
+        budget: Budget,
+        options: OctreeLessons,
+        seed: int,
+        backend: str = "auto",
+    ) -> None:
+        device = octree.light.density.device
+        super().__init__(scene, device, budget.renderer_steps, options.samples, options, seed)
+        self.backend = backend
+        self._take(octree)
+
+    def _take(self, octree: Octree) -> None:
+        self.octree = octree
+        light = octree.light
+        # As tables of one and of 3 C columns, for Adam.
+        self.tables = {"density": light.density[:, None], "harmonics": light.harmonics.flatten(1)}
+        self.gradients = {name: torch.zeros_like(table) for name, table in self.tables.items()}
+        self.moments = {name: AdamState.like(table) for name, table in self.tables.items()}
+
+    def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
+        # `jitter` moves samples; where a ray crosses a voxel is fixed.
+        light, backend = self.octree.light, self.backend
+        crossings = walk(rays, self.octree.voxels, backend=backend)
+        sigma = light.density[crossings.voxel].relu()
+        counts, _ = visible(sigma, crossings, stop=STOP, backend=backend)
+        crossings = crossings.front(counts)
+        self._sigma = light.density[crossings.voxel].requires_grad_()
+        self.visited = crossings.voxel  # [S] int32
+        colours = shade_voxels(
+            light.harmonics,
+            crossings.voxel,
+            crossings.ray,
+            functional.normalize(rays.directions, dim=1),
+            grad_buffer=self.gradients["harmonics"].view_as(light.harmonics),
+            backend=backend,
+        )
+        pixels = composite(self._sigma.relu(), colours, crossings, stop=STOP, backend=backend)
+        return pixels.over(background), len(crossings)
+
+    def _update(self) -> None:
+        if self._sigma.grad is not None:
+            self.gradients["density"].view(-1).index_add_(0, self.visited, self._sigma.grad)
+        rate = self.learning_rate()
+        # A leaf's optical thickness is its density times its width.
+        width = 1 / self.octree.voxels.resolution
+        rates = {"harmonics": rate, "density": rate / self.options.rate}
+        rates["density"] *= self.options.density_rate / width
+        for name, table in self.tables.items():
+            given = table, self.gradients[name], self.moments[name], rates[name]
+            sparse_adam_(*given, backend=self.backend)
+
+    def watched(self) -> dict[str, Tensor]:
+        return self.tables
+
+    def result(self) -> dict[str, Tensor]:
+        return self.octree.tensors()
+
+    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+        self._take(Octree.of(tensors, self.octree.light.density.device))
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
+        tensors, figures = super().state()
+        for name, adam in self.moments.items():
+            tensors |= adam.tensors(f"{name}.")
+        return tensors, figures
+
+    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
+        super().restore(tensors, figures)
+        device = self.octree.light.density.device
+        self.moments = {name: AdamState.of(tensors, f"{name}.", device) for name in self.tables}
 
 
 @dataclass(kw_only=True, eq=False)

@@ -40,9 +40,8 @@ from methods.nerf.field import NerfField
 from methods.nerf.method import Nerf
 from methods.nsvf.field import NsvfField
 from methods.nsvf.method import Nsvf
-from methods.plenoctree.method import PlenOctree
+from methods.plenoctree.method import OctreeLessons, PlenOctree
 from methods.plenoctree.octree import Extraction
-from methods.plenoctree.training import OctreeLessons
 from methods.rendering import field, rays
 from methods.rendering.occupancy import EVERY, STEP
 from methods.steernerf.method import SteerNerf

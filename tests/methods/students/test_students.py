@@ -19,9 +19,8 @@ from methods.instant_ngp.stage1 import train_field
 from methods.kilonerf.method import KiloLessons, KiloNerf
 from methods.nerf.method import Nerf
 from methods.nsvf.method import Nsvf
-from methods.plenoctree.method import PlenOctree
+from methods.plenoctree.method import OctreeLessons, PlenOctree
 from methods.plenoctree.octree import Extraction
-from methods.plenoctree.training import OctreeLessons
 from methods.students.method import Student
 from methods.students.networks import NetworkLessons
 from methods.training import loop

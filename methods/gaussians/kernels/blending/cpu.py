@@ -145,10 +145,8 @@ def _tiles(box):
 
 @njit(cache=True, parallel=True)
 def _count(boxes, across, threads, counts, entries):
-    """Count the entries of each tile and of each Gaussian (shifted by one), in n threads.
-
-    Each thread handles every n-th row of tiles.
-    """
+    """Count the entries of each tile and of each Gaussian (shifted by one); each of n threads has
+    every n-th row of tiles."""
     for thread in prange(threads):
         for rank in range(len(boxes)):
             left, right, top, bottom = _tiles(boxes[rank])
@@ -195,15 +193,13 @@ def _forward(packed, boxes, offsets, ranks, stop, threads, values, depth, alpha)
             if offsets[tile] == offsets[tile + 1]:
                 continue
             top, left = tile // across * TILE, tile % across * TILE
-            _tile_forward(
-                packed, boxes, ranks[offsets[tile] : offsets[tile + 1]], stop, top, left, state
-            )
+            own = ranks[offsets[tile] : offsets[tile + 1]]
+            _tile_forward(packed, boxes, own, stop, top, left, state)
             for row in range(top, min(top + TILE, height)):
                 for column in range(left, min(left + TILE, width)):
                     at = (row - top) * TILE + column - left
-                    values[row, column, 0] = state[PIXELS + at]
-                    values[row, column, 1] = state[2 * PIXELS + at]
-                    values[row, column, 2] = state[3 * PIXELS + at]
+                    for k in range(3):
+                        values[row, column, k] = state[(1 + k) * PIXELS + at]
                     depth[row, column] = state[4 * PIXELS + at]
                     alpha[row, column] = ONE - state[at]
 

@@ -77,16 +77,11 @@ def project_gaussians(
 
 def covariances(scales: Tensor, rotations: Tensor) -> Tensor:
     """V [N, 3, 3] of N Gaussians."""
-    factors = rotation_matrices(rotations) * scales[:, None]
-    return factors @ factors.transpose(1, 2)
-
-
-def rotation_matrices(rotations: Tensor) -> Tensor:
-    """R [N, 3, 3] of quaternions [N, 4] (w, x, y, z) of any non-zero length."""
     w, x, y, z = torch.nn.functional.normalize(rotations, dim=1).unbind(dim=1)
-    entries = (
+    entries = (  # of R
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     )  # fmt: skip
-    return torch.stack(entries, dim=1).view(-1, 3, 3)
+    factors = torch.stack(entries, dim=1).view(-1, 3, 3) * scales[:, None]
+    return factors @ factors.transpose(1, 2)

@@ -34,8 +34,6 @@ from methods.gaussians.kernels.projection import (
 from methods.kernels.dispatch import served
 
 CAMERA = CAMERAS["looking at the cube"]
-FAR = 3.0
-"""Bound on the variance of an ellipse over the least, `BLUR`; scales and depths ensure it."""
 
 AREA = (
     "conics, of an area that loses a factor of xx yy / area < 64, after 30 roundings of numbers "

@@ -13,6 +13,7 @@ ValueError, as do other numbers than float32 with backend="cpu".
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import ModuleType
 
 import torch
 from torch import Tensor
@@ -128,11 +129,17 @@ def densities(
     """
     check_shape("positions", positions, None, 3)
     check_shape("numbers", numbers, len(positions))
-    if _learn(networks):
-        return composed_densities(positions, numbers, networks, backend)
-    return implementation(__name__, backend, positions.device).densities(
-        positions, numbers, networks
-    )
+    kernel = implementation(__name__, backend, positions.device)
+    if _in_one_pass(kernel, networks):
+        return kernel.densities(positions, numbers, networks)
+    place, offsets = order(numbers, len(networks["in"][0]), backend=backend)
+    x = encode_frequencies(positions[place], POSITION_FREQUENCIES, backend=backend)
+    for name in ("in", "mid"):
+        x = grouped_linear(x, *networks[name], offsets, relu=True, backend=backend)
+    raw = grouped_linear(x, *networks["density"], offsets, backend=backend)
+    hidden = _back(x, place, len(positions))
+    geometry = torch.cat((hidden, numbers[:, None].to(hidden.dtype)), dim=1)
+    return _back(raw, place, len(positions)).squeeze(1), geometry
 
 
 def colours(
@@ -148,32 +155,9 @@ def colours(
     """
     check_shape("geometry", geometry, None, HIDDEN + 1)
     check_shape("encoded", encoded, len(geometry), SHAPES["direction"][0] - HIDDEN)
-    if _learn(networks):
-        return composed_colours(geometry, encoded, networks, backend)
-    return implementation(__name__, backend, geometry.device).colours(geometry, encoded, networks)
-
-
-def _learn(networks: Networks) -> bool:
-    tensors = (tensor for layer in networks.values() for tensor in layer)
-    return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-
-
-def composed_densities(
-    positions: Tensor, numbers: Tensor, networks: Networks, backend: str
-) -> tuple[Tensor, Tensor]:
-    """`densities`, layer by layer."""
-    place, offsets = order(numbers, len(networks["in"][0]), backend=backend)
-    x = encode_frequencies(positions[place], POSITION_FREQUENCIES, backend=backend)
-    for name in ("in", "mid"):
-        x = grouped_linear(x, *networks[name], offsets, relu=True, backend=backend)
-    raw = grouped_linear(x, *networks["density"], offsets, backend=backend)
-    hidden = _back(x, place, len(positions))
-    geometry = torch.cat((hidden, numbers[:, None].to(hidden.dtype)), dim=1)
-    return _back(raw, place, len(positions)).squeeze(1), geometry
-
-
-def composed_colours(geometry: Tensor, encoded: Tensor, networks: Networks, backend: str) -> Tensor:
-    """`colours`, layer by layer."""
+    kernel = implementation(__name__, backend, geometry.device)
+    if _in_one_pass(kernel, networks):
+        return kernel.colours(geometry, encoded, networks)
     numbers, count = geometry[:, HIDDEN].detach().int(), len(networks["feature"][0])
     place, offsets = order(numbers, count, backend=backend)
     hidden = geometry[place, :HIDDEN]
@@ -182,6 +166,12 @@ def composed_colours(geometry: Tensor, encoded: Tensor, networks: Networks, back
     x = grouped_linear(x, *networks["direction"], offsets, relu=True, backend=backend)
     x = grouped_linear(x, *networks["colour"], offsets, backend=backend)
     return _back(x.sigmoid(), place, len(geometry))
+
+
+def _in_one_pass(kernel: ModuleType, networks: Networks) -> bool:
+    """Whether nobody asks for gradients, and the backend has all layers in one loop."""
+    learned = any(tensor.requires_grad for layer in networks.values() for tensor in layer)
+    return hasattr(kernel, "densities") and not (learned and torch.is_grad_enabled())
 
 
 def _back(values: Tensor, place: Tensor, count: int) -> Tensor:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from methods.kilonerf.kernels.grouped_mlp import Networks, composed_colours, composed_densities
-
 
 def locate(positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
     scaled = (positions.detach() - corner) / side
@@ -36,11 +34,3 @@ def grouped_linear(
     out = [torch.addmm(bias, part, weight) for part, weight, bias in layers]
     joined = torch.cat(out) if out else inputs.new_zeros(0, weights.shape[2])
     return joined.relu() if relu else joined
-
-
-def densities(positions: Tensor, numbers: Tensor, networks: Networks) -> tuple[Tensor, Tensor]:
-    return composed_densities(positions, numbers, networks, "reference")
-
-
-def colours(geometry: Tensor, encoded: Tensor, networks: Networks) -> Tensor:
-    return composed_colours(geometry, encoded, networks, "reference")

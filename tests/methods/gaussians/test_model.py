@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from methods.gaussians.storage import rounded, stored_bytes
+from methods.gaussians.model import rounded, stored_bytes
 from tests.methods.gaussians.test_ply import some
 
 
