@@ -14,8 +14,6 @@ from methods.kilonerf.kernels.grouped_mlp import (
     Networks,
     colours,
     densities,
-    encode_frequencies,
-    grouped_linear,
 )
 
 both = pytest.mark.parametrize("backend", ["reference", "cpu"])
@@ -59,33 +57,9 @@ def test_they_are_those_of_torch_one_by_one(backend: str) -> None:
 
 
 @both
-def test_a_gradient_comes_from_the_samples_of_its_network_alone(backend: str) -> None:
-    generator = torch.Generator().manual_seed(0)
-    weights = torch.randn(3, 8, 16, generator=generator, requires_grad=True)
-    biases = torch.randn(3, 16, generator=generator, requires_grad=True)
-    inputs = torch.randn(20, 8, generator=generator)
-    scaled = torch.cat((inputs[:10], -3 * inputs[10:]))
-    offsets = torch.tensor([0, 10, 10, 20])
-    found = []
-    for given in (inputs, scaled):
-        out = grouped_linear(given, weights, biases, offsets, relu=True, backend=backend)
-        found.append(torch.autograd.grad(out.square().sum(), (weights, biases)))
-    for one, other in zip(*found, strict=True):
-        assert one[0].any()
-        assert torch.equal(one[0], other[0])
-        assert not one[1].any()
-        assert not torch.equal(one[2], other[2])
-
-
-@both
 def test_nan_stays_with_its_sample(backend: str) -> None:
     few, _ = networks(1)
     positions = torch.zeros(12, 3)
     positions[5] = math.nan
     raw, _ = densities(positions, torch.zeros(12, dtype=torch.int32), few, backend=backend)
     assert raw.isnan().nonzero().flatten().tolist() == [5]
-
-
-def test_other_numbers_than_float32_are_refused_on_a_cpu() -> None:
-    with pytest.raises(ValueError, match="use backend='reference'"):
-        encode_frequencies(torch.zeros(1, 3, dtype=torch.float64), 2, backend="cpu")
