@@ -13,13 +13,7 @@ from torch.nn import functional
 from bench.study import Axis, Study, Variant, turned
 from bench.types import Budget, Probe, Rays, Scene
 from methods.diver.kernels.segments import Corners, Layers, render_segments
-from methods.diver.model import (
-    CHANNELS,
-    DIRECTION_CHANNELS,
-    CornerModel,
-    Decoder,
-    encode_directions,
-)
+from methods.diver.model import CornerModel, Decoder, encode_directions
 from methods.diver.training import DiverLessons, DiverTraining
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.corner_gather import CORNERS
@@ -32,7 +26,6 @@ MULTIPLE = 16
 """The resolution is a multiple of this: its cells are looked up in bricks of bricks."""
 
 FINEST = 512
-
 
 Stored = Literal["bf16", "fp32"]
 
@@ -52,7 +45,7 @@ class Baked:
         table = table.to(torch.bfloat16 if stored == "bf16" else torch.float32)
         self.corners, self.backend = Corners(model.voxels, model.corners, table), model.backend
         self.occupancy = Occupancy.at(model.voxels.coordinates, model.resolution)
-        along, across = decoder.view.weight.split((CHANNELS, DIRECTION_CHANNELS), dim=1)
+        along, across = decoder.view_parts()
         third, bias = decoder.third.weight, decoder.third.bias
         self.layers = Layers(
             hidden=decoder.second.weight.detach(),
@@ -76,12 +69,8 @@ class Baked:
 
     @torch.no_grad()
     def render_rays(self, rays: Rays, probe: Probe, stop: float, faint: float) -> Pixels:
-        """Render R `rays`, not composited on a background.
-
-        Args:
-            stop: transmittance at which a ray ends.
-            faint: weight below which a segment has an opacity but no colour.
-        """
+        """Render R `rays`, not composited on a background, with `stop` and `faint` as for
+        `render_segments`."""
         layers = self.layers
         with probe.stage("segments"):
             encoded = encode_directions(rays.directions)

@@ -52,9 +52,13 @@ class Decoder(nn.Module):
         sigma, geometry = self.third(hidden).split((1, CHANNELS), dim=1)
         return sigma.squeeze(1), geometry
 
+    def view_parts(self) -> tuple[Tensor, Tensor]:
+        """Weights of the geometry [32, 32] and of the direction [32, 27] in the layer `view`."""
+        return self.view.weight.split((CHANNELS, DIRECTION_CHANNELS), dim=1)
+
     def colours(self, geometry: Tensor, encoded: Tensor, ray: Tensor) -> Tensor:
         """RGB [S, 3] in [0, 1] on rays `ray` [S] of encoded directions [R, 27]."""
-        along, across = self.view.weight.split((CHANNELS, DIRECTION_CHANNELS), dim=1)
+        along, across = self.view_parts()
         # This layer is linear: the product of the directions is computed only once per ray.
         towards = functional.linear(encoded, across, self.view.bias)
         hidden = functional.linear(geometry, along) + towards.index_select(0, ray)

@@ -105,9 +105,7 @@ class GaussianSplatting:
         finished = log.stage_dir("gaussians", key) / "gaussians.safetensors"
         begun = time.monotonic()
         gaussians = self._untrained(field, scene, finished.exists())
-        work = GaussianTraining(
-            gaussians, scene, budget.renderer_steps, self.fitting, setup.backend, setup.seed
-        )
+        work = GaussianTraining(gaussians, scene, budget.renderer_steps, self.fitting, setup)
         work.seconds = time.monotonic() - begun
         loop.train(work, finished, "gaussians", log)
         self.train_s = work.seconds + (0.0 if field is None else field.train_s)

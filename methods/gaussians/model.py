@@ -22,25 +22,16 @@ OUTLIERS = 1e-3
 
 
 class Gaussians(nn.Module):
-    """N Gaussians.
-
-    Attributes:
-        means: [N, 3] centres, scene units.
-        log_scales: [N, 3] logarithms of the standard deviations along their axes.
-        rotations: [N, 4] quaternions (w, x, y, z), not normalised.
-        logits: [N] logits of the opacity at the centre.
-        base: [N, 1, 3] coefficients of the first spherical harmonic.
-        view: [N, C - 1, 3] those of the others, in the order of `methods.kernels.spherical`.
-    """
+    """N Gaussians."""
 
     def __init__(
         self,
-        means: Tensor,
-        log_scales: Tensor,
-        rotations: Tensor,
-        logits: Tensor,
-        base: Tensor,
-        view: Tensor,
+        means: Tensor,  # [N, 3] centres, scene units
+        log_scales: Tensor,  # [N, 3] logarithms of the standard deviations along their axes
+        rotations: Tensor,  # [N, 4] quaternions (w, x, y, z), not normalised
+        logits: Tensor,  # [N] of the opacity at the centre
+        base: Tensor,  # [N, 1, 3] coefficients of the first spherical harmonic
+        view: Tensor,  # [N, C - 1, 3] of the others, in the order of `methods.kernels.spherical`
     ) -> None:
         super().__init__()
         self.means = nn.Parameter(means)
@@ -75,11 +66,8 @@ class Gaussians(nn.Module):
         return self.logits.sigmoid()
 
     def render(self, camera: Camera, stop: float, probe: Probe, backend: str = "auto") -> Pixels:
-        """Render the pixels of `camera`, row by row, not composited on a background.
-
-        Differentiable in all parameters, except for the change of a colour with the direction in
-        which the mean is seen.
-        """
+        """Render the pixels of `camera`, row by row, not composited on a background; differentiable
+        in all parameters, but for the change of a colour with the direction of the mean."""
         with probe.stage("project"):
             opacities = self.opacities
             shape = self.means, self.log_scales.exp(), self.rotations
@@ -95,11 +83,8 @@ class Gaussians(nn.Module):
 
 
 def rounded(gaussians: Gaussians) -> Gaussians:
-    """Gaussians as they come back from storage: means in 16 bits, everything else in 8.
-
-    Levels are spread evenly from the least to the largest value of a column. Opacities are stored
-    as they are, scales as logarithms, rotations normalised.
-    """
+    """Gaussians as they come back from storage: means in 16 bits, everything else in 8; opacities
+    as they are, scales as logarithms, rotations normalised."""
     opacities = _levels(gaussians.opacities, 8).clamp(1e-6, 1 - 1e-6)
     return Gaussians(
         _levels(gaussians.means, 16),
@@ -121,7 +106,7 @@ def stored_bytes(gaussians: Gaussians) -> int:
 
 
 def _levels(values: Tensor, bits: int, outliers: float = 0.0) -> Tensor:
-    """`values` [N, ...], each column rounded to 2^bits levels between its extremes."""
+    """`values` [N, ...], each column rounded to 2^bits levels, evenly between its extremes."""
     columns = values.detach().reshape(len(values), math.prod(values.shape[1:]))
     if not columns.numel():
         return values.detach().clone()

@@ -25,7 +25,7 @@ from methods.gaussians.kernels.projection import covariances
 from methods.gaussians.kernels.ssim import ssim
 from methods.gaussians.model import Gaussians
 from methods.instant_ngp.pixels import PixelBatches
-from methods.instant_ngp.stage1 import TrainedField
+from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.kernels.composite import STOP
 from methods.kernels.types import expect
 from methods.rendering.rays import render_rays
@@ -81,19 +81,12 @@ class GaussianTraining:
     asked: loop.Asked | None = None
 
     def __init__(
-        self,
-        gaussians: Gaussians,
-        scene: Scene,
-        steps: int,
-        options: Fitting,
-        backend: str,
-        seed: int,
+        self, gaussians: Gaussians, scene: Scene, steps: int, options: Fitting, setup: Setup
     ) -> None:
-        device = gaussians.means.device
-        self.gaussians, self.options, self.backend = gaussians, options, backend
+        self.gaussians, self.options, self.backend = gaussians, options, setup.backend
         self.step, self.steps, self.seconds = 0, steps, 0.0
-        self.split, self.background = scene.splits["train"], scene.background.to(device)
-        self.generator = torch.Generator(device).manual_seed(seed)
+        self.split, self.background = scene.splits["train"], scene.background.to(setup.device)
+        self.generator = torch.Generator(setup.device).manual_seed(setup.seed)
         self.views: list[int] = []  # still to come in this pass over the pictures
 
     @cached_property
@@ -181,10 +174,7 @@ def on_surfaces(
     trained: TrainedField, scene: Scene, count: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """Choose `count` points where rays of random training pixels end, and their colours: [count, 3]
-    each.
-
-    If the pictures show too little matter, points are taken more than once.
-    """
+    each. If the pictures show too little matter, points are taken more than once."""
     field = trained.field
     batches = PixelBatches(scene.splits["train"], field.device)
     points, colours = [], []
@@ -227,10 +217,8 @@ def relocate(
     gaussians: Gaussians, optimiser: torch.optim.Optimizer, generator: torch.Generator
 ) -> int:
     """Move dead Gaussians to living ones, drawn in proportion to opacity; return how many moved.
-
-    A living one and its copies get opacities and scales such that together they look as it did
-    alone (their Eq. 9). The optimiser's moments of all Gaussians that changed are set to 0.
-    """
+    Together, a living one and its copies look as it did alone (their Eq. 9). The optimiser's
+    moments of all Gaussians that changed are set to 0."""
     opacities = gaussians.opacities
     dead = (opacities <= DEAD).nonzero().squeeze(1)
     alive = (opacities > DEAD).nonzero().squeeze(1)
@@ -253,11 +241,8 @@ def relocate(
 
 def shared_between(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
     """Opacity of each of `copies` [N] Gaussians that replace one of `opacities` [N], and the factor
-    on its scales (Eq. 9).
-
-    1 - (1 - o_new)^n = o, and the factor keeps the integral of the opacity along a ray through the
-    centre.
-    """
+    on its scales (Eq. 9): 1 - (1 - o_new)^n = o, and the factor keeps the integral of the opacity
+    along a ray through the centre."""
     copies = copies.clamp(1, MOST_COPIES)
     new = 1 - (1 - opacities.double()) ** (1 / copies)
     total = torch.zeros_like(new)

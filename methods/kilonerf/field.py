@@ -27,17 +27,11 @@ DENSITY_LAYERS = ("in", "mid", "density")
 
 @dataclass(frozen=True)
 class Grid:
-    """Cubes side by side, some of which have a network.
+    """Cubes side by side, some of which have a network."""
 
-    Attributes:
-        networks: [X, Y, Z] int16, the number of each cube's network, -1 for none.
-        corner: [3] lower corner of the first cube, in the unit cube.
-        side: [] side of a cube.
-    """
-
-    networks: Tensor
-    corner: Tensor
-    side: Tensor
+    networks: Tensor  # [X, Y, Z] int16, the number of each cube's network, -1 for none
+    corner: Tensor  # [3] lower corner of the first cube, in the unit cube
+    side: Tensor  # [] side of a cube
 
     @property
     def count(self) -> int:
@@ -47,22 +41,15 @@ class Grid:
 
 @dataclass(frozen=True)
 class Pieces:
-    """Parts of occupied cells, each within the cube of one network.
+    """Parts of occupied cells, each within the cube of one network, network by network."""
 
-    Attributes:
-        low, high: [P, 3] corners, in the unit cube, network by network.
-        offsets: [N + 1] network n has pieces offsets[n] to offsets[n + 1].
-    """
-
-    low: Tensor
-    high: Tensor
-    offsets: Tensor
+    low: Tensor  # [P, 3] corners, in the unit cube
+    high: Tensor  # [P, 3]
+    offsets: Tensor  # [N + 1] network n has pieces offsets[n] to offsets[n + 1]
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draw `count` random points for each network: [N * count, 3], network by network.
-
-        All pieces of a network are equally likely, whatever their size.
-        """
+        """Draw `count` random points for each network: [N * count, 3], network by network. All
+        pieces of a network are equally likely, whatever their size."""
         device = self.low.device
         sizes = self.offsets.diff()
         shares = torch.rand(len(sizes), count, generator=generator, device=device)
@@ -75,10 +62,7 @@ class Pieces:
 
 def place_networks(occupancy: Occupancy, bounds: Tensor, along: int) -> tuple[Grid, Pieces]:
     """Cover `bounds` [2, 3] with cubes: `along` of them on its longest side, as few as possible on
-    the others. Those that overlap occupied cells have a network.
-
-    Returns the cubes, and the occupied parts of those that have a network.
-    """
+    the others. Those that overlap occupied cells have a network; also returns these overlaps."""
     extent = bounds[1] - bounds[0]
     side = extent.max() / along * (1 + 1e-6)  # a little larger: no face is lost by rounding
     shape = (extent / side).ceil().int()

@@ -14,7 +14,7 @@ from torch.nn import functional
 from bench.study import Axis, Study, Variant, turned
 from bench.types import Budget, Probe, Rays, Scene
 from methods.instant_ngp.pixels import PixelBatches
-from methods.instant_ngp.stage1 import TrainedField
+from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import STOP, composite, visible
@@ -26,6 +26,8 @@ from methods.rendering.compaction import to_host
 from methods.rendering.frame import Render
 from methods.rendering.sampling import Sampling
 from methods.students.method import Student
+
+SIDE = "method.extraction.resolution"
 
 
 @dataclass(frozen=True)
@@ -52,22 +54,15 @@ class OctreeTraining(PixelTraining):
     options: OctreeLessons
 
     def __init__(
-        self,
-        octree: Octree,
-        scene: Scene,
-        budget: Budget,
-        options: OctreeLessons,
-        seed: int,
-        backend: str = "auto",
+        self, octree: Octree, scene: Scene, budget: Budget, options: OctreeLessons, setup: Setup
     ) -> None:
-        device = octree.light.density.device
-        super().__init__(scene, device, budget.renderer_steps, options.samples, options, seed)
-        self.backend = backend
+        steps, samples = budget.renderer_steps, options.samples
+        super().__init__(scene, setup.device, steps, samples, options, setup.seed)
+        self.backend = setup.backend
         self._take(octree)
 
     def _take(self, octree: Octree) -> None:
-        self.octree = octree
-        light = octree.light
+        self.octree, light = octree, octree.light
         # As tables of one and of 3 C columns, for Adam.
         self.tables = {"density": light.density[:, None], "harmonics": light.harmonics.flatten(1)}
         self.gradients = {name: torch.zeros_like(table) for name, table in self.tables.items()}
@@ -82,14 +77,9 @@ class OctreeTraining(PixelTraining):
         crossings = crossings.front(counts)
         self._sigma = light.density[crossings.voxel].requires_grad_()
         self.visited = crossings.voxel  # [S] int32
-        colours = shade_voxels(
-            light.harmonics,
-            crossings.voxel,
-            crossings.ray,
-            functional.normalize(rays.directions, dim=1),
-            grad_buffer=self.gradients["harmonics"].view_as(light.harmonics),
-            backend=backend,
-        )
+        seen = crossings.voxel, crossings.ray, functional.normalize(rays.directions, dim=1)
+        buffer = self.gradients["harmonics"].view_as(light.harmonics)
+        colours = shade_voxels(light.harmonics, *seen, grad_buffer=buffer, backend=backend)
         pixels = composite(self._sigma.relu(), colours, crossings, stop=STOP, backend=backend)
         return pixels.over(background), len(crossings)
 
@@ -143,14 +133,10 @@ class PlenOctree(Student):
             "stop": turned("stop", "method.stop", ("1e-1", "1e-3", "1e-4")),
             "stored": [Variant("stored fp32", ("method.stored=fp32",))],
         },
-        trained={
-            "resolution, trained": [
-                Variant(f"{n}³", (f"method.extraction.resolution={n}",)) for n in (128, 256)
-            ]
-        },
+        trained={"resolution, trained": [Variant(f"{n}³", (f"{SIDE}={n}",)) for n in (128, 256)]},
         exact=("method.stop=1e-4", "method.stored=fp32"),
         parts=dict.fromkeys(("rays", "render"), "field"),
-        axes={"G": Axis("{}³ leaves", "method.extraction.resolution", (128, 256, 512))},
+        axes={"G": Axis("{}³ leaves", SIDE, (128, 256, 512))},
         chosen=("stored", "stop"),
     )
 
@@ -168,7 +154,7 @@ class PlenOctree(Student):
         generator = torch.Generator(setup.device).manual_seed(setup.seed)
         batches = PixelBatches(scene.splits["train"], setup.device)
         octree = extract(trained, batches, self.extraction, generator)
-        return OctreeTraining(octree, scene, budget, self.training, setup.seed, setup.backend)
+        return OctreeTraining(octree, scene, budget, self.training, setup)
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Load the leaves that show anything, as they are stored."""
@@ -180,11 +166,9 @@ class PlenOctree(Student):
         faint = Sampling(stop=stop).least_weight
 
         def render(_: Tensor, rays: Rays) -> Pixels:
-            given = rays, octree.voxels, octree.light
+            given, how = (rays, octree.voxels, octree.light), {"stop": stop, "faint": faint}
             with probe.stage("render"):
-                pixels, crossed, shaded = render_voxels(
-                    *given, stop=stop, faint=faint, backend=backend
-                )
+                pixels, crossed, shaded = render_voxels(*given, **how, backend=backend)
                 samples, shown = to_host([crossed.sum(), shaded.sum()])
             probe.count("samples", samples)
             probe.count("shaded_samples", shown, samples)

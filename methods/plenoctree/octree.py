@@ -35,12 +35,9 @@ CLAMP = 1e-3
 
 @dataclass(frozen=True)
 class Octree:
-    """Leaves of one size, constant inside: V of the G^3 cells of the unit cube. Of their density,
-    only the positive part is used (ReLU).
-
-    Two maps replace all levels of the octree above the leaves: one of bricks of 8^3 leaves, and one
-    of the leaves of each brick. A look-up takes two steps instead of nine.
-    """
+    """Leaves of one size: V of the G^3 cells of the unit cube. Only positive densities are used
+    (ReLU). Two maps, of bricks of 8^3 leaves and of the leaves of each brick, replace all levels
+    above the leaves: a look-up takes two steps instead of nine."""
 
     voxels: Voxels
     light: Light
@@ -92,8 +89,7 @@ def _half(values: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Extraction:
-    """How leaves are found and filled, as `sweeps/configs/method/plenoctree.yaml` explains; the
-    resolution is at most 2048, and `most_leaves` are refused before memory is allocated."""
+    """How leaves are found and filled, as `sweeps/configs/method/plenoctree.yaml` explains."""
 
     resolution: int = 512
     degree: int = 2
@@ -117,10 +113,7 @@ class Extraction:
 
 @torch.no_grad()
 def extract(
-    trained: TrainedField,
-    batches: PixelBatches,
-    options: Extraction,
-    generator: torch.Generator,
+    trained: TrainedField, batches: PixelBatches, options: Extraction, generator: torch.Generator
 ) -> Octree:
     """Extract the octree of what `trained` shows to the training rays of `batches`; raise
     SteerbenchError if there are too many candidates, or if nothing is to be seen."""
@@ -177,22 +170,20 @@ def _densities(field: Field, leaves: Voxels, points: int, generator: torch.Gener
 def _harmonics(field: Field, voxels: Voxels, degree: int, directions: int) -> Tensor:
     """Coefficients [V, C, 3], fitted by least squares to the logits of the colours at the centres
     of the voxels, in `directions` evenly spread directions."""
-    device, terms = voxels.coordinates.device, (degree + 1) ** 2
-    towards = fibonacci_sphere(directions).to(device)
-    basis = spherical_harmonics(towards, backend=field.backend)[:, :terms].double()
+    towards = fibonacci_sphere(directions).to(voxels.coordinates.device)
+    harmonics = spherical_harmonics(towards, backend=field.backend)
+    basis = harmonics[:, : (degree + 1) ** 2].double()
     solve = torch.linalg.pinv(basis).float()  # [C, D], the same for all voxels
     encoded = field.encode_directions(towards)
-    found = torch.zeros(len(voxels), terms, 3, device=device)
-    batch = max(QUERIES // directions, 1)
-    for first in range(0, len(voxels), batch):
-        centres = (voxels.coordinates[first : first + batch] + 0.5) / voxels.resolution
-        count = len(centres)
-        _, geometry = field.density(pad(centres))
+    found = []
+    for part in voxels.coordinates.split(max(QUERIES // directions, 1)):
+        count = len(part)
+        _, geometry = field.density(pad((part + 0.5) / voxels.resolution))
         pairs = geometry[:count].repeat_interleave(directions, dim=0)
         shown = field.features(pad(pairs), pad(encoded.repeat(count, 1)))[: len(pairs), :3]
         logits = shown.clamp(CLAMP, 1 - CLAMP).logit().view(count, directions, 3)
-        found[first : first + batch] = torch.einsum("cd,vdk->vck", solve, logits)
-    return found
+        found.append(torch.einsum("cd,vdk->vck", solve, logits))
+    return torch.cat(found)
 
 
 def fibonacci_sphere(count: int) -> Tensor:

@@ -123,7 +123,7 @@ def test_only_what_rays_meet_is_changed(ball_scene: Scene, teacher: TrainedField
     octree, _ = extracted(teacher, ball_scene)
     before = octree.light.density.clone(), octree.light.harmonics.clone()
     options = OctreeLessons(max_rays=64)
-    training = OctreeTraining(octree, ball_scene, TAUGHT, options, seed=0)
+    training = OctreeTraining(octree, ball_scene, TAUGHT, options, TEACHER)
     training.advance()
     met = torch.zeros(len(octree.voxels), dtype=torch.bool)
     met[training.visited.long()] = True

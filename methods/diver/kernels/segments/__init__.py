@@ -49,11 +49,9 @@ class Layers:
 def segment_weights(
     rays: Rays, crossings: Crossings, voxels: Voxels, *, backend: str = "auto"
 ) -> Tensor:
-    """Weights [S, 8] of the corners in the means over the `crossings` of R `rays` through `voxels`.
-
-    A mean is the integral of the trilinear interpolant along the segment, divided by its length
-    (Section 3.2); of a segment of length 0 it is that of the point. Not differentiable.
-    """
+    """Weights [S, 8] of the corners in the means over the `crossings` of R `rays` through `voxels`:
+    integrals of the trilinear interpolant along the segment, divided by its length (Section 3.2).
+    Not differentiable."""
     check_rays(rays)
     kernel = implementation(__name__, backend, rays.origins.device)
     return kernel.segment_weights(rays, crossings, voxels)
@@ -69,15 +67,11 @@ def render_segments(
     faint: float = 0.0,
     backend: str = "auto",
 ) -> tuple[Pixels, Tensor, Tensor]:
-    """The pixels of R `rays`, not composited on a background. Not differentiable.
+    """The pixels of R `rays`, which end at the transmittance `stop`, without a background; segments
+    with at most the weight `faint` have an opacity but no colour. Not differentiable.
 
-    Also, for each ray, how many segments lie in front of its end and how many of them have a
-    colour: [R] int32.
-
-    Args:
-        towards: [R, H] what the direction of each ray adds to the output of `layers.geometry`.
-        stop: transmittance at which a ray ends, in [0, 1).
-        faint: weight up to which a segment has an opacity but no colour.
+    `towards` [R, H] is what the direction of a ray adds to the output of `layers.geometry`. Also
+    returns how many segments of each ray lie in front of its end, and have a colour: [R] int32.
     """
     check_stop(stop)
     hidden, features = layers.hidden.shape

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -102,28 +101,24 @@ def cases() -> list[Case]:
 
 
 def _weights() -> Iterator[Case]:
-    corners = torch.tensor(list(itertools.product((0.0, 0.5, 1.0), repeat=3)))
-    pairs = torch.cartesian_prod(torch.arange(27), torch.arange(27))
-    generator = torch.Generator().manual_seed(1000)
-    kinds: dict[str, Callable[[], Given]] = {
-        "random segments": partial(_inside, *torch.rand(2, 1000, 3, generator=generator)),
-        "between corners, edges, faces and the middle": partial(_inside, *corners[pairs.T]),
-        "without length": partial(_inside, corners, corners),
-        "rays through a full grid": _through,
-    }
     exact = Property(
         "segment_weights",
         "weights are those of a quadrature with four nodes, two more than a cubic needs",
         f"{WEIGHTS}; {PLACE}",
         on_backends(36 * SIDE + 16, "fp64"),
     )
-    for name, make in kinds.items():
+    for name, make in {"in a voxel": _inside, "rays through a full grid": _through}.items():
         yield from WEIGH.cases(name, make)
         yield exact.case(f"{name}, by quadrature", partial(_quadrature_error, make))
 
 
-def _inside(entry: Tensor, leave: Tensor) -> Given:
-    """Segments in the first voxel, from `entry` to `leave` in its coordinates."""
+def _inside() -> Given:
+    """Segments in the first voxel: random ones; between corners, middles of edges and faces, and
+    the middle, also from one of them to itself."""
+    places = torch.cartesian_prod(*[torch.tensor([0.0, 0.5, 1.0])] * 3)
+    pairs = torch.cartesian_prod(torch.arange(27), torch.arange(27))
+    drawn = torch.rand(2, 1000, 3, generator=torch.Generator().manual_seed(1000))
+    entry, leave = torch.cat((drawn, places[pairs.T]), dim=1)
     count, rays = len(entry), Rays(entry / SIDE, (leave - entry) / SIDE)
     number, zeros, ones = torch.arange(count), torch.zeros(count), torch.ones(count)
     offsets, first = torch.arange(count + 1), torch.zeros(count, dtype=torch.int32)

@@ -30,16 +30,11 @@ def blend(
     stop: float = STOP,
     backend: str = "auto",
 ) -> Pixels:
-    """Render the pixels of a width x height picture, row by row, without a background.
+    """Render the pixels of a width x height picture, row by row, without a background, of Gaussians
+    with `opacities` [N] at their centres and `colours` [N, 3]. Behind a transmittance of at most
+    `stop` they have no weight; those of equal depth are blended as they are given.
 
-    Values and alpha are differentiable in centres, conics, opacities and colours; depth has no
-    gradient. Gaussians of equal depth are blended in the order in which they are given.
-
-    Args:
-        ellipses: N Gaussians projected to the picture.
-        opacities: [N] at their centres.
-        colours: [N, 3].
-        stop: Gaussians behind a transmittance of at most `stop` have no weight.
+    Values and alpha are differentiable in centres, conics, opacities and colours.
     """
     count = len(opacities)
     check_shape("opacities", opacities, None)

@@ -53,17 +53,12 @@ def project_gaussians(
     *,
     backend: str = "auto",
 ) -> Ellipses:
-    """Project N Gaussians to ellipses.
+    """Project N Gaussians to ellipses: `means` [N, 3] and standard deviations along their axes,
+    `scales` [N, 3], in scene units; `rotations` [N, 4], quaternions (w, x, y, z) of any non-zero
+    length; `opacities` [N] at the centre.
 
     Centres and conics are differentiable in means, scales and rotations; for invisible Gaussians
     they are zeros without gradient. Depth and extents have no gradient.
-
-    Args:
-        means: [N, 3] centres, scene units.
-        scales: [N, 3] standard deviations along the axes of the Gaussian, scene units.
-        rotations: [N, 4] quaternions (w, x, y, z) of any non-zero length.
-        opacities: [N] at the centre, in [0, 1].
-        camera: on the device of the Gaussians.
     """
     count = len(means)
     check_shape("means", means, None, 3)

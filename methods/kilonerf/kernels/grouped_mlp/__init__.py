@@ -43,15 +43,11 @@ Networks = Mapping[str, tuple[Tensor, Tensor]]
 def locate(
     positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor, *, backend: str = "auto"
 ) -> tuple[Tensor, Tensor]:
-    """Find the network of each position, and the local position in its cube. No gradient.
+    """The networks [S] int16 of `positions` [S, 3], -1 for none, and their places [S, 3] in its
+    cube, -1 to 1 along each axis. No gradient.
 
-    Returns networks [S] int16, -1 for none, and local positions [S, 3], -1 to 1 along each axis.
-
-    Args:
-        positions: [S, 3].
-        cubes: [X, Y, Z] int16, the network of each cube of a grid, -1 for none.
-        corner: [3] lower corner of the first cube.
-        side: [] side of a cube.
+    `cubes` [X, Y, Z] int16 are the networks of a grid of cubes of a `side` [], -1 for none; the
+    first one has the lower `corner` [3].
     """
     check_shape("positions", positions, None, 3)
     check_shape("cubes", cubes, None, None, None)
@@ -62,14 +58,11 @@ def locate(
 
 
 def order(networks: Tensor, count: int, *, backend: str = "auto") -> tuple[Tensor, Tensor]:
-    """Sort samples by their networks, of which there are `count`; within a network they keep their
-    order.
+    """Sort samples by their `networks` [S], integers below `count` (not checked), negative for none;
+    within a network they keep their order.
 
     Returns the samples [M] int64 that have a network, and offsets [N + 1] int64: network n owns
     offsets[n] to offsets[n + 1] of them.
-
-    Args:
-        networks: [S] integers below `count`, each sample's network; negative: none. Not checked.
     """
     check_shape("networks", networks, None)
     return implementation(__name__, backend, networks.device).order(networks, count)
@@ -95,14 +88,10 @@ def grouped_linear(
     relu: bool = False,
     backend: str = "auto",
 ) -> Tensor:
-    """A linear layer [S, O], with a `relu` or without, on samples sorted by network; differentiable
-    in its inputs, weights and biases.
+    """A linear layer [S, O], with a `relu` or without, on `inputs` [S, I] sorted by network.
 
-    Args:
-        inputs: [S, I]; network n has rows offsets[n] to offsets[n + 1].
-        weights: [N, I, O].
-        biases: [N, O].
-        offsets: [N + 1] int64 of `order`, from 0 to S. Not checked.
+    Differentiable in inputs, `weights` [N, I, O] and `biases` [N, O]; `offsets` [N + 1] are those
+    of `order`. Not checked.
     """
     check_shape("weights", weights, None, None, None)
     networks, channels, outputs = weights.shape
@@ -117,15 +106,11 @@ def grouped_linear(
 def densities(
     positions: Tensor, numbers: Tensor, networks: Networks, *, backend: str = "auto"
 ) -> tuple[Tensor, Tensor]:
-    """Densities [S] before their activation, and the input [S, 33] of `colours`.
+    """Densities [S] before their activation, and the input [S, 33] of `colours`, of samples at
+    `positions` [S, 3] in the cubes of their networks, by their `numbers` [S] as for `order`.
 
-    The latter holds the hidden channels, then the number of the network, which is exact in float32.
-    Densities and hidden channels are 0 where a sample has no network. Differentiable in the
-    networks.
-
-    Args:
-        positions: [S, 3] local to the sample's cube, -1 to 1 along each axis.
-        numbers: [S] the network of each sample, as for `order`.
+    The latter are the hidden channels, then the number, which is exact in float32. Densities and
+    hidden channels are 0 where a sample has no network. Differentiable in the networks.
     """
     check_shape("positions", positions, None, 3)
     check_shape("numbers", numbers, len(positions))
@@ -145,13 +130,10 @@ def densities(
 def colours(
     geometry: Tensor, encoded: Tensor, networks: Networks, *, backend: str = "auto"
 ) -> Tensor:
-    """Colours [S, 3] in (0, 1) of samples; 0 where a sample has no network.
+    """Colours [S, 3] in (0, 1) of samples with the `geometry` [S, 33] of `densities` in `encoded`
+    directions [S, 27]; 0 where a sample has no network.
 
     Differentiable in the hidden channels and the networks.
-
-    Args:
-        geometry: [S, 33] from `densities`.
-        encoded: [S, 27] encoded directions.
     """
     check_shape("geometry", geometry, None, HIDDEN + 1)
     check_shape("encoded", encoded, len(geometry), SHAPES["direction"][0] - HIDDEN)

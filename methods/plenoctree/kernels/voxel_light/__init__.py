@@ -36,13 +36,10 @@ def render_voxels(
     faint: float = 0.0,
     backend: str = "auto",
 ) -> tuple[Pixels, Tensor, Tensor]:
-    """Render R `rays` without a background. Not differentiable.
+    """Render R `rays`, which end at the transmittance `stop`, without a background; voxels with at
+    most the weight `faint` count for opacity but are not shaded. Not differentiable.
 
     Returns the pixels and, for each ray, the numbers of crossed and of shaded voxels: [R] int32.
-
-    Args:
-        stop: transmittance at which a ray ends, in [0, 1).
-        faint: voxels with at most this weight count for opacity but are not shaded.
     """
     check_stop(stop)
     check_rays(rays)
@@ -61,15 +58,11 @@ def shade_voxels(
     grad_buffer: Tensor | None = None,
     backend: str = "auto",
 ) -> Tensor:
-    """Colours [S, 3] of S voxels in the directions of their rays. Differentiable in `harmonics`.
+    """Colours [S, 3] of some voxels, rows `voxel` [S] int32 of the `harmonics` [V, C, 3], in the
+    direction of their `ray` [S] int32, a row of the unit vectors `directions` [R, 3].
 
-    Args:
-        harmonics: [V, C, 3] as in `Light`.
-        voxel: [S] int32 rows of `harmonics`; rows may repeat.
-        ray: [S] int32 rows of `directions`.
-        directions: [R, 3] unit vectors.
-        grad_buffer: [V, C, 3]; if given, the gradient of `harmonics` is added to it in place and
-            hidden from autograd.
+    Differentiable in `harmonics`; if a `grad_buffer` of their shape is given, the gradient is added
+    to it in place and hidden from autograd.
     """
     check_harmonics("harmonics", harmonics, None)
     check_shape("voxel", voxel, None)
