@@ -121,7 +121,6 @@ class Diver(Student):
         expect(0 <= self.faint < 1, "faint", "a weight of 0 or more and less than 1", self.faint)
 
     def model_settings(self) -> Mapping[str, object]:
-        """The number of voxels."""
         return {"resolution": self.resolution}
 
     def begin(self, trained: TrainedField, scene: Scene, budget: Budget) -> DiverTraining:
@@ -131,7 +130,6 @@ class Diver(Student):
         return DiverTraining(model, scene, budget, self.training, self.teacher.seed)
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Load a model, and bake it."""
         device = self.teacher.device
         blank = torch.zeros(0, 3, dtype=torch.int32, device=device)
         model = CornerModel(blank, self.resolution, Decoder().to(device), self.teacher.backend)
@@ -139,15 +137,12 @@ class Diver(Student):
         self.baked = Baked(model, self.stored)
 
     def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
-        """The cells of its voxels, and the baked model."""
-
         def render(_: Tensor, rays: Rays) -> Pixels:
             return self.baked.render_rays(rays, probe, self.stop, self.faint)
 
         return self.baked.occupancy, render
 
     def sizes(self) -> dict[str, int]:
-        """Bytes of what `Baked` renders."""
         return self.baked.sizes()
 
     def settings(self) -> dict[str, str]:

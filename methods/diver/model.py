@@ -93,13 +93,10 @@ class CornerModel(nn.Module):
     def taught(
         cls, trained: TrainedField, resolution: int, generator: torch.Generator
     ) -> CornerModel:
-        """Make a model with voxels where the trained field is occupied.
+        """Make a model with voxels where the trained field is occupied, and a random decoder.
 
-        The features of a corner are its hash encoding, 16 levels of 2, divided by their
-        standard deviation; the decoder is random.
-
-        Raises:
-            ValueError: the encoding has more than 32 channels.
+        The features of a corner are its hash encoding, 16 levels of 2, divided by their standard
+        deviation; ValueError if it has more than 32 channels.
         """
         field = trained.field
         few = f"at most the {CHANNELS} channels of a corner: choose fewer levels or features"

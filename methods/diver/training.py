@@ -44,7 +44,7 @@ class DiverLessons(PixelOptions):
 
 
 class DiverTraining(PixelTraining):
-    """Trains corners and decoder on some thousand rays a step, as a `loop.Training`."""
+    """Trains corners and decoder on some thousand rays a step."""
 
     options: DiverLessons
 
@@ -59,7 +59,6 @@ class DiverTraining(PixelTraining):
         self.grad = torch.zeros_like(model.table)
 
     def advance(self) -> dict[str, float]:
-        """Take one step; return its mean squared error."""
         if self.step == int(self.options.prune_at * self.steps):
             self._prune()
         return super().advance()

@@ -30,11 +30,8 @@ from methods.training import loop
 
 @dataclass(kw_only=True, eq=False)
 class GaussianSplatting:
-    """3D Gaussians, whose number is a setting. A training also writes them to a PLY file.
-
-    Its settings are explained in `sweeps/configs/method/gaussians.yaml`; `grid`, `training` and
-    `precision` are those of the field that they start from.
-    """
+    """3D Gaussians, with the settings of `sweeps/configs/method/gaussians.yaml`; `grid`, `training`
+    and `precision` are those of the field that they start from."""
 
     grid: HashGrid
     training: TrainingOptions
@@ -109,8 +106,7 @@ class GaussianSplatting:
         work.seconds = time.monotonic() - begun
         loop.train(work, finished, "gaussians", log)
         self.train_s = work.seconds + (0.0 if field is None else field.train_s)
-        exported = finished.with_suffix(".ply")
-        if not exported.exists():
+        if not (exported := finished.with_suffix(".ply")).exists():
             ply.write(gaussians, scene, exported)
             log.info(f"Gaussians for other programs: {exported}")
         return gaussians

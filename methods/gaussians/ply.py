@@ -50,12 +50,8 @@ def write(gaussians: Gaussians, scene: Scene, path: Path) -> None:
 
 
 def read(path: Path, scene: Scene) -> Gaussians:
-    """Read the Gaussians of a file in the coordinates of the data set of `scene`.
-
-    Raises:
-        SteerbenchError: the file is missing, truncated or of another kind; values are not finite;
-            rotations are zeros; nothing lies inside the bounds of the scene.
-    """
+    """Read the Gaussians of a file in the coordinates of the data set of `scene`; SteerbenchError
+    says what is wrong with the file or its numbers, or that nothing lies inside the scene."""
 
     def refuse(wrong: bool, why: str) -> None:
         if wrong:
@@ -65,9 +61,8 @@ def read(path: Path, scene: Scene) -> Gaussians:
     try:
         vertices: np.ndarray = PlyData.read(path, mmap=False)["vertex"].data
     except (PlyParseError, KeyError, ValueError, UnicodeDecodeError) as error:
-        raise SteerbenchError(
-            f"{path}: expected a PLY file of 3D Gaussians, could not read one ({error})"
-        ) from error
+        why = "expected a PLY file of 3D Gaussians, could not read one"
+        raise SteerbenchError(f"{path}: {why} ({error})") from error
     refuse(not len(vertices), "expected 3D Gaussians, it has none")
     names = vertices.dtype.names or ()
     missing = ", ".join(name for name in NEEDED if name not in names)

@@ -1,8 +1,6 @@
 """Training of Gaussians on pictures (Kerbl et al. 2023, Section 5): where they start, and how faded
-ones move (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo").
-
-The number of Gaussians is fixed. Those that have faded are relocated to others, and noise lets the
-faint ones explore.
+ones are relocated and explore (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte
+Carlo"). Their number is fixed.
 """
 
 from __future__ import annotations
@@ -156,11 +154,8 @@ class GaussianTraining:
         self.gaussians.load_state_dict({name: tensors[name] for name in self.result()})
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """The optimiser, random numbers, and the views still to come."""
-        more = {
-            "generator": self.generator.get_state(),
-            "views": torch.tensor(self.views, dtype=torch.int64),
-        }
+        views = torch.tensor(self.views, dtype=torch.int64)
+        more = {"generator": self.generator.get_state(), "views": views}
         return checkpoint.optimiser_tensors(self.optimiser, "adam.") | more, {}
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:

@@ -80,13 +80,12 @@ def place_networks(occupancy: Occupancy, bounds: Tensor, along: int) -> tuple[Gr
         there = ((cube <= last) & (cube >= 0) & (cube < shape)).all(dim=1)
         cube = cube[there]
         start = corner + cube * side
-        part = torch.maximum(low[there], start), torch.minimum(high[there], start + side)
-        parts.append((cube, *part))
+        ends = torch.maximum(low[there], start), torch.minimum(high[there], start + side)
+        parts.append((cube, *ends))
     cube, low, high = (torch.cat(part) for part in zip(*parts, strict=True))
     x, y, z = shape.tolist()
-    used, number, counts = ((cube[:, 0] * y + cube[:, 1]) * z + cube[:, 2]).unique(
-        return_inverse=True, return_counts=True
-    )
+    index = (cube[:, 0] * y + cube[:, 1]) * z + cube[:, 2]
+    used, number, counts = index.unique(return_inverse=True, return_counts=True)
     networks = torch.full((x, y, z), -1, dtype=torch.int16, device=device)
     networks.view(-1)[used.long()] = torch.arange(len(used), dtype=torch.int16, device=device)
     by_network = number.argsort(stable=True)

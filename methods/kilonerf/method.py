@@ -21,8 +21,7 @@ MOST = 32
 """Maximum number of networks along an axis: they are numbered in int16."""
 
 LEAK = 0.01
-"""Slope of the density below 0 in distillation, so that its gradient does not vanish in empty
-space."""
+"""Slope of the density below 0 in distillation: its gradient does not vanish in empty space."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +47,8 @@ class KiloTraining(StudentTraining):
 
     def _places(self) -> tuple[Tensor, Tensor]:
         positions = self.pieces.draw(self.options.points_each, self.generator)
-        directions = torch.randn(
-            len(positions), 3, generator=self.generator, device=positions.device
-        )
+        shape, device = positions.shape, positions.device
+        directions = torch.randn(shape, generator=self.generator, device=device)
         return positions, functional.normalize(directions, dim=1)
 
     def _learned(self, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
@@ -89,11 +87,9 @@ class KiloNerf(FieldStudent):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        along = f"1 to {MOST} along an axis"
-        expect(1 <= self.networks <= MOST, "networks", along, self.networks)
+        expect(1 <= self.networks <= MOST, "networks", f"1 to {MOST}", self.networks)
 
     def model_settings(self) -> Mapping[str, object]:
-        """The number of networks."""
         return {"networks": self.networks}
 
     def new_field(self) -> KiloField:
@@ -102,7 +98,6 @@ class KiloNerf(FieldStudent):
         return KiloField(self.grid, self.teacher.backend, generator).to(self.teacher.device)
 
     def begin(self, trained: TrainedField, scene: Scene, budget: Budget) -> KiloTraining:
-        """Place the networks, and make their training."""
         bounds = scene.bounds.to(self.teacher.device)
         self.occupancy = trained.occupancy
         self.grid, pieces = place_networks(trained.occupancy, bounds, self.networks)
@@ -111,7 +106,6 @@ class KiloNerf(FieldStudent):
         return training
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Load the networks, and where they are."""
         parts = checkpoint.part(tensors, "field.")
         self.grid = Grid(parts["networks"], parts["corner"], parts["side"])
         super().restore(tensors)

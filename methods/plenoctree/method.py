@@ -119,8 +119,7 @@ class OctreeTraining(PixelTraining):
 @dataclass(kw_only=True, eq=False)
 class PlenOctree(Student):
     """A sparse grid of densities and spherical harmonics, extracted from a trained field and
-    fine-tuned on the photos; its settings are explained in `sweeps/configs/method/plenoctree.yaml`.
-    """
+    fine-tuned on the photos; `sweeps/configs/method/plenoctree.yaml` explains its settings."""
 
     training: OctreeLessons
     extraction: Extraction
@@ -145,11 +144,9 @@ class PlenOctree(Student):
         expect(self.stored in ("fp16", "fp32"), "stored", "fp16 or fp32", self.stored)
 
     def model_settings(self) -> Mapping[str, object]:
-        """The settings of the extraction."""
         return asdict(self.extraction)
 
     def begin(self, trained: TrainedField, scene: Scene, budget: Budget) -> OctreeTraining:
-        """Extract an octree, and make its training."""
         setup = self.teacher
         generator = torch.Generator(setup.device).manual_seed(setup.seed)
         batches = PixelBatches(scene.splits["train"], setup.device)
@@ -157,11 +154,9 @@ class PlenOctree(Student):
         return OctreeTraining(octree, scene, budget, self.training, setup)
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Load the leaves that show anything, as they are stored."""
         self.octree = Octree.of(tensors, self.teacher.device).visible(self.stored)
 
     def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
-        """The cells that hold leaves, and one pass through them."""
         octree, stop, backend = self.octree, self.stop, self.teacher.backend
         faint = Sampling(stop=stop).least_weight
 
@@ -177,7 +172,6 @@ class PlenOctree(Student):
         return octree.occupancy, render
 
     def sizes(self) -> dict[str, int]:
-        """Bytes of the leaves' values and of the index, as they are stored."""
         return self.octree.sizes(2 if self.stored == "fp16" else 4)
 
     def settings(self) -> dict[str, str]:

@@ -35,9 +35,9 @@ CLAMP = 1e-3
 
 @dataclass(frozen=True)
 class Octree:
-    """Leaves of one size: V of the G^3 cells of the unit cube. Only positive densities are used
-    (ReLU). Two maps, of bricks of 8^3 leaves and of the leaves of each brick, replace all levels
-    above the leaves: a look-up takes two steps instead of nine."""
+    """Leaves of one size: V of the G^3 cells of the unit cube. Only positive densities are used.
+    Two maps, of bricks of 8^3 leaves and of the leaves of each brick, replace all levels above the
+    leaves: a look-up takes two steps instead of nine."""
 
     voxels: Voxels
     light: Light
@@ -127,10 +127,8 @@ def extract(
     seen = largest_weights(voxels, weigh, batches, options.rays, generator, backend)
     kept = (seen >= options.least_weight) & (density > 0)
     if not kept.any():
-        raise SteerbenchError(
-            f"octree: no leaf has a weight of {options.least_weight} on a training ray: expected "
-            "a trained field; give it more steps (budget.steps)"
-        )
+        none = f"octree: no leaf has a weight of {options.least_weight} on a training ray"
+        raise SteerbenchError(f"{none}: expected a trained field; give it more budget.steps")
     voxels = Voxels(voxels.coordinates[kept], resolution)
     harmonics = _harmonics(field, voxels, options.degree, options.directions)
     return Octree(voxels, Light(density[kept], harmonics))

@@ -40,9 +40,9 @@ f64 = np.float64
 def segment_weights(rays: Rays, crossings: Crossings, voxels: Voxels) -> Tensor:
     check_float32(rays.origins, rays.directions, crossings.near)
     weights = torch.empty(len(crossings), 8)
-    given = rays.origins, rays.directions, crossings.ray, crossings.near, crossings.far
-    cells = voxels.coordinates, crossings.voxel
-    _segment_weights(*arrays(*given, *cells), f32(voxels.resolution), weights.numpy())
+    segments = crossings.ray, crossings.near, crossings.far, voxels.coordinates, crossings.voxel
+    given = arrays(rays.origins, rays.directions, *segments)
+    _segment_weights(*given, f32(voxels.resolution), weights.numpy())
     return weights
 
 
@@ -63,10 +63,8 @@ def render_segments(
     else:
         check_float32(*given, *parts, table)
     if any(size % LANES for size in layers.hidden.shape):
-        raise ValueError(
-            f"backend 'cpu' has layers of multiples of {LANES}, got {list(layers.hidden.shape)}: "
-            "use backend='reference'"
-        )
+        got = f"got {list(layers.hidden.shape)}: use backend='reference'"
+        raise ValueError(f"backend 'cpu' has layers of multiples of {LANES}, {got}")
     pixels = Pixels.blank(len(towards), 3)
     crossed, shaded = torch.zeros(2, len(towards), dtype=torch.int32)
     _render(
@@ -167,13 +165,8 @@ def _layer(rows, inputs, count, weights, bias, outputs, relu):
 
 @njit(cache=True)
 def _shade(count, waiting, buffers, layers, sums, first):
-    """Add the colours of `count` segments to the `sums` of their rays, which begin at ray `first`.
-
-    Args:
-        waiting: what the hidden layer made of each segment, its ray and its weight.
-        buffers: for the outputs of both layers.
-        layers: what the directions add, geometry and its missing bias, colour and its bias.
-    """
+    """Add the colours of `count` segments, of which hidden channels, rays and weights were
+    `waiting`, to the `sums` of their rays, which begin at ray `first`."""
     hidden, rays, weights = waiting
     shown, raw = buffers
     towards, geometry, none, colour, colour_bias = layers

@@ -84,11 +84,8 @@ class _Blend(torch.autograd.Function):
 
 
 def _by_depth(depth: np.ndarray, extents: np.ndarray) -> np.ndarray:
-    """Indices of the visible Gaussians, nearest first; [n] int64.
-
-    Depths are positive, so their bits as integers have the same order. With the index in the lower
-    half, a fast sort of int64 is stable for equal depths.
-    """
+    """Indices [n] of the visible Gaussians, nearest first. Depths are positive, so their bits as
+    integers have the same order; with the index below them, a fast sort is stable."""
     shown = (extents[:, 0] > 0).nonzero()[0]
     keys = depth[shown].view(np.int32).astype(np.int64) << 32 | shown
     keys.sort()

@@ -77,10 +77,8 @@ def cases() -> list[Case]:
     )
     holds, why = "nothing shows, and no gradient is not finite", "decided by comparisons: 0 wrong"
     hidden = Property(PROJECT.subject, holds, why, on_backends(0, "fp64"))
-    found.append(slopes.case("in the picture", _slopes_error))
-    for name, changed in HIDDEN.items():
-        found.append(hidden.case(name, partial(_shown, changed)))
-    return found
+    found += (hidden.case(name, partial(_shown, changed)) for name, changed in HIDDEN.items())
+    return [*found, slopes.case("in the picture", _slopes_error)]
 
 
 def _given(count: int) -> Given:

@@ -96,11 +96,9 @@ def _reached(spans, row, size):
 
 @njit(cache=True, parallel=True)
 def _compare(picture, target, spans, slopes, sums, seen):
-    """Sums of the similarity of each row; its derivatives by the mean of x, of x x and of x y.
-
-    Only windows from which a difference can be `seen` are computed. A window in which both pictures
-    are equal has the similarity 1 and no gradient, because that is the maximum.
-    """
+    """Sums of the similarity of each row; its derivatives by the mean of x, of x x and of x y. Only
+    windows from which a difference can be `seen` are computed: where both pictures are equal, the
+    similarity is 1 and has no gradient, because that is the maximum."""
     height, size = picture.shape
     for row in prange(height):
         low, high = _reached(spans, row, size)
@@ -164,8 +162,5 @@ def _spread(picture, target, slopes, seen, grads):
         for k in range(3):
             _across(blurred[k], padded[k])
         for i in range(high - low):
-            grads[row, low + i] = (
-                blurred[0, i]
-                + TWO * picture[row, low + i] * blurred[1, i]
-                + target[row, low + i] * blurred[2, i]
-            )
+            x, y = picture[row, low + i], target[row, low + i]
+            grads[row, low + i] = blurred[0, i] + TWO * x * blurred[1, i] + y * blurred[2, i]

@@ -58,8 +58,8 @@ def locate(
 
 
 def order(networks: Tensor, count: int, *, backend: str = "auto") -> tuple[Tensor, Tensor]:
-    """Sort samples by their `networks` [S], integers below `count` (not checked), negative for none;
-    within a network they keep their order.
+    """Sort samples by their `networks` [S], integers below `count`, which is not checked, negative
+    for none; within a network they keep their order.
 
     Returns the samples [M] int64 that have a network, and offsets [N + 1] int64: network n owns
     offsets[n] to offsets[n + 1] of them.

@@ -187,13 +187,11 @@ def _layer(count: int, networks: int, inputs: int, outputs: int) -> Given:
 
 def _few(networks: int) -> Networks:
     """Their weights are at most 1 / 8."""
-    return {
-        name: (
-            _uniform(10 + n, networks, inputs, outputs) / 8,
-            _uniform(20 + n, networks, outputs) / 8,
-        )
-        for n, (name, (inputs, outputs)) in enumerate(SHAPES.items())
-    }
+    found = {}
+    for n, (name, shape) in enumerate(SHAPES.items()):
+        weights, biases = _uniform(10 + n, networks, *shape), _uniform(20 + n, networks, shape[1])
+        found[name] = weights / 8, biases / 8
+    return found
 
 
 def _in_cubes(count: int, networks: int) -> Given:

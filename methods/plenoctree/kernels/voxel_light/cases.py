@@ -53,10 +53,11 @@ RENDER = Operation(
 )
 
 
-def _visits(given: Given) -> Tensor:
-    """How often each voxel is seen."""
+def _slopes(given: Given) -> Tensor:
+    """How far the gradient of a voxel that is seen n times may be off."""
     voxels = len(given["harmonics"])
-    return torch.bincount(given["voxel"].long(), minlength=voxels).double()[:, None, None]
+    n = torch.bincount(given["voxel"].long(), minlength=voxels).double()[:, None, None]
+    return n * (2 * (COLOUR + 4) + 12 + n / 2) * U32
 
 
 SHADE = Operation(
@@ -74,7 +75,7 @@ SHADE = Operation(
             "n visits of a voxel: each a harmonic below 2, off by 48 u, times a slope of at most "
             "1 / 4, off as colours are and by 4 u; n sums of at most n / 2: n (2 (COLOUR + 4) + "
             "12 + n / 2) u",
-            lambda given: (n := _visits(given)) * (2 * (COLOUR + 4) + 12 + n / 2) * U32,
+            _slopes,
         )
     },
 )

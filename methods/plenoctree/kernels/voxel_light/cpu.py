@@ -118,10 +118,8 @@ def _shade(harmonics, voxel, ray, basis, terms, colours):
 
 @njit(cache=True, parallel=True)
 def _scatter(voxel, ray, basis, colours, grad, target, terms, parts):
-    """Adjoint of `_shade`: target[voxel] += Y(d) times the gradient before the sigmoid.
-
-    `basis` and `target` are flat, `parts` a power of two.
-    """
+    """Adjoint of `_shade`: target[voxel] += Y(d) times the gradient before the sigmoid. `basis` and
+    `target` are flat, `parts` a power of two."""
     for part in prange(parts):
         for i in range(len(voxel)):
             if (voxel[i] // NEAR) & (parts - 1) == part:
