@@ -13,7 +13,7 @@ from methods.diver.kernels.segments import segment_weights
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.corner_gather import corner_gather
 from methods.kernels.encode import encode
-from methods.kernels.types import Intervals, expect
+from methods.kernels.types import expect
 from methods.kernels.voxel_walk import Crossings, Voxels
 from methods.students.networks import positional
 from methods.students.voxels import corners_of, occupied_voxels
@@ -141,8 +141,3 @@ class CornerModel(nn.Module):
         device = self.table.device
         self._place(tensors["coordinates"].to(device))
         self.table = nn.Parameter(tensors["table"].to(device, copy=True))
-
-
-def as_intervals(crossings: Crossings) -> Intervals:
-    """Intervals for `composite`: densities are integrated already, so every length is 1."""
-    return Intervals(crossings.t, torch.ones_like(crossings.t), crossings.offsets)

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from bench.types import Budget, Rays, Scene
-from methods.diver.model import CornerModel, as_intervals, encode_directions
+from methods.diver.kernels.segments import as_intervals
+from methods.diver.model import CornerModel, encode_directions
 from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import STOP, composite, visible, weights

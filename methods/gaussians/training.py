@@ -182,19 +182,18 @@ def on_surfaces(
         colours.append(pixels.values[hit, :3] / pixels.alpha[hit, None])
         if sum(map(len, points)) >= count:
             break
-    found, shades = torch.cat(points), torch.cat(colours)
-    if not len(found):
+    if not (total := sum(map(len, points))):
         return anywhere(scene, count, generator)
     # Evenly spread, because rays are drawn picture by picture.
-    index = torch.arange(count, device=found.device) * len(found) // count
-    return found[index], shades[index].clamp(0, 1)
+    index = torch.arange(count, device=field.device) * total // count
+    return torch.cat(points)[index], torch.cat(colours)[index].clamp(0, 1)
 
 
 def anywhere(scene: Scene, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Draw `count` points uniformly inside the bounds of `scene`, with random colours."""
     low, high = scene.bounds.to(generator.device)
-    unit = torch.rand(2, count, 3, generator=generator, device=generator.device)
-    return low + unit[0] * (high - low), unit[1]
+    unit, colours = torch.rand(2, count, 3, generator=generator, device=generator.device)
+    return low + unit * (high - low), colours
 
 
 def spacing(points: Tensor) -> Tensor:

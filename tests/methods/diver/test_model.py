@@ -7,8 +7,9 @@ import math
 import torch
 
 from bench.types import NullProbe
+from methods.diver.kernels.segments import as_intervals
 from methods.diver.method import Baked
-from methods.diver.model import CornerModel, Decoder, as_intervals, encode_directions
+from methods.diver.model import CornerModel, Decoder, encode_directions
 from methods.kernels.composite import composite
 from methods.kernels.march.cases import some_rays
 from methods.kernels.voxel_walk import walk

@@ -12,13 +12,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from bench.types import Rays, check_shape
 from methods.kernels.composite import check_stop
 from methods.kernels.corner_gather import CORNERS
 from methods.kernels.dispatch import implementation
-from methods.kernels.types import Pixels, check_rays
+from methods.kernels.types import Intervals, Pixels, check_rays
 from methods.kernels.voxel_walk import Crossings, Voxels
 
 
@@ -44,6 +45,11 @@ class Layers:
     geometry: Tensor  # [H, H]
     colour: Tensor  # [3, H]
     colour_bias: Tensor  # [3]
+
+
+def as_intervals(crossings: Crossings) -> Intervals:
+    """Intervals for `composite`: densities are integrated already, so every length is 1."""
+    return Intervals(crossings.t, torch.ones_like(crossings.t), crossings.offsets)
 
 
 def segment_weights(

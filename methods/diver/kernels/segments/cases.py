@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -95,21 +95,29 @@ RENDER = Operation(
 
 def cases() -> list[Case]:
     """Segments of every kind; few and many rays, both types of tables, rays that end early, NaN."""
-    holds = "a NaN among the features spoils the rays through its voxels alone"
-    spoilt = Property("render_segments", holds, "exact", on_backends(0))
-    return [*_weights(), *_rendered(), spoilt.case("NaN in a corner", _nan_error)]
-
-
-def _weights() -> Iterator[Case]:
     exact = Property(
-        "segment_weights",
+        WEIGH.subject,
         "weights are those of a quadrature with four nodes, two more than a cubic needs",
         f"{WEIGHTS}; {PLACE}",
         on_backends(36 * SIDE + 16, "fp64"),
     )
+    holds = "a NaN among the features spoils the rays through its voxels alone"
+    spoilt = Property(RENDER.subject, holds, "exact", on_backends(0))
+    found = [spoilt.case("NaN in a corner", _nan_error)]
     for name, make in {"in a voxel": _inside, "rays through a full grid": _through}.items():
-        yield from WEIGH.cases(name, make)
-        yield exact.case(f"{name}, by quadrature", partial(_quadrature_error, make))
+        found += WEIGH.cases(name, make)
+        found.append(exact.case(f"{name}, by quadrature", partial(_quadrature_error, make)))
+    for name, given in {
+        "no ray": (SIDE, 0, torch.float32, 0.0, 0.0),
+        "one ray": (SIDE, 1, torch.float32, 0.0, 0.0),
+        "129 rays": (SIDE, 129, torch.float32, 0.0, 0.0),
+        "129 rays, table of bfloat16": (SIDE, 129, torch.bfloat16, 0.0, 0.0),
+        "129 rays, stop and faint": (SIDE, 129, torch.float32, 1e-4, 1e-5),
+        "8,192 rays in 64^3": (64, 1 << 13, torch.bfloat16, 1e-2, 1e-2),
+    }.items():
+        items = given[1] if given[1] > 129 else None
+        found += RENDER.cases(name, partial(scene, *given), items=items)
+    return found
 
 
 def _inside() -> Given:
@@ -154,20 +162,6 @@ def _quadrature_error(
     rays = Rays(rays.origins.to(dtype), rays.directions.to(dtype))
     crossings = replace(crossings, near=crossings.near.to(dtype), far=crossings.far.to(dtype))
     return largest_error((segment_weights(rays, crossings, voxels, backend=backend),), (exact,))
-
-
-def _rendered() -> Iterator[Case]:
-    kinds = {
-        "no ray": (SIDE, 0, torch.float32, 0.0, 0.0),
-        "one ray": (SIDE, 1, torch.float32, 0.0, 0.0),
-        "129 rays": (SIDE, 129, torch.float32, 0.0, 0.0),
-        "129 rays, table of bfloat16": (SIDE, 129, torch.bfloat16, 0.0, 0.0),
-        "129 rays, stop and faint": (SIDE, 129, torch.float32, 1e-4, 1e-5),
-        "8,192 rays in 64^3": (64, 1 << 13, torch.bfloat16, 1e-2, 1e-2),
-    }
-    for name, given in kinds.items():
-        items = given[1] if given[1] > 129 else None
-        yield from RENDER.cases(name, partial(scene, *given), items=items)
 
 
 def scene(side: int, count: int, dtype: torch.dtype, stop: float, faint: float) -> Given:

@@ -7,10 +7,10 @@ from torch import Tensor
 from torch.nn.functional import linear
 
 from bench.types import Rays
-from methods.diver.kernels.segments import Corners, Layers
+from methods.diver.kernels.segments import Corners, Layers, as_intervals
 from methods.kernels.composite import composite, visible, weights
 from methods.kernels.corner_gather import corner_gather, trilinear
-from methods.kernels.types import Intervals, Pixels
+from methods.kernels.types import Pixels
 from methods.kernels.voxel_walk import Crossings, Voxels, walk
 
 CHUNK_RAYS = 1 << 15
@@ -37,10 +37,10 @@ def render_segments(
 ) -> tuple[Pixels, Tensor, Tensor]:
     """Evaluates all segments, also those behind the end of a ray, whose weight is 0."""
     if len(towards) > CHUNK_RAYS:
+        chunks = (slice(at, at + CHUNK_RAYS) for at in range(0, len(towards), CHUNK_RAYS))
         parts = (
             render_segments(rays.take(some), corners, layers, towards[some], stop, faint)
-            for first in range(0, len(towards), CHUNK_RAYS)
-            for some in [slice(first, first + CHUNK_RAYS)]
+            for some in chunks
         )
         columns = ((*vars(pixels).values(), *counts) for pixels, *counts in parts)
         *joined, crossed, shaded = map(torch.cat, zip(*columns, strict=True))
@@ -48,12 +48,11 @@ def render_segments(
     crossings = walk(rays, corners.voxels, backend="reference")
     ray = crossings.ray.long()
     mean = segment_weights(rays, crossings, corners.voxels)
-    given = corners.table, corners.rows, crossings.voxel, mean
-    features = corner_gather(*given, backend="reference")
-    hidden = linear(features.to(towards).relu(), layers.hidden, layers.hidden_bias).relu()
+    read = corners.table, corners.rows, crossings.voxel, mean
+    features = corner_gather(*read, backend="reference").to(towards)
+    hidden = linear(features.relu(), layers.hidden, layers.hidden_bias).relu()
     density = linear(hidden, layers.density, layers.density_bias).relu().squeeze(1)
-    # Integrated already: every length is 1.
-    intervals = Intervals(crossings.t, torch.ones_like(crossings.t), crossings.offsets)
+    intervals = as_intervals(crossings)
     weight = weights(density, intervals, stop=stop, backend="reference")
     shown = (linear(hidden, layers.geometry) + towards[ray]).relu()
     colour = linear(shown, layers.colour, layers.colour_bias).sigmoid()
