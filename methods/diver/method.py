@@ -22,11 +22,6 @@ from methods.rendering.compaction import to_host
 from methods.rendering.frame import Render
 from methods.students.method import Student
 
-MULTIPLE = 16
-"""The resolution is a multiple of this: its cells are looked up in bricks of bricks."""
-
-FINEST = 512
-
 Stored = Literal["bf16", "fp32"]
 
 
@@ -115,8 +110,8 @@ class Diver(Student):
     def __post_init__(self) -> None:
         super().__post_init__()
         size = self.resolution
-        whole = MULTIPLE <= size <= FINEST and not size % MULTIPLE
-        expect(whole, "resolution", f"a multiple of {MULTIPLE} up to {FINEST}", size)
+        whole = 16 <= size <= 512 and not size % 16  # cells are looked up in bricks of bricks
+        expect(whole, "resolution", "a multiple of 16 up to 512", size)
         expect(self.stored in ("bf16", "fp32"), "stored", "bf16 or fp32", self.stored)
         expect(0 <= self.faint < 1, "faint", "a weight of 0 or more and less than 1", self.faint)
 

@@ -22,8 +22,6 @@ from methods.kilonerf.kernels.grouped_mlp import (
 )
 from methods.students.fields import REACH, StudentField
 
-DENSITY_LAYERS = ("in", "mid", "density")
-
 
 @dataclass(frozen=True)
 class Grid:
@@ -138,7 +136,7 @@ class KiloField(StudentField):
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:
         products = {name: inputs * outputs for name, (inputs, outputs) in SHAPES.items()}
-        density = sum(products[name] for name in DENSITY_LAYERS)
+        density = sum(products[name] for name in ("in", "mid", "density"))
         probe.count("products", density * samples + (sum(products.values()) - density) * shaded)
 
     def sizes(self) -> dict[str, int]:
