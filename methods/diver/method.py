@@ -70,8 +70,9 @@ class Baked:
         with probe.stage("segments"):
             encoded = encode_directions(rays.directions)
             towards = functional.linear(encoded, self.across, self.view_bias)
-            given, how = (rays, self.corners, layers, towards), {"stop": stop, "faint": faint}
-            pixels, crossed, shaded = render_segments(*given, **how, backend=self.backend)
+            pixels, crossed, shaded = render_segments(
+                rays, self.corners, layers, towards, stop=stop, faint=faint, backend=self.backend
+            )
         segments, colours = map(int, to_host([crossed.sum(), shaded.sum()]))
         probe.count("segments", segments)
         probe.count("shaded_segments", colours, segments)

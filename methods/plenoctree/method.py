@@ -161,9 +161,10 @@ class PlenOctree(Student):
         faint = Sampling(stop=stop).least_weight
 
         def render(_: Tensor, rays: Rays) -> Pixels:
-            given, how = (rays, octree.voxels, octree.light), {"stop": stop, "faint": faint}
             with probe.stage("render"):
-                pixels, crossed, shaded = render_voxels(*given, **how, backend=backend)
+                pixels, crossed, shaded = render_voxels(
+                    rays, octree.voxels, octree.light, stop=stop, faint=faint, backend=backend
+                )
                 samples, shown = to_host([crossed.sum(), shaded.sum()])
             probe.count("samples", samples)
             probe.count("shaded_samples", shown, samples)

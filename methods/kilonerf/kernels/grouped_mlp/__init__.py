@@ -43,8 +43,8 @@ Networks = Mapping[str, tuple[Tensor, Tensor]]
 def locate(
     positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor, *, backend: str = "auto"
 ) -> tuple[Tensor, Tensor]:
-    """The networks [S] int16 of `positions` [S, 3], -1 for none, and their places [S, 3] in its
-    cube, -1 to 1 along each axis. No gradient.
+    """The networks [S] int16 of `positions` [S, 3], -1 for none, and where these are in the cubes
+    of their networks [S, 3], -1 to 1 along each axis. No gradient.
 
     `cubes` [X, Y, Z] int16 are the networks of a grid of cubes of a `side` [], -1 for none; the
     first one has the lower `corner` [3].
@@ -109,7 +109,7 @@ def densities(
     """Densities [S] before their activation, and the input [S, 33] of `colours`, of samples at
     `positions` [S, 3] in the cubes of their networks, by their `numbers` [S] as for `order`.
 
-    The latter are the hidden channels, then the number, which is exact in float32. Densities and
+    `colours` takes the hidden channels, then the number, which is exact in float32. Densities and
     hidden channels are 0 where a sample has no network. Differentiable in the networks.
     """
     check_shape("positions", positions, None, 3)
