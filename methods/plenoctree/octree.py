@@ -185,8 +185,7 @@ def _harmonics(field: Field, voxels: Voxels, degree: int, directions: int) -> Te
 
 
 def fibonacci_sphere(count: int) -> Tensor:
-    """Unit vectors [count, 3], evenly spread: a turn of the golden angle for each equal step in
-    height."""
+    """Unit vectors [count, 3], evenly spread: a golden angle for each equal step in height."""
     i = torch.arange(count, dtype=torch.float64)
     z = 1 - (2 * i + 1) / count
     angle = i * math.pi * (3 - math.sqrt(5))
