@@ -1,39 +1,93 @@
-"""DIVeR (Wu et al. 2022), as a `bench.types.Method`."""
+"""DIVeR (Wu et al. 2022), as a `bench.types.Method`: what is baked for a frame (Section 3.4)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from bench.study import Axis, Study, Variant, turned
 from bench.types import Budget, Probe, Rays, Scene
-from methods.diver.decoder import Decoder
-from methods.diver.model import CornerModel
-from methods.diver.rendering import Baked, Stored
+from methods.diver.kernels.segments import Corners, Layers, render_segments
+from methods.diver.model import CornerModel, Decoder, encode_directions
 from methods.diver.training import DiverLessons, DiverTraining
 from methods.instant_ngp.stage1 import TrainedField
+from methods.kernels.corner_gather import CORNERS
 from methods.kernels.types import Occupancy, Pixels, expect
+from methods.rendering.compaction import to_host
 from methods.rendering.frame import Render
 from methods.students.method import Student
 
-MULTIPLE = 16
-"""The resolution is a multiple of this: its cells are looked up in bricks of bricks."""
+Stored = Literal["bf16", "fp32"]
 
-FINEST = 512
+
+class Baked:
+    """A trained model as it is rendered, with features of the corners in the type `stored`.
+
+    Integration is linear and its weights add up to 1, so the first layer of the decoder may come
+    before it: it is already applied to the corners. No ReLU separates the 32 outputs of the third
+    layer from the layer of the directions: the two are merged.
+    """
+
+    @torch.no_grad()
+    def __init__(self, model: CornerModel, stored: Stored) -> None:
+        decoder = model.decoder
+        table = functional.linear(model.table, decoder.first.weight, decoder.first.bias)
+        table = table.to(torch.bfloat16 if stored == "bf16" else torch.float32)
+        self.corners, self.backend = Corners(model.voxels, model.corners, table), model.backend
+        self.occupancy = Occupancy.at(model.voxels.coordinates, model.resolution)
+        along, across = decoder.view_parts()
+        third, bias = decoder.third.weight, decoder.third.bias
+        self.layers = Layers(
+            hidden=decoder.second.weight.detach(),
+            hidden_bias=decoder.second.bias.detach(),
+            density=third[:1],
+            density_bias=bias[:1],
+            geometry=along @ third[1:],
+            colour=decoder.colour.weight.detach(),
+            colour_bias=decoder.colour.bias.detach(),
+        )
+        self.across, self.view_bias = across.clone(), decoder.view.bias + along @ bias[1:]
+
+    def sizes(self) -> dict[str, int]:
+        """Bytes of the features, of a bit per cell that marks voxels, and of the decoder."""
+        decoder = (*vars(self.layers).values(), self.across, self.view_bias)
+        return {
+            "corners": self.corners.table.numel() * self.corners.table.element_size(),
+            "voxels": self.occupancy.cells.numel() // 8,
+            "decoder": 4 * sum(part.numel() for part in decoder),
+        }
+
+    @torch.no_grad()
+    def render_rays(self, rays: Rays, probe: Probe, stop: float, faint: float) -> Pixels:
+        """Render R `rays`, not composited on a background, with `stop` and `faint` as for
+        `render_segments`."""
+        layers = self.layers
+        with probe.stage("segments"):
+            encoded = encode_directions(rays.directions)
+            towards = functional.linear(encoded, self.across, self.view_bias)
+            pixels, crossed, shaded = render_segments(
+                rays, self.corners, layers, towards, stop=stop, faint=faint, backend=self.backend
+            )
+        segments, colours = map(int, to_host([crossed.sum(), shaded.sum()]))
+        probe.count("segments", segments)
+        probe.count("shaded_segments", colours, segments)
+        probe.count("table_reads", CORNERS * segments)
+        density = layers.hidden.numel() + layers.density.numel()
+        colour = layers.geometry.numel() + layers.colour.numel()
+        directions = self.across.numel() * len(rays.origins)
+        probe.count("products", segments * density + colours * colour + directions)
+        return pixels
 
 
 @dataclass(kw_only=True, eq=False)
 class Diver(Student):
-    """Corner features of sparse voxels, integrated along rays and decoded by a small network.
-
-    Attributes:
-        resolution: voxels along the unit cube, a multiple of 16, at most 512.
-        stored: "bf16" or "fp32", the precision of the corners' features when rendering.
-        faint: weight below which a segment has an opacity but no colour.
-    """
+    """Corner features of sparse voxels, integrated along rays and decoded by a small network; its
+    settings are explained in `sweeps/configs/method/diver.yaml`."""
 
     training: DiverLessons
     name: str = "diver"
@@ -57,13 +111,12 @@ class Diver(Student):
     def __post_init__(self) -> None:
         super().__post_init__()
         size = self.resolution
-        whole = MULTIPLE <= size <= FINEST and not size % MULTIPLE
-        expect(whole, "resolution", f"a multiple of {MULTIPLE} up to {FINEST}", size)
+        whole = 16 <= size <= 512 and not size % 16  # cells are looked up in bricks of bricks
+        expect(whole, "resolution", "a multiple of 16 up to 512", size)
         expect(self.stored in ("bf16", "fp32"), "stored", "bf16 or fp32", self.stored)
         expect(0 <= self.faint < 1, "faint", "a weight of 0 or more and less than 1", self.faint)
 
     def model_settings(self) -> Mapping[str, object]:
-        """The number of voxels."""
         return {"resolution": self.resolution}
 
     def begin(self, trained: TrainedField, scene: Scene, budget: Budget) -> DiverTraining:
@@ -73,7 +126,6 @@ class Diver(Student):
         return DiverTraining(model, scene, budget, self.training, self.teacher.seed)
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Load a model, and bake it."""
         device = self.teacher.device
         blank = torch.zeros(0, 3, dtype=torch.int32, device=device)
         model = CornerModel(blank, self.resolution, Decoder().to(device), self.teacher.backend)
@@ -81,15 +133,12 @@ class Diver(Student):
         self.baked = Baked(model, self.stored)
 
     def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
-        """The cells of its voxels, and the baked model."""
-
         def render(_: Tensor, rays: Rays) -> Pixels:
             return self.baked.render_rays(rays, probe, self.stop, self.faint)
 
         return self.baked.occupancy, render
 
     def sizes(self) -> dict[str, int]:
-        """Bytes of what `Baked` renders."""
         return self.baked.sizes()
 
     def settings(self) -> dict[str, str]:

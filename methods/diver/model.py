@@ -1,4 +1,4 @@
-"""Features at the corners of sparse voxels, and the decoder of their integrals."""
+"""Features at the corners of sparse voxels, and the decoder of their integrals (Wu et al. 2022)."""
 
 from __future__ import annotations
 
@@ -6,28 +6,76 @@ from collections.abc import Mapping
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from bench.types import Rays
-from methods.diver.decoder import CHANNELS, Decoder
 from methods.diver.kernels.segments import segment_weights
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.corner_gather import corner_gather
 from methods.kernels.encode import encode
-from methods.kernels.types import Intervals
+from methods.kernels.types import expect
 from methods.kernels.voxel_walk import Crossings, Voxels
+from methods.students.networks import positional
 from methods.students.voxels import corners_of, occupied_voxels
 from methods.training import checkpoint
 
+CHANNELS = 32
+"""Features of a corner, and width of every layer between input and output."""
+
+FREQUENCIES = 4
+DIRECTION_CHANNELS = 3 + 2 * 3 * FREQUENCIES
+
+
+def encode_directions(directions: Tensor) -> Tensor:
+    """Unit vectors of ray `directions` [R, 3], with sines and cosines of pi, 2 pi, 4 pi and 8 pi
+    times them: [R, 27]."""
+    return positional(functional.normalize(directions, dim=-1), FREQUENCIES)
+
+
+class Decoder(nn.Module):
+    """DIVeR32 (Section 3.3): a 32-32-32-33 network of integrated features, and a (32 + 27)-32-3
+    network of its last 32 outputs and the direction. ReLU between the layers of each, but not
+    between the two."""
+
+    def __init__(self, generator: torch.Generator | None = None) -> None:
+        super().__init__()
+        self.first = _linear(CHANNELS, CHANNELS, generator)
+        self.second = _linear(CHANNELS, CHANNELS, generator)
+        self.third = _linear(1 + CHANNELS, CHANNELS, generator)
+        self.view = _linear(CHANNELS, CHANNELS + DIRECTION_CHANNELS, generator)
+        self.colour = _linear(3, CHANNELS, generator)
+
+    def density(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Density [S], integrated over the segment, before its ReLU; and what `colours` needs
+        [S, 32]."""
+        hidden = self.second(self.first(features).relu()).relu()
+        sigma, geometry = self.third(hidden).split((1, CHANNELS), dim=1)
+        return sigma.squeeze(1), geometry
+
+    def view_parts(self) -> tuple[Tensor, Tensor]:
+        """Weights of the geometry [32, 32] and of the direction [32, 27] in the layer `view`."""
+        return self.view.weight.split((CHANNELS, DIRECTION_CHANNELS), dim=1)
+
+    def colours(self, geometry: Tensor, encoded: Tensor, ray: Tensor) -> Tensor:
+        """RGB [S, 3] in [0, 1] on rays `ray` [S] of encoded directions [R, 27]."""
+        along, across = self.view_parts()
+        # This layer is linear: the product of the directions is computed only once per ray.
+        towards = functional.linear(encoded, across, self.view.bias)
+        hidden = functional.linear(geometry, along) + towards.index_select(0, ray)
+        return self.colour(hidden.relu()).sigmoid()
+
+
+def _linear(outputs: int, inputs: int, generator: torch.Generator | None) -> nn.Linear:
+    layer = nn.utils.skip_init(nn.Linear, inputs, outputs)
+    bound = (6 / (inputs + outputs)) ** 0.5
+    nn.init.uniform_(layer.weight, -bound, bound, generator=generator)
+    nn.init.zeros_(layer.bias)
+    return layer
+
 
 class CornerModel(nn.Module):
-    """V voxels of a grid over the unit cube with features [C, 32] of their corners, and a decoder.
-
-    Args:
-        coordinates: [V, 3] int32, which voxels there are.
-        resolution: voxels along the cube.
-        decoder: decodes the integrals.
-        backend: backend of the kernels.
-    """
+    """V voxels of a grid over the unit cube, at `coordinates` [V, 3] int32, with features [C, 32]
+    of their corners, and a decoder."""
 
     table: nn.Parameter
 
@@ -41,30 +89,24 @@ class CornerModel(nn.Module):
         self.table = nn.Parameter(blank)
 
     @classmethod
+    @torch.no_grad()
     def taught(
         cls, trained: TrainedField, resolution: int, generator: torch.Generator
     ) -> CornerModel:
-        """Make a model with voxels where the trained field is occupied.
+        """Make a model with voxels where the trained field is occupied, and a random decoder.
 
-        The features of a corner are its hash encoding, 16 levels of 2, divided by their
-        standard deviation; the decoder is random.
-
-        Raises:
-            ValueError: the encoding has more than 32 channels.
+        The features of a corner are its hash encoding, 16 levels of 2, divided by their standard
+        deviation; ValueError if it has more than 32 channels.
         """
         field = trained.field
-        if field.grid.channels > CHANNELS:
-            raise ValueError(
-                f"a corner has {CHANNELS} features: expected a hash grid of at most as many "
-                f"channels, got {field.grid.channels}; choose fewer levels or features"
-            )
+        few = f"at most the {CHANNELS} channels of a corner: choose fewer levels or features"
+        expect(field.grid.channels <= CHANNELS, "grid", few, field.grid.channels)
         coordinates = occupied_voxels(trained.occupancy, resolution)
         decoder = Decoder(generator).to(field.device)
         model = cls(coordinates, resolution, decoder, field.backend)
-        with torch.no_grad():
-            positions = model.vertices / resolution
-            features = encode(positions, field.table, field.grid, backend=field.backend)
-            model.table[:, : features.shape[1]] = features / features.std().clamp(min=1e-8)
+        positions = model.vertices / resolution
+        features = encode(positions, field.table, field.grid, backend=field.backend)
+        model.table[:, : features.shape[1]] = features / features.std().clamp(min=1e-8)
         return model
 
     def _place(self, coordinates: Tensor) -> None:
@@ -94,13 +136,8 @@ class CornerModel(nn.Module):
         return decoder | {"coordinates": self.voxels.coordinates, "table": self.table.detach()}
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore what `tensors` returned, with as many voxels as there were."""
+        """Restore what `tensors` returned."""
         self.decoder.load_state_dict(checkpoint.part(tensors, "decoder."))
         device = self.table.device
         self._place(tensors["coordinates"].to(device))
         self.table = nn.Parameter(tensors["table"].to(device, copy=True))
-
-
-def as_intervals(crossings: Crossings) -> Intervals:
-    """Intervals for `composite`: densities are integrated already, so every length is 1."""
-    return Intervals(crossings.t, torch.ones_like(crossings.t), crossings.offsets)

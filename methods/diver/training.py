@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from bench.types import Budget, Rays, Scene
-from methods.diver.decoder import encode_directions
-from methods.diver.model import CornerModel, as_intervals
+from methods.diver.kernels.segments import as_intervals
+from methods.diver.model import CornerModel, encode_directions
 from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import STOP, composite, visible, weights
@@ -24,16 +24,8 @@ from methods.training.loop import step_at
 
 @dataclass(frozen=True)
 class DiverLessons(PixelOptions):
-    """How to train the model; `rate` is that of the decoder.
-
-    Attributes:
-        corner_rate: initial learning rate of the corners' features.
-        sparsity: weight of the mean of log(1 + 2 sigma^2) over the segments that are not hidden,
-            with sigma before its ReLU: negative values are drawn back to 0.
-        prune_at: share of the steps after which voxels that hardly show are pruned.
-        prune_below: a voxel is pruned if its weight on all traced rays is below this.
-        prune_rays: random training rays that are traced for this, at most as many as there are.
-    """
+    """How to train the model, as `sweeps/configs/method/diver.yaml` explains; `rate` is that of the
+    decoder."""
 
     rate: float = 5e-3
     opacity_entropy: float = 0.0
@@ -53,7 +45,7 @@ class DiverLessons(PixelOptions):
 
 
 class DiverTraining(PixelTraining):
-    """Trains corners and decoder on some thousand rays a step, as a `loop.Training`."""
+    """Trains corners and decoder on some thousand rays a step."""
 
     options: DiverLessons
 
@@ -68,7 +60,6 @@ class DiverTraining(PixelTraining):
         self.grad = torch.zeros_like(model.table)
 
     def advance(self) -> dict[str, float]:
-        """Take one step; return its mean squared error."""
         if self.step == int(self.options.prune_at * self.steps):
             self._prune()
         return super().advance()
@@ -94,7 +85,7 @@ class DiverTraining(PixelTraining):
 
     def _push_to_sparsity(self, raw: Tensor, count: int) -> None:
         """Add the gradient of the sparsity term, the mean of log(1 + 2 sigma^2), to that of the
-        first `count` densities `raw`."""
+        first `count` densities `raw`, before their ReLU: negative ones are drawn back to 0."""
         if self.options.sparsity and raw.requires_grad:
             slope = 4 * raw.detach() / (1 + 2 * raw.detach().square())
             slope[count:] = 0
@@ -104,23 +95,21 @@ class DiverTraining(PixelTraining):
     @torch.no_grad()
     def _densities(self, rays: Rays, crossings: Crossings) -> Tensor:
         """Integrated densities [S]."""
-        model = self.model
-        weight = model.weights(rays, crossings)
+        model, weight = self.model, self.model.weights(rays, crossings)
         features = model.features(pad(crossings.voxel), pad(weight))
         return model.decoder.density(features)[0][: len(crossings)].relu()
 
     @torch.no_grad()
     def _prune(self) -> None:
-        """Prune the voxels that have less than a certain weight on all of many rays (their
-        Section 4.1)."""
+        """Prune the voxels that hardly show on any of many rays (their Section 4.1)."""
         model, options = self.model, self.options
 
         def weigh(rays: Rays, crossings: Crossings) -> Tensor:
             sigma = self._densities(rays, crossings)
             return weights(sigma, as_intervals(crossings), stop=STOP, backend=model.backend)
 
-        looked_along = self.batches, options.prune_rays, self.generator
-        largest = largest_weights(model.voxels, weigh, *looked_along, model.backend)
+        rays = self.batches, options.prune_rays, self.generator
+        largest = largest_weights(model.voxels, weigh, *rays, model.backend)
         rows = model.keep(largest >= options.prune_below).long()
         moments = self.moments
         self.moments = AdamState(moments.first[rows], moments.second[rows], moments.steps[rows])
@@ -134,20 +123,17 @@ class DiverTraining(PixelTraining):
         sparse_adam_(table, self.grad, self.moments, corner_rate, backend=self.model.backend)
 
     def watched(self) -> dict[str, Tensor]:
-        """Features, their moments, the decoder."""
         moments = self.moments.first + self.moments.second
         decoder = dict(self.model.decoder.named_parameters())
         return {"corner features": self.model.table, "their moments": moments, **decoder}
 
     def result(self) -> dict[str, Tensor]:
-        """The model."""
         return self.model.tensors()
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
         self.model.load(tensors)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """Optimisers, random numbers, number of rays."""
         tensors, figures = super().state()
         tensors |= self.moments.tensors("moments.")
         return tensors | checkpoint.optimiser_tensors(self.networks, "adam."), figures

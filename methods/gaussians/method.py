@@ -15,10 +15,8 @@ from bench.study import Axis, Study, Variant, turned
 from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.gaussians import ply
-from methods.gaussians.model import Gaussians
-from methods.gaussians.start import anywhere, on_surfaces, spacing
-from methods.gaussians.storage import rounded, stored_bytes
-from methods.gaussians.training import Fitting, GaussianTraining
+from methods.gaussians.model import Gaussians, rounded, stored_bytes
+from methods.gaussians.training import Fitting, GaussianTraining, anywhere, on_surfaces, spacing
 from methods.instant_ngp.field import Precision
 from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
 from methods.instant_ngp.training import TrainingOptions
@@ -32,20 +30,8 @@ from methods.training import loop
 
 @dataclass(kw_only=True, eq=False)
 class GaussianSplatting:
-    """3D Gaussians, whose number is a setting. A training also writes them to a PLY file.
-
-    Attributes:
-        grid, training, precision: of the field that they start from; all methods with the same
-            options share it.
-        fitting: how they are trained, for `budget.renderer_steps` steps.
-        count: number of Gaussians.
-        degree: degree of the spherical harmonics of a colour, 0 to 3.
-        start: "field": on the surfaces of a trained Instant-NGP field; "scratch": anywhere.
-        checkpoint: a PLY file to show instead of training, in the coordinates of the data set.
-        stored: "fp32", or "int8": rounded after training, means to 16 bits, everything else to 8.
-        stop: transmittance at which a pixel ends, less than 1.
-        name: as shown in result rows.
-    """
+    """3D Gaussians, with the settings of `sweeps/configs/method/gaussians.yaml`; `grid`, `training`
+    and `precision` are those of the field that they start from."""
 
     grid: HashGrid
     training: TrainingOptions
@@ -97,55 +83,45 @@ class GaussianSplatting:
         self.background = scene.background.to(self.setup.device)
 
     def _trained(self, scene: Scene, budget: Budget, log: Log) -> Gaussians:
-        setup, key, field = self.setup, self._key(scene, budget), None
-        if self.start == "field":
-            field = train_field(setup, scene, budget, log)
-            key["field"] = setup.key(scene, budget)
-        finished = log.stage_dir("gaussians", key) / "gaussians.safetensors"
-        begun = time.monotonic()
-        gaussians = self._untrained(field, scene, finished.exists())
-        work = GaussianTraining(
-            gaussians, scene, budget.renderer_steps, self.fitting, setup.backend, setup.seed
-        )
-        work.seconds = time.monotonic() - begun
-        loop.train(work, finished, "gaussians", log)
-        self.train_s = work.seconds + (0.0 if field is None else field.train_s)
-        exported = finished.with_suffix(".ply")
-        if not exported.exists():
-            ply.write(gaussians, scene, exported)
-            log.info(f"Gaussians for other programs: {exported}")
-        return gaussians
-
-    def _untrained(self, field: TrainedField | None, scene: Scene, blank: bool) -> Gaussians:
-        """The Gaussians before training; with `blank`, placeholders of the same shape."""
-        setup = self.setup
-        generator = torch.Generator(setup.device).manual_seed(setup.seed)
-        if blank:
-            points = colours = torch.zeros(self.count, 3, device=setup.device)
-            scales = torch.ones(self.count, device=setup.device)
-        else:
-            points, colours = (
-                anywhere(scene, self.count, generator)
-                if field is None
-                else on_surfaces(field, scene, self.count, generator)
-            )
-            scales = self.fitting.size * spacing(points)
-        return Gaussians.at(points, colours, scales, self.fitting.opacity, self.degree)
-
-    def _key(self, scene: Scene, budget: Budget) -> dict[str, object]:
-        """Everything the Gaussians depend on, besides the field that they start from."""
-        return {
+        setup, field = self.setup, None
+        key = {
             "scene": scene.digest,
             "steps": budget.renderer_steps,
             "fitting": asdict(self.fitting),
             "count": self.count,
             "degree": self.degree,
             "start": self.start,
-            "backend": self.setup.backend,
-            "device": self.setup.device.type,
-            "seed": self.setup.seed,
-            **computed_by(GaussianTraining, on_surfaces),
+            "backend": setup.backend,
+            "device": setup.device.type,
+            "seed": setup.seed,
+            **computed_by(GaussianTraining),
         }
+        if self.start == "field":
+            field = train_field(setup, scene, budget, log)
+            key["field"] = setup.key(scene, budget)
+        finished = log.stage_dir("gaussians", key) / "gaussians.safetensors"
+        begun = time.monotonic()
+        gaussians = self._untrained(field, scene, finished.exists())
+        work = GaussianTraining(gaussians, scene, budget.renderer_steps, self.fitting, setup)
+        work.seconds = time.monotonic() - begun
+        loop.train(work, finished, "gaussians", log)
+        self.train_s = work.seconds + (0.0 if field is None else field.train_s)
+        if not (exported := finished.with_suffix(".ply")).exists():
+            ply.write(gaussians, scene, exported)
+            log.info(f"Gaussians for other programs: {exported}")
+        return gaussians
+
+    def _untrained(self, field: TrainedField | None, scene: Scene, blank: bool) -> Gaussians:
+        """The Gaussians before training; with `blank`, placeholders of the same shape."""
+        device = self.setup.device
+        if blank:
+            points = colours = torch.zeros(self.count, 3, device=device)
+            scales = torch.ones(self.count, device=device)
+        else:
+            given = scene, self.count, torch.Generator(device).manual_seed(self.setup.seed)
+            points, colours = anywhere(*given) if field is None else on_surfaces(field, *given)
+            scales = self.fitting.size * spacing(points)
+        return Gaussians.at(points, colours, scales, self.fitting.opacity, self.degree)
 
     def reset(self) -> None:
         """Do nothing: every frame stands alone."""
@@ -160,9 +136,8 @@ class GaussianSplatting:
 
     def sizes(self) -> dict[str, int]:
         """Bytes of the Gaussians' parameters, as they are stored."""
-        if self.stored == "int8":
-            return {"gaussians": stored_bytes(self.gaussians)}
-        return {"gaussians": sum(4 * x.numel() for x in self.gaussians.parameters())}
+        plain = sum(4 * x.numel() for x in self.gaussians.parameters())
+        return {"gaussians": plain if self.stored == "fp32" else stored_bytes(self.gaussians)}
 
     def settings(self) -> dict[str, str]:
         return self.setup.settings() | {"precision": self.stored, "engine": "none"}

@@ -1,4 +1,4 @@
-"""A scene as 3D Gaussians, and its pictures (Kerbl et al. 2023)."""
+"""A scene as 3D Gaussians, its pictures (Kerbl et al. 2023), and how it is stored in few bytes."""
 
 from __future__ import annotations
 
@@ -17,27 +17,21 @@ from methods.kernels.types import Pixels
 Y00 = 1 / math.sqrt(4 * math.pi)
 """The first spherical harmonic, a constant."""
 
+OUTLIERS = 1e-3
+"""Share of the harmonics, at either end, that is clipped: a few outliers make all steps coarse."""
+
 
 class Gaussians(nn.Module):
-    """N Gaussians.
-
-    Attributes:
-        means: [N, 3] centres, scene units.
-        log_scales: [N, 3] logarithms of the standard deviations along their axes.
-        rotations: [N, 4] quaternions (w, x, y, z), not normalised.
-        logits: [N] logits of the opacity at the centre.
-        base: [N, 1, 3] coefficients of the first spherical harmonic.
-        view: [N, C - 1, 3] those of the others, in the order of `methods.kernels.spherical`.
-    """
+    """N Gaussians."""
 
     def __init__(
         self,
-        means: Tensor,
-        log_scales: Tensor,
-        rotations: Tensor,
-        logits: Tensor,
-        base: Tensor,
-        view: Tensor,
+        means: Tensor,  # [N, 3] centres, scene units
+        log_scales: Tensor,  # [N, 3] logarithms of the standard deviations along their axes
+        rotations: Tensor,  # [N, 4] quaternions (w, x, y, z), not normalised
+        logits: Tensor,  # [N] of the opacity at the centre
+        base: Tensor,  # [N, 1, 3] coefficients of the first spherical harmonic
+        view: Tensor,  # [N, C - 1, 3] of the others, in the order of `methods.kernels.spherical`
     ) -> None:
         super().__init__()
         self.means = nn.Parameter(means)
@@ -72,21 +66,12 @@ class Gaussians(nn.Module):
         return self.logits.sigmoid()
 
     def render(self, camera: Camera, stop: float, probe: Probe, backend: str = "auto") -> Pixels:
-        """Render the pixels of `camera`, row by row, not composited on a background.
-
-        Differentiable in all parameters, except for the change of a colour with the direction in
-        which the mean is seen.
-        """
+        """Render the pixels of `camera`, row by row, not composited on a background; differentiable
+        in all parameters, but for the change of a colour with the direction of the mean."""
         with probe.stage("project"):
             opacities = self.opacities
-            ellipses = project_gaussians(
-                self.means,
-                self.log_scales.exp(),
-                self.rotations,
-                opacities,
-                camera,
-                backend=backend,
-            )
+            shape = self.means, self.log_scales.exp(), self.rotations
+            ellipses = project_gaussians(*shape, opacities, camera, backend=backend)
         probe.count("gaussians", (ellipses.extents[:, 0] > 0).sum(), len(self))
         with probe.stage("shade"):
             towards = functional.normalize(self.means.detach() - camera.c2w[:, 3], dim=1)
@@ -95,3 +80,39 @@ class Gaussians(nn.Module):
         with probe.stage("blend"):
             size = camera.width, camera.height
             return blend(ellipses, opacities, colours, *size, stop=stop, backend=backend)
+
+
+def rounded(gaussians: Gaussians) -> Gaussians:
+    """Gaussians as they come back from storage: means in 16 bits, everything else in 8; opacities
+    as they are, scales as logarithms, rotations normalised."""
+    opacities = _levels(gaussians.opacities, 8).clamp(1e-6, 1 - 1e-6)
+    return Gaussians(
+        _levels(gaussians.means, 16),
+        _levels(gaussians.log_scales, 8),
+        _levels(functional.normalize(gaussians.rotations, dim=1), 8),
+        opacities.logit(),
+        _levels(gaussians.base, 8, OUTLIERS),
+        _levels(gaussians.view, 8, OUTLIERS),
+    )
+
+
+def stored_bytes(gaussians: Gaussians) -> int:
+    """Bytes of rounded parameters, and of the two extremes of each column."""
+    total = 0
+    for name, values in gaussians.named_parameters():
+        width = 2 if name == "means" else 1
+        total += (len(values) * width + 2 * 4) * (values.numel() // len(values))
+    return total
+
+
+def _levels(values: Tensor, bits: int, outliers: float = 0.0) -> Tensor:
+    """`values` [N, ...], each column rounded to 2^bits levels, evenly between its extremes."""
+    columns = values.detach().reshape(len(values), math.prod(values.shape[1:]))
+    if not columns.numel():
+        return values.detach().clone()
+    skipped = int(outliers * len(columns))
+    low = columns.kthvalue(1 + skipped, dim=0).values
+    high = columns.kthvalue(len(columns) - skipped, dim=0).values
+    step = ((high - low) / (2**bits - 1)).clamp(min=torch.finfo(columns.dtype).tiny)
+    level = ((columns.clamp(low, high) - low) / step).round()
+    return (low + level * step).view_as(values)

@@ -50,43 +50,42 @@ def write(gaussians: Gaussians, scene: Scene, path: Path) -> None:
 
 
 def read(path: Path, scene: Scene) -> Gaussians:
-    """Read the Gaussians of a file in the coordinates of the data set of `scene`.
+    """Read the Gaussians of a file in the coordinates of the data set of `scene`; SteerbenchError
+    says what is wrong with the file or its numbers, or that nothing lies inside the scene."""
 
-    Raises:
-        SteerbenchError: the file is missing, truncated or of another kind; values are not finite;
-            rotations are zeros; nothing lies inside the bounds of the scene.
-    """
-    vertices = _vertices(path)
+    def refuse(wrong: bool, why: str) -> None:
+        if wrong:
+            raise SteerbenchError(f"{path}: {why}")
+
+    refuse(not path.is_file(), "expected a PLY file of 3D Gaussians, there is none")
+    try:
+        vertices: np.ndarray = PlyData.read(path, mmap=False)["vertex"].data
+    except (PlyParseError, KeyError, ValueError, UnicodeDecodeError) as error:
+        why = "expected a PLY file of 3D Gaussians, could not read one"
+        raise SteerbenchError(f"{path}: {why} ({error})") from error
+    refuse(not len(vertices), "expected 3D Gaussians, it has none")
     names = vertices.dtype.names or ()
-    if missing := [name for name in NEEDED if name not in names]:
-        raise SteerbenchError(
-            f"{path}: expected the properties of 3D Gaussians, there is no {', '.join(missing)}"
-        )
+    missing = ", ".join(name for name in NEEDED if name not in names)
+    refuse(bool(missing), f"expected the properties of 3D Gaussians, there is no {missing}")
     rest = sorted((n for n in names if n.startswith("f_rest_")), key=lambda n: int(n[7:]))
-    if len(rest) not in (0, 9, 24, 45):
-        raise SteerbenchError(
-            f"{path}: expected 0, 9, 24 or 45 properties f_rest_* (degrees 0 to 3), got {len(rest)}"
-        )
+    degrees = "0, 9, 24 or 45 properties f_rest_* (degrees 0 to 3)"
+    refuse(len(rest) not in (0, 9, 24, 45), f"expected {degrees}, got {len(rest)}")
 
     def columns(*group: str) -> Tensor:
         return torch.from_numpy(np.stack([vertices[name] for name in group], axis=1)).float()
 
-    read = columns(*NEEDED, *rest)
-    if bad := int((~read.isfinite()).any(dim=1).sum()):
-        raise SteerbenchError(f"{path}: {bad:,} of {len(read):,} Gaussians are not finite")
+    of_all = f"of {len(vertices):,} Gaussians"
+    bad = int((~columns(*NEEDED, *rest).isfinite()).any(dim=1).sum())
+    refuse(bad > 0, f"{bad:,} {of_all} are not finite")
     rotations = columns(*ROTATION)
-    if bad := int((rotations == 0).all(dim=1).sum()):
-        raise SteerbenchError(
-            f"{path}: {bad:,} of {len(read):,} Gaussians have a rotation of zeros"
-        )
+    bad = int((rotations == 0).all(dim=1).sum())
+    refuse(bad > 0, f"{bad:,} {of_all} have a rotation of zeros")
     means = (columns(*POSITION) - scene.origin) / scene.unit_length
     low, high = scene.bounds
-    if not ((means >= low) & (means <= high)).all(dim=1).any():
-        raise SteerbenchError(
-            f"{path}: none of its {len(read):,} Gaussians lies inside the scene: expected the "
-            "coordinates of the data set"
-        )
-    view = columns(*rest).view(-1, 3, len(rest) // 3) if rest else torch.zeros(len(read), 3, 0)
+    inside = ((means >= low) & (means <= high)).all(dim=1).any()
+    elsewhere = "lies inside the scene: expected the coordinates of the data set"
+    refuse(not inside, f"none {of_all} {elsewhere}")
+    view = columns(*rest).view(-1, 3, len(rest) // 3) if rest else torch.zeros(len(means), 3, 0)
     return Gaussians(
         means,
         columns(*SCALE) - math.log(scene.unit_length),
@@ -95,20 +94,6 @@ def read(path: Path, scene: Scene) -> Gaussians:
         columns(*BASE)[:, None],
         _flipped(view.transpose(1, 2).contiguous()),
     )
-
-
-def _vertices(path: Path) -> np.ndarray:
-    if not path.is_file():
-        raise SteerbenchError(f"{path}: expected a PLY file of 3D Gaussians, there is none")
-    try:
-        vertices: np.ndarray = PlyData.read(path, mmap=False)["vertex"].data
-    except (PlyParseError, KeyError, ValueError, UnicodeDecodeError) as error:
-        raise SteerbenchError(
-            f"{path}: expected a PLY file of 3D Gaussians, could not read one ({error})"
-        ) from error
-    if not len(vertices):
-        raise SteerbenchError(f"{path}: expected 3D Gaussians, it has none")
-    return vertices
 
 
 def _flipped(view: Tensor) -> Tensor:

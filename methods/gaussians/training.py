@@ -1,43 +1,52 @@
-"""Training of Gaussians on pictures (Kerbl et al. 2023, Section 5; Kheradmand et al. 2024)."""
+"""Training of Gaussians on pictures (Kerbl et al. 2023, Section 5): where they start, and how faded
+ones are relocated and explore (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte
+Carlo"). Their number is fixed.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
+from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn import functional
 
 from bench.cameras import place_camera, scale_camera
 from bench.types import Camera, NullProbe, Scene, composite
+from methods.gaussians.kernels.projection import covariances
 from methods.gaussians.kernels.ssim import ssim
-from methods.gaussians.mcmc import disturb, relocate
 from methods.gaussians.model import Gaussians
+from methods.instant_ngp.pixels import PixelBatches
+from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.kernels.composite import STOP
 from methods.kernels.types import expect
+from methods.rendering.frame import render_rays
 from methods.training import checkpoint, loop
+
+SOLID = 0.5
+"""Opacity above which a ray counts as ending at a surface."""
+
+NEIGHBOURS = 3
+
+DEAD = 0.005
+"""A Gaussian whose opacity is at most this is dead, and is relocated."""
+
+MOST_COPIES = 51
+"""Maximum number of Gaussians in one place after a relocation, as in the release."""
+
+STEEPNESS, FAINT = 100.0, 0.005
+"""Noise falls off around the opacity `FAINT` as a sigmoid of this steepness (their Eq. 10)."""
 
 
 @dataclass(frozen=True)
 class Fitting:
-    """How to train Gaussians; rates are those of Adam.
-
-    Attributes:
-        means, scales, rotations, opacities, colours: learning rates; harmonics beyond the first
-            have a twentieth of `colours`. Means are in scene units.
-        final_means: share of the rate of the means that is left at the end; it falls exponentially.
-        similarity: weight of 1 - SSIM; the mean absolute error has the rest.
-        opacity_cost, scale_cost: weights of the mean opacity and of the mean scale, so that
-            Gaussians that are not needed fade.
-        noise: noise on the means, as a multiple of their rate.
-        every: steps between two relocations of faded Gaussians.
-        relocate_from, relocate_to: shares of the training between which they are relocated.
-        half: share of the training, at its beginning, on pictures of half the resolution.
-        opacity: initial opacity.
-        size: initial scales, as a multiple of the distance between neighbours.
-    """
+    """How to train Gaussians, as `sweeps/configs/method/gaussians.yaml` explains; the learning rate
+    of the means is in scene units."""
 
     means: float = 3e-4
     final_means: float = 0.01
@@ -63,50 +72,37 @@ class Fitting:
 
 
 class GaussianTraining:
-    """Trains Gaussians, as a `methods.training.loop.Training`: on one picture per step."""
+    """A `methods.training.loop.Training` on one picture a step."""
 
     advice = "Try a smaller rate (method.fitting.means)."
     asked: loop.Asked | None = None
 
     def __init__(
-        self,
-        gaussians: Gaussians,
-        scene: Scene,
-        steps: int,
-        options: Fitting,
-        backend: str,
-        seed: int,
+        self, gaussians: Gaussians, scene: Scene, steps: int, options: Fitting, setup: Setup
     ) -> None:
-        device = gaussians.means.device
-        self.gaussians, self.options, self.backend = gaussians, options, backend
+        self.gaussians, self.options, self.backend = gaussians, options, setup.backend
         self.step, self.steps, self.seconds = 0, steps, 0.0
-        self.split, self.background = scene.splits["train"], scene.background.to(device)
-        self.generator = torch.Generator(device).manual_seed(seed)
+        self.split, self.background = scene.splits["train"], scene.background.to(setup.device)
+        self.generator = torch.Generator(setup.device).manual_seed(setup.seed)
         self.views: list[int] = []  # still to come in this pass over the pictures
 
     @cached_property
     def optimiser(self) -> torch.optim.Adam:
         """Created when first needed, like that of a field."""
-        options = self.options
-        rates = {
-            "means": options.means,
-            "log_scales": options.scales,
-            "rotations": options.rotations,
-            "logits": options.opacities,
-            "base": options.colours,
-            "view": options.colours / 20,
-        }
-        groups = [
-            {"params": [getattr(self.gaussians, name)], "lr": rate} for name, rate in rates.items()
-        ]
+        gaussians, options = self.gaussians, self.options
+        rates = (
+            (gaussians.means, options.means),
+            (gaussians.log_scales, options.scales),
+            (gaussians.rotations, options.rotations),
+            (gaussians.logits, options.opacities),
+            (gaussians.base, options.colours),
+            (gaussians.view, options.colours / 20),
+        )
+        groups = [{"params": [parameter], "lr": rate} for parameter, rate in rates]
         return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def advance(self) -> dict[str, float]:
-        """Take one step; return its mean squared error, see `loop.look`.
-
-        Raises:
-            SteerbenchError: the error is not finite.
-        """
+        """Take one step; return its mean squared error, where `loop.look` does."""
         options, gaussians = self.options, self.gaussians
         share = self.step / self.steps
         camera, target = self._picture(half=share < options.half)
@@ -115,10 +111,9 @@ class GaussianTraining:
         loss = (1 - options.similarity) * functional.l1_loss(picture, target)
         if options.similarity:
             loss = loss + options.similarity * (1 - ssim(picture, target, backend=self.backend))
-        costs = (
-            options.opacity_cost * gaussians.opacities.mean()
-            + options.scale_cost * gaussians.log_scales.exp().mean()
-        )
+        # Gaussians that are not needed fade.
+        costs = options.opacity_cost * gaussians.opacities.mean()
+        costs = costs + options.scale_cost * gaussians.log_scales.exp().mean()
         (loss + costs).backward()
         errors = loop.look(self, {"": functional.mse_loss(picture, target)}, {"picture": picture})
         rate = options.means * options.final_means**share
@@ -135,18 +130,16 @@ class GaussianTraining:
     def _picture(self, half: bool) -> tuple[Camera, Tensor]:
         """The next training view and its picture [H, W, 3]; a pass uses every view once."""
         if not self.views:
-            order = torch.randperm(
-                len(self.split), generator=self.generator, device=self.generator.device
-            )
+            count, generator = len(self.split), self.generator
+            order = torch.randperm(count, generator=generator, device=generator.device)
             self.views = order.tolist()
         view = self.views.pop()
         camera, device = self.split.cameras[view], self.background.device
         picture = composite(self.split.images[view].to(device, non_blocking=True), self.background)
         if half and min(camera.width, camera.height) > 1:
             camera = scale_camera(camera, camera.width // 2, camera.height // 2)
-            shrunk = functional.interpolate(
-                picture.movedim(-1, 0)[None], size=(camera.height, camera.width), mode="area"
-            )
+            planes, size = picture.movedim(-1, 0)[None], (camera.height, camera.width)
+            shrunk = functional.interpolate(planes, size=size, mode="area")
             picture = shrunk[0].movedim(0, -1).contiguous()
         return place_camera(camera, device), picture
 
@@ -160,11 +153,8 @@ class GaussianTraining:
         self.gaussians.load_state_dict({name: tensors[name] for name in self.result()})
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """The optimiser, random numbers, and the views still to come."""
-        more = {
-            "generator": self.generator.get_state(),
-            "views": torch.tensor(self.views, dtype=torch.int64),
-        }
+        views = torch.tensor(self.views, dtype=torch.int64)
+        more = {"generator": self.generator.get_state(), "views": views}
         return checkpoint.optimiser_tensors(self.optimiser, "adam.") | more, {}
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
@@ -172,3 +162,96 @@ class GaussianTraining:
         checkpoint.restore_optimiser(self.optimiser, tensors, "adam.")
         self.generator.set_state(tensors["generator"].cpu())
         self.views = tensors["views"].tolist()
+
+
+def on_surfaces(
+    trained: TrainedField, scene: Scene, count: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Choose `count` points where rays of random training pixels end, and their colours: [count, 3]
+    each. If the pictures show too little matter, points are taken more than once."""
+    field = trained.field
+    batches = PixelBatches(scene.splits["train"], field.device)
+    points, colours = [], []
+    for _ in range(64):  # too few if less than 1/64 of the pixels show matter
+        rays, _ = batches.draw(count, generator)
+        pixels = render_rays(field, rays, trained.occupancy, NullProbe(), trained.sampling)
+        hit = pixels.alpha > SOLID
+        depth = pixels.depth_sum[hit] / pixels.alpha[hit]
+        points.append(rays.origins[hit] + depth[:, None] * rays.directions[hit])
+        colours.append(pixels.values[hit, :3] / pixels.alpha[hit, None])
+        if sum(map(len, points)) >= count:
+            break
+    if not (total := sum(map(len, points))):
+        return anywhere(scene, count, generator)
+    # Evenly spread, because rays are drawn picture by picture.
+    index = torch.arange(count, device=field.device) * total // count
+    return torch.cat(points)[index], torch.cat(colours)[index].clamp(0, 1)
+
+
+def anywhere(scene: Scene, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Draw `count` points uniformly inside the bounds of `scene`, with random colours."""
+    low, high = scene.bounds.to(generator.device)
+    unit, colours = torch.rand(2, count, 3, generator=generator, device=generator.device)
+    return low + unit * (high - low), colours
+
+
+def spacing(points: Tensor) -> Tensor:
+    """Root mean square distance [N] of each point from its nearest neighbours, more than 0."""
+    if len(points) <= NEIGHBOURS:
+        return torch.full_like(points[:, 0], 0.01)
+    places = points.cpu().numpy()
+    distances, _ = KDTree(places).query(places, NEIGHBOURS + 1, workers=torch.get_num_threads())
+    mean = np.sqrt(np.square(distances[:, 1:]).mean(axis=1))
+    return torch.from_numpy(mean).to(points).clamp(min=1e-5)
+
+
+@torch.no_grad()
+def relocate(
+    gaussians: Gaussians, optimiser: torch.optim.Optimizer, generator: torch.Generator
+) -> int:
+    """Move dead Gaussians to living ones, drawn in proportion to opacity; return how many moved.
+    Together, a living one and its copies look as it did alone (their Eq. 9). The optimiser's
+    moments of all Gaussians that changed are set to 0."""
+    opacities = gaussians.opacities
+    dead = (opacities <= DEAD).nonzero().squeeze(1)
+    alive = (opacities > DEAD).nonzero().squeeze(1)
+    if not len(dead) or not len(alive):
+        return 0
+    drawn = torch.multinomial(opacities[alive], len(dead), replacement=True, generator=generator)
+    source = alive[drawn]
+    copies = torch.bincount(source, minlength=len(gaussians))[source] + 1
+    opacity, shrink = shared_between(opacities[source], copies)
+    gaussians.logits[source] = opacity.clamp(DEAD, 1 - 1e-6).logit()
+    gaussians.log_scales[source] += shrink.log()[:, None]
+    for parameter in gaussians.parameters():
+        parameter[dead] = parameter[source]
+    changed = torch.cat((dead, source))
+    for state in optimiser.state.values():
+        for name in ("exp_avg", "exp_avg_sq"):
+            state[name][changed] = 0
+    return len(dead)
+
+
+def shared_between(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
+    """Opacity of each of `copies` [N] Gaussians that replace one of `opacities` [N], and the factor
+    on its scales (Eq. 9): 1 - (1 - o_new)^n = o, and the factor keeps the integral of the opacity
+    along a ray through the centre."""
+    copies = copies.clamp(1, MOST_COPIES)
+    new = 1 - (1 - opacities.double()) ** (1 / copies)
+    total = torch.zeros_like(new)
+    for i in range(1, int(copies.max()) + 1):
+        terms = sum(
+            math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1) * new ** (k + 1) for k in range(i)
+        )
+        total += torch.where(copies >= i, terms, 0.0)
+    return new.float(), (opacities / total).float()
+
+
+@torch.no_grad()
+def disturb(gaussians: Gaussians, amount: float, generator: torch.Generator) -> None:
+    """Add noise to the means, in the shape of each Gaussian, and more the fainter it is (Eq. 8)."""
+    means = gaussians.means
+    faintness = torch.sigmoid(STEEPNESS * (FAINT - gaussians.opacities))
+    noise = torch.randn(means.shape, generator=generator, device=means.device)
+    spread = covariances(gaussians.log_scales.exp(), gaussians.rotations)
+    means.add_(amount * (spread @ (faintness[:, None] * noise)[:, :, None]).squeeze(2))

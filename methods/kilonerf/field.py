@@ -1,17 +1,19 @@
-"""The field: small networks, one for each cell of a grid that may hold matter."""
+"""The field: small networks, one for each cube of a grid that holds matter."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from bench.types import Probe
-from methods.kilonerf.grid import Grid
+from methods.kernels.types import Occupancy
 from methods.kilonerf.kernels.grouped_mlp import (
-    HIDDEN,
+    DIRECTION_FREQUENCIES,
+    SHAPES,
     Networks,
     colours,
     densities,
@@ -20,30 +22,78 @@ from methods.kilonerf.kernels.grouped_mlp import (
 )
 from methods.students.fields import REACH, StudentField
 
-POSITION_FREQUENCIES = 10
-DIRECTION_FREQUENCIES = 4
 
-SHAPES = {
-    "in": (3 + 6 * POSITION_FREQUENCIES, HIDDEN),
-    "mid": (HIDDEN, HIDDEN),
-    "density": (HIDDEN, 1),
-    "feature": (HIDDEN, HIDDEN),
-    "direction": (HIDDEN + 3 + 6 * DIRECTION_FREQUENCIES, HIDDEN),
-    "colour": (HIDDEN, 3),
-}
-"""Inputs and outputs of a layer (Reiser et al. 2021, Figure 2): 6,212 parameters a network."""
+@dataclass(frozen=True)
+class Grid:
+    """Cubes side by side, some of which have a network."""
 
-DENSITY_LAYERS = ("in", "mid", "density")
+    networks: Tensor  # [X, Y, Z] int16, the number of each cube's network, -1 for none
+    corner: Tensor  # [3] lower corner of the first cube, in the unit cube
+    side: Tensor  # [] side of a cube
+
+    @property
+    def count(self) -> int:
+        """How many networks there are."""
+        return int(self.networks.max()) + 1
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Parts of occupied cells, each within the cube of one network, network by network."""
+
+    low: Tensor  # [P, 3] corners, in the unit cube
+    high: Tensor  # [P, 3]
+    offsets: Tensor  # [N + 1] network n has pieces offsets[n] to offsets[n + 1]
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """Draw `count` random points for each network: [N * count, 3], network by network. All
+        pieces of a network are equally likely, whatever their size."""
+        device = self.low.device
+        sizes = self.offsets.diff()
+        shares = torch.rand(len(sizes), count, generator=generator, device=device)
+        chosen = (shares * sizes[:, None]).long().clamp(max=sizes[:, None] - 1)
+        chosen = (self.offsets[:-1, None] + chosen).flatten()
+        within = torch.rand(len(chosen), 3, generator=generator, device=device)
+        low, high = self.low[chosen], self.high[chosen]
+        return low + within * (high - low)
+
+
+def place_networks(occupancy: Occupancy, bounds: Tensor, along: int) -> tuple[Grid, Pieces]:
+    """Cover `bounds` [2, 3] with cubes: `along` of them on its longest side, as few as possible on
+    the others. Those that overlap occupied cells have a network; also returns these overlaps."""
+    extent = bounds[1] - bounds[0]
+    side = extent.max() / along * (1 + 1e-6)  # a little larger: no face is lost by rounding
+    shape = (extent / side).ceil().int()
+    corner, device = bounds[0].clone(), bounds.device
+    cells = occupancy.cells.nonzero()  # [C, 3]
+    low, high = cells / occupancy.resolution, (cells + 1) / occupancy.resolution
+    first = ((low - corner) / side).floor().int()
+    last = ((high - corner) / side).ceil().int() - 1
+    parts = []
+    # A cell that is crossed by a face lies in several cubes.
+    reach = int((last - first).max()) + 1 if len(cells) else 1
+    steps = torch.arange(reach, device=device)
+    for shift in torch.cartesian_prod(steps, steps, steps):
+        cube = first + shift.int()
+        there = ((cube <= last) & (cube >= 0) & (cube < shape)).all(dim=1)
+        cube = cube[there]
+        start = corner + cube * side
+        ends = torch.maximum(low[there], start), torch.minimum(high[there], start + side)
+        parts.append((cube, *ends))
+    cube, low, high = (torch.cat(part) for part in zip(*parts, strict=True))
+    x, y, z = shape.tolist()
+    index = (cube[:, 0] * y + cube[:, 1]) * z + cube[:, 2]
+    used, number, counts = index.unique(return_inverse=True, return_counts=True)
+    networks = torch.full((x, y, z), -1, dtype=torch.int16, device=device)
+    networks.view(-1)[used.long()] = torch.arange(len(used), dtype=torch.int16, device=device)
+    by_network = number.argsort(stable=True)
+    offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
+    return Grid(networks, corner, side), Pieces(low[by_network], high[by_network], offsets)
 
 
 class KiloField(StudentField):
-    """Small networks on a grid; density and colour are 0 where there is no network.
-
-    Args:
-        grid: where the networks are.
-        backend: backend of the kernels.
-        generator: source of the weights, which are the same in all networks at the beginning.
-    """
+    """Small networks on a `grid`, all alike at the beginning; density and colour are 0 where there
+    is no network."""
 
     round_samples = 8  # measured: docs/log.md
 
@@ -56,14 +106,13 @@ class KiloField(StudentField):
         self.register_buffer("networks", grid.networks)
         self.register_buffer("corner", grid.corner)
         self.register_buffer("side", grid.side)
-        self.count_networks = grid.count
         self.weights, self.biases = nn.ParameterDict(), nn.ParameterDict()
         for name, (inputs, outputs) in SHAPES.items():
             # As in torch's linear layers: uniform, with a bound from the number of inputs.
             bound = 1 / math.sqrt(inputs)
             for kind, shape in ((self.weights, (inputs, outputs)), (self.biases, (outputs,))):
                 values = torch.empty(*shape).uniform_(-bound, bound, generator=generator)
-                kind[name] = nn.Parameter(values.repeat(self.count_networks, *[1] * len(shape)))
+                kind[name] = nn.Parameter(values.repeat(grid.count, *[1] * len(shape)))
 
     def raw_density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Density [S] times `REACH` before its activation, and what `features` needs [S, 33]."""
@@ -87,7 +136,7 @@ class KiloField(StudentField):
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:
         products = {name: inputs * outputs for name, (inputs, outputs) in SHAPES.items()}
-        density = sum(products[name] for name in DENSITY_LAYERS)
+        density = sum(products[name] for name in ("in", "mid", "density"))
         probe.count("products", density * samples + (sum(products.values()) - density) * shaded)
 
     def sizes(self) -> dict[str, int]:
@@ -97,4 +146,4 @@ class KiloField(StudentField):
 
     @property
     def _layers(self) -> Networks:
-        return Networks(dict(self.weights), dict(self.biases))
+        return {name: (self.weights[name], self.biases[name]) for name in SHAPES}

@@ -1,4 +1,5 @@
-"""KiloNeRF (Reiser et al. 2021): thousands of small networks, distilled from one field."""
+"""KiloNeRF (Reiser et al. 2021): thousands of small networks, distilled from one field, then
+trained on photos (Section 3.2)."""
 
 from __future__ import annotations
 
@@ -7,27 +8,78 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from bench.types import Budget, Scene
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.types import expect
-from methods.kilonerf.field import KiloField
-from methods.kilonerf.grid import Grid, place_networks
-from methods.kilonerf.training import KiloLessons, KiloTraining
-from methods.students.fields import FieldStudent
+from methods.kilonerf.field import Grid, KiloField, Pieces, place_networks
+from methods.students.fields import FieldLessons, FieldStudent, StudentTraining
 from methods.training import checkpoint
 
 MOST = 32
 """Maximum number of networks along an axis: they are numbered in int16."""
 
+LEAK = 0.01
+"""Slope of the density below 0 in distillation: its gradient does not vanish in empty space."""
+
+
+@dataclass(frozen=True)
+class KiloLessons(FieldLessons):
+    """How to train the networks, as `sweeps/configs/method/kilonerf.yaml` explains."""
+
+    rate: float = 3e-3
+    final_rate: float = 1 / 30
+    share: float = 1.0
+    points_each: int = 128
+    view_cost: float = 1e-6
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        expect(self.points_each >= 1, "points_each", "1 or more", self.points_each)
+        expect(self.view_cost >= 0, "view_cost", "0 or more", self.view_cost)
+
+
+class KiloTraining(StudentTraining):
+    """Like `StudentTraining`, with the same number of points for each network."""
+
+    options: KiloLessons
+    field: KiloField
+    pieces: Pieces
+
+    def _places(self) -> tuple[Tensor, Tensor]:
+        positions = self.pieces.draw(self.options.points_each, self.generator)
+        shape, device = positions.shape, positions.device
+        directions = torch.randn(shape, generator=self.generator, device=device)
+        return positions, functional.normalize(directions, dim=1)
+
+    def _learned(self, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """As in the base class, with a density that may fall below 0."""
+        thickness, geometry = self.field.raw_density(positions)
+        encoded = self.field.encode_directions(directions)
+        opacity = 1 - torch.exp(-functional.leaky_relu(thickness, LEAK))
+        return opacity, self.field.features(geometry, encoded)
+
+    def _update(self) -> None:
+        if self.step >= self.points_until:
+            self._smooth_views()
+        super()._update()
+
+    @torch.no_grad()
+    def _smooth_views(self) -> None:
+        """Add the gradient of `view_cost` times the norms, not squared, of the layers that see the
+        directions."""
+        for name in ("direction", "colour"):
+            for parameter in (self.field.weights[name], self.field.biases[name]):
+                if parameter.grad is not None:
+                    scale = self.options.view_cost / parameter.norm().clamp(min=1e-12)
+                    parameter.grad.add_(parameter * scale)
+
 
 @dataclass(kw_only=True, eq=False)
 class KiloNerf(FieldStudent):
-    """KiloNeRF as a `bench.types.Method`.
-
-    Attributes:
-        networks: how many there are along the longest side of the scene, 1 to 32.
-    """
+    """KiloNeRF as a `bench.types.Method`, with `networks` along the longest side of the scene, 1 to
+    32."""
 
     training: KiloLessons
     name: str = "kilonerf"
@@ -37,11 +89,9 @@ class KiloNerf(FieldStudent):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        along = f"1 to {MOST} along an axis"
-        expect(1 <= self.networks <= MOST, "networks", along, self.networks)
+        expect(1 <= self.networks <= MOST, "networks", f"1 to {MOST}", self.networks)
 
     def model_settings(self) -> Mapping[str, object]:
-        """The number of networks."""
         return {"networks": self.networks}
 
     def new_field(self) -> KiloField:
@@ -50,14 +100,14 @@ class KiloNerf(FieldStudent):
         return KiloField(self.grid, self.teacher.backend, generator).to(self.teacher.device)
 
     def begin(self, trained: TrainedField, scene: Scene, budget: Budget) -> KiloTraining:
-        """Place the networks, and make their training."""
         bounds = scene.bounds.to(self.teacher.device)
         self.occupancy = trained.occupancy
         self.grid, pieces = place_networks(trained.occupancy, bounds, self.networks)
-        return KiloTraining(self, self.new_field(), pieces, trained, scene, budget)
+        training = KiloTraining(self, self.new_field(), trained, scene, budget)
+        training.pieces = pieces
+        return training
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Load the networks, and where they are."""
         parts = checkpoint.part(tensors, "field.")
         self.grid = Grid(parts["networks"], parts["corner"], parts["side"])
         super().restore(tensors)

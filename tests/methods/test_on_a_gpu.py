@@ -35,15 +35,13 @@ from methods.kernels import availability, multiplies_bf16
 from methods.kernels.encode import HashGrid
 from methods.kernels.march import longest_ray
 from methods.kilonerf.field import KiloField
-from methods.kilonerf.method import KiloNerf
-from methods.kilonerf.training import KiloLessons
+from methods.kilonerf.method import KiloLessons, KiloNerf
 from methods.nerf.field import NerfField
 from methods.nerf.method import Nerf
 from methods.nsvf.field import NsvfField
 from methods.nsvf.method import Nsvf
-from methods.plenoctree.method import PlenOctree
-from methods.plenoctree.start import Extraction
-from methods.plenoctree.training import OctreeLessons
+from methods.plenoctree.method import OctreeLessons, PlenOctree
+from methods.plenoctree.octree import Extraction
 from methods.rendering import field, frame
 from methods.rendering.occupancy import EVERY, STEP
 from methods.steernerf.method import SteerNerf

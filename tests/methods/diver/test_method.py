@@ -11,6 +11,7 @@ from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene
 from methods.diver.method import Diver
 from methods.diver.training import DiverLessons
 from methods.instant_ngp.stage1 import TrainedField
+from methods.students.voxels import corners_of
 from tests.methods.trainings import GRID, TAUGHT, TEACHER, quality
 
 LESSONS = DiverLessons(prune_rays=1 << 13)
@@ -55,9 +56,8 @@ def test_sparsity_draws_a_negative_density_back_to_zero(
     """Its slope is 4 s / (1 + 2 s^2) of the mean, of the first `count` densities alone."""
     training = method_of().begin(teacher, ball_scene, TAUGHT)
     raw = torch.tensor([-2.0, 0.0, 0.5, 3.0], requires_grad=True)
-    shown = raw * 1.0
-    training._push_to_sparsity(shown, 3)
-    shown.relu().mul(0).sum().backward()
+    training._push_to_sparsity(raw, 3)
+    raw.relu().mul(0).sum().backward()
     wanted = LESSONS.sparsity / 3 * torch.tensor([-8 / 9, 0, 4 / 3, 0])
     torch.testing.assert_close(raw.grad, wanted)
 
@@ -81,7 +81,7 @@ def test_pruning_leaves_what_shows(ball_scene: Scene, teacher: TrainedField) -> 
 
 def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, shared_log: Log) -> None:
     half, single = (fitted(ball_scene, shared_log, stored=kind) for kind in ("bf16", "fp32"))
-    corners = len(half.baked.model.vertices)
+    corners = len(corners_of(half.baked.corners.voxels.coordinates)[1])
     merged = 32 * 32 + 32 + 32 + 1 + 32 * 32 + 32 * 27 + 32 + 3 * 32 + 3
     assert half.sizes() == {"corners": corners * 64, "voxels": 32**3 // 8, "decoder": 4 * merged}
     assert single.sizes()["corners"] == 2 * half.sizes()["corners"]
@@ -94,5 +94,5 @@ def test_a_teacher_with_more_features_than_a_corner_is_refused(
     ball_scene: Scene, shared_log: Log
 ) -> None:
     setup = replace(TEACHER, grid=replace(GRID, levels=17))
-    with pytest.raises(ValueError, match="expected a hash grid of at most"):
+    with pytest.raises(ValueError, match="expected at most the 32 channels of a corner"):
         fitted(ball_scene, shared_log, replace(TAUGHT, steps=1), teacher=setup)

@@ -8,12 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene, SteerbenchError, Unavailable
+from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene, Unavailable
 from methods.gaussians.method import GaussianSplatting
-from methods.gaussians.start import anywhere, on_surfaces, spacing
-from methods.gaussians.training import Fitting, GaussianTraining
-from methods.instant_ngp.stage1 import TrainedField
-from tests.methods.trainings import GRID, QUICK, TAUGHT, goes_on_after_a_kill, quality
+from methods.gaussians.training import Fitting
+from tests.methods.trainings import GRID, QUICK, TAUGHT, quality
 
 
 def fitted(scene: Scene, log: Log, budget: Budget = TAUGHT, **options) -> GaussianSplatting:
@@ -45,44 +43,6 @@ def test_they_learn_from_scratch(ball_scene: Scene, quiet_log: Log) -> None:
     assert quality(after, ball_scene) > quality(before, ball_scene) + 3
 
 
-def test_they_begin_on_surfaces_with_their_colours(
-    ball_scene: Scene, teacher: TrainedField
-) -> None:
-    generator = torch.Generator().manual_seed(0)
-    points, colours = on_surfaces(teacher, ball_scene, 500, generator)
-    radius = (points - 0.5).norm(dim=1)
-    assert len(points) == 500
-    assert abs(radius.median().item() - 0.3) < 2 * 1.6 / 40
-    error = colours - (0.5 + (points - 0.5) / 0.6).clamp(0, 1)  # the ball is coloured by its normal
-    assert error.abs().median() < 0.1  # two colours drawn at random are 0.3 apart
-
-
-def test_spacing_is_the_distance_of_neighbours(ball_scene: Scene) -> None:
-    axis = 0.1 * torch.arange(4.0)
-    lattice = torch.cartesian_prod(axis, axis, axis)
-    torch.testing.assert_close(spacing(lattice), torch.full((64,), 0.1))
-    assert (spacing(torch.zeros(10, 3)) > 0).all()  # all in one place
-    points, _ = anywhere(ball_scene, 100, torch.Generator().manual_seed(0))
-    assert ((points >= 0.1) & (points <= 0.9)).all()
-
-
-def test_a_killed_training_goes_on_as_if_it_had_not_been(
-    ball_scene: Scene, quiet_log: Log, tmp_path: Path
-) -> None:
-    def training() -> GaussianTraining:
-        method = GaussianSplatting(
-            grid=GRID,
-            training=QUICK,
-            fitting=Fitting(every=10),
-            count=200,
-            start="scratch",
-        )
-        gaussians = method._untrained(None, ball_scene, blank=False)
-        return GaussianTraining(gaussians, ball_scene, 40, Fitting(every=10), "auto", seed=0)
-
-    goes_on_after_a_kill(training, 23, tmp_path)
-
-
 def test_a_training_is_found_again_and_left_for_others(
     ball_scene: Scene, quiet_log: Log, tmp_path: Path
 ) -> None:
@@ -106,11 +66,6 @@ def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, shared_log: Log) -
     assert small.sizes()["gaussians"] < plain.sizes()["gaussians"] / 3.5
     assert small.settings()["precision"] == "int8"
     assert abs(quality(small, ball_scene) - quality(plain, ball_scene)) < 0.5
-
-
-def test_a_missing_checkpoint_is_one_line(ball_scene: Scene, quiet_log: Log) -> None:
-    with pytest.raises(SteerbenchError, match="there is none"):
-        fitted(ball_scene, quiet_log, checkpoint="nowhere.ply")
 
 
 def test_by_triton_there_are_none() -> None:

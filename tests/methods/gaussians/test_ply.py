@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,7 +43,9 @@ def some(count: int = 50, degree: int = 3) -> Gaussians:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_what_is_written_is_read(degree: int, moved_scene: Scene, tmp_path: Path) -> None:
+def test_what_is_written_is_read_and_holds_the_coordinates_of_the_data_set(
+    degree: int, moved_scene: Scene, tmp_path: Path
+) -> None:
     path = tmp_path / "a.ply"
     given = some(degree=degree)
     ply.write(given, moved_scene, path)
@@ -50,14 +53,7 @@ def test_what_is_written_is_read(degree: int, moved_scene: Scene, tmp_path: Path
     for name, value in given.named_parameters():
         # A product and a sum in float32, of numbers below 8.
         torch.testing.assert_close(getattr(found, name), value, rtol=0, atol=8 * 2.0**-22)
-
-
-def test_a_file_holds_the_coordinates_of_the_data_set(moved_scene: Scene, tmp_path: Path) -> None:
-    path = tmp_path / "a.ply"
-    given = some(1)
-    ply.write(given, moved_scene, path)
-    vertex = PlyData.read(path)["vertex"][0]
-    means = given.means[0].tolist()
+    vertex, means = PlyData.read(path)["vertex"][0], given.means[0].tolist()
     assert vertex["x"] == pytest.approx(-1 + 3 * means[0])
     assert vertex["z"] == pytest.approx(5 + 3 * means[2])
     assert vertex["scale_1"] == pytest.approx(given.log_scales[0, 1].item() + math.log(3))
@@ -86,21 +82,17 @@ def test_harmonics_of_a_file_have_the_condon_shortley_phase(
     harmonics = torch.cat((given.base, given.view), dim=1)
     ours = shade(harmonics, torch.tensor([[x, y, z]]))[0].tolist()
     for channel in range(3):
-        values = [
-            vertex[f"f_dc_{channel}"],
-            *(vertex[f"f_rest_{8 * channel + k}"] for k in range(8)),
-        ]
-        theirs = sum(b * float(v) for b, v in zip(basis, values, strict=True))
+        names = [f"f_dc_{channel}", *(f"f_rest_{8 * channel + k}" for k in range(8))]
+        theirs = sum(b * float(vertex[name]) for b, name in zip(basis, names, strict=True))
         assert theirs == pytest.approx(ours[channel], abs=1e-5)
 
 
-def written(scene: Scene, path: Path, **changes: float) -> np.ndarray:
-    """A good file of 50 Gaussians, but for the properties in `changes` of the first."""
+def vertices_of(scene: Scene, path: Path, **changes: float) -> np.ndarray:
+    """Those of a good file of 50 Gaussians, but for the properties in `changes` of the first."""
     ply.write(some(), scene, path)
     vertices = PlyData.read(path, mmap=False)["vertex"].data
     for name, value in changes.items():
         vertices[name][0] = value
-    PlyData([PlyElement.describe(vertices, "vertex")]).write(path)
     return vertices
 
 
@@ -110,13 +102,20 @@ def written(scene: Scene, path: Path, **changes: float) -> np.ndarray:
         ({"x": math.nan}, "1 of 50 Gaussians are not finite"),
         ({"scale_0": math.inf}, "1 of 50 Gaussians are not finite"),
         (dict.fromkeys(ply.ROTATION, 0.0), "1 of 50 Gaussians have a rotation of zeros"),
+        (["x", "y", "z"], "there is no f_dc_0, f_dc_1"),
+        ([*ply.NEEDED, *(f"f_rest_{k}" for k in range(44))], "got 44"),
+        (slice(0), "it has none"),
     ],
 )
-def test_bad_values_are_refused(
-    changes: dict[str, float], complaint: str, tiny_scene: Scene, tmp_path: Path
+def test_bad_vertices_are_refused(
+    changes: Any, complaint: str, tiny_scene: Scene, tmp_path: Path
 ) -> None:
     path = tmp_path / "a.ply"
-    written(tiny_scene, path, **changes)
+    if isinstance(changes, dict):
+        vertices = vertices_of(tiny_scene, path, **changes)
+    else:
+        vertices = repack_fields(vertices_of(tiny_scene, path)[changes])
+    PlyData([PlyElement.describe(vertices, "vertex")]).write(path)
     with pytest.raises(SteerbenchError, match=complaint):
         ply.read(path, tiny_scene)
 
@@ -125,28 +124,16 @@ def test_bad_files_are_refused(tiny_scene: Scene, tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     with pytest.raises(SteerbenchError, match="there is none"):
         ply.read(path, tiny_scene)
-    vertices = written(tiny_scene, path)
-    path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(SteerbenchError, match="could not read one"):
-        ply.read(path, tiny_scene)
-    path.write_bytes(b"\x89PNG\r\n\x1a\n")
-    with pytest.raises(SteerbenchError, match="could not read one"):
-        ply.read(path, tiny_scene)
-    PlyData([PlyElement.describe(repack_fields(vertices[["x", "y", "z"]]), "vertex")]).write(path)
-    with pytest.raises(SteerbenchError, match="there is no f_dc_0, f_dc_1"):
-        ply.read(path, tiny_scene)
-    PlyData([PlyElement.describe(vertices[:0], "vertex")]).write(path)
-    with pytest.raises(SteerbenchError, match="it has none"):
-        ply.read(path, tiny_scene)
-    kept = [name for name in vertices.dtype.names or () if name != "f_rest_44"]
-    PlyData([PlyElement.describe(repack_fields(vertices[kept]), "vertex")]).write(path)
-    with pytest.raises(SteerbenchError, match="got 44"):
-        ply.read(path, tiny_scene)
+    ply.write(some(), tiny_scene, path)
+    for content in (path.read_bytes()[:-100], b"\x89PNG\r\n\x1a\n"):
+        path.write_bytes(content)
+        with pytest.raises(SteerbenchError, match="could not read one"):
+            ply.read(path, tiny_scene)
 
 
 def test_gaussians_of_another_place_are_refused(tiny_scene: Scene, tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     ply.write(some(), tiny_scene, path)
     elsewhere = replace(tiny_scene, origin=torch.full((3,), 100.0))
-    with pytest.raises(SteerbenchError, match="none of its 50 Gaussians lies inside the scene"):
+    with pytest.raises(SteerbenchError, match="none of 50 Gaussians lies inside the scene"):
         ply.read(path, elsewhere)

@@ -5,20 +5,14 @@ from __future__ import annotations
 import pytest
 
 from bench.types import Log, NullProbe, Scene
-from methods.kilonerf.field import SHAPES
-from methods.kilonerf.method import KiloNerf
-from methods.kilonerf.training import KiloLessons
+from methods.kilonerf.kernels.grouped_mlp import SHAPES
+from methods.kilonerf.method import KiloLessons, KiloNerf
 from tests.methods.trainings import TAUGHT, TEACHER, quality
 
-LESSONS = KiloLessons(points_each=64, rate=1e-2)
 
-
-def method(**options) -> KiloNerf:
-    return KiloNerf(**{"teacher": TEACHER, "training": LESSONS, "networks": 4} | options)
-
-
-def fitted(scene: Scene, log: Log, **options) -> KiloNerf:
-    student = method(**options)
+def fitted(scene: Scene, log: Log) -> KiloNerf:
+    lessons = KiloLessons(points_each=64, rate=1e-2)
+    student = KiloNerf(teacher=TEACHER, training=lessons, networks=4)
     student.fit(scene, TAUGHT, log)
     return student
 
@@ -26,8 +20,7 @@ def fitted(scene: Scene, log: Log, **options) -> KiloNerf:
 @pytest.mark.slow
 def test_it_learns_a_ball(ball_scene: Scene, shared_log: Log) -> None:
     student = fitted(ball_scene, shared_log)
-    test = ball_scene.splits["test"]
-    frame = student.render(test.cameras[1], NullProbe())
+    frame = student.render(ball_scene.splits["test"].cameras[1], NullProbe())
     assert quality(student, ball_scene) > 20
     assert abs(frame.depth[16, 16].item() - 1.3) < 4 * 1.6 / 40  # the front, to four pixels
 
@@ -36,9 +29,8 @@ def test_sizes_are_those_of_the_networks(ball_scene: Scene, shared_log: Log) -> 
     student = fitted(ball_scene, shared_log)
     parameters = sum(i * o + o for i, o in SHAPES.values())
     assert parameters == 6212  # of the publication
-    cubes = student.grid.networks
     assert student.sizes() == {
         "networks": student.grid.count * parameters * 4,
-        "network_grid": cubes.numel() * 2,
+        "network_grid": student.grid.networks.numel() * 2,
         "occupancy": 128**3 // 8,
     }

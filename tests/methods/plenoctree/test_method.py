@@ -12,22 +12,17 @@ from bench.types import EMPTY_ALPHA, Log, NullProbe, Scene, SteerbenchError
 from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.types import Pixels
-from methods.plenoctree.method import PlenOctree, opaque_at_end
-from methods.plenoctree.octree import Octree
-from methods.plenoctree.start import Extraction, extract, fibonacci_sphere
-from methods.plenoctree.training import OctreeLessons, OctreeTraining
+from methods.plenoctree.method import OctreeLessons, OctreeTraining, PlenOctree, opaque_at_end
+from methods.plenoctree.octree import Extraction, Octree, extract, fibonacci_sphere
 from tests.methods.conftest import Work
 from tests.methods.trainings import TAUGHT, TEACHER, quality
 
 SMALL = {"resolution": 128, "degree": 1, "rays": 20_000, "points": 2, "directions": 8}
-Y00 = (4 * math.pi) ** -0.5
 
 
-def fitted(scene: Scene, log: Log, steps: int = 20, **others) -> PlenOctree:
-    extraction = Extraction(**SMALL | {k: others.pop(k) for k in SMALL if k in others})
-    method = PlenOctree(
-        teacher=TEACHER, extraction=extraction, training=OctreeLessons(samples=8192), **others
-    )
+def fitted(scene: Scene, log: Log, steps: int = 20, stored: str = "fp16") -> PlenOctree:
+    how = {"extraction": Extraction(**SMALL), "training": OctreeLessons(samples=8192)}
+    method = PlenOctree(teacher=TEACHER, stored=stored, **how)
     method.fit(scene, replace(TAUGHT, renderer_steps=steps), log)
     return method
 
@@ -36,10 +31,12 @@ def mean_quality(method: PlenOctree, scene: Scene, split: str) -> float:
     return sum(quality(method, scene, split, view) for view in range(3)) / 3
 
 
-def extracted(teacher: TrainedField, scene: Scene, **others) -> Octree:
+def extracted(teacher: TrainedField, scene: Scene, **others: float) -> tuple[Octree, torch.Tensor]:
+    """An octree, and the centres of its leaves."""
     batches = PixelBatches(scene.splits["train"], torch.device("cpu"))
     generator = torch.Generator().manual_seed(0)
-    return extract(teacher, batches, Extraction(**SMALL | others), generator)
+    octree = extract(teacher, batches, Extraction(**SMALL | others), generator)
+    return octree, (octree.voxels.coordinates + 0.5) / 128
 
 
 def test_a_ray_that_ends_is_opaque_and_keeps_its_colour_and_depth() -> None:
@@ -52,9 +49,8 @@ def test_a_ray_that_ends_is_opaque_and_keeps_its_colour_and_depth() -> None:
 
 
 def test_leaves_stand_where_the_ball_is(ball_scene: Scene, teacher: TrainedField) -> None:
-    octree = extracted(teacher, ball_scene)
-    centres = (octree.voxels.coordinates + 0.5) / 128
-    assert teacher.occupancy.cells[tuple((centres * 128).long().unbind(dim=1))].all()
+    octree, centres = extracted(teacher, ball_scene)
+    assert teacher.occupancy.holds(centres).all()
     # Pixels are 1.6 / 40 wide: half of the leaves are not farther than two from the surface.
     away = ((centres - 0.5).norm(dim=1) - 0.3).abs()
     assert away.median() < 2 * 1.6 / 40
@@ -62,36 +58,28 @@ def test_leaves_stand_where_the_ball_is(ball_scene: Scene, teacher: TrainedField
     assert len(octree.voxels) < 0.9 * int(teacher.occupancy.cells.sum())
 
 
+@torch.no_grad()
 def test_densities_are_means_of_the_teacher(ball_scene: Scene, teacher: TrainedField) -> None:
-    octree = extracted(teacher, ball_scene, points=16)
-    centres = (octree.voxels.coordinates + 0.5) / 128
+    octree, centres = extracted(teacher, ball_scene, points=16)
     axis = (torch.arange(4) + 0.5) / 4 - 0.5
     inner = torch.cartesian_prod(axis, axis, axis) / 128
     some = torch.arange(0, len(centres), len(centres) // 50)
-    with torch.no_grad():
-        dense = torch.stack([teacher.field.density(x + inner)[0] for x in centres[some]])
+    dense = torch.stack([teacher.field.density(x + inner)[0] for x in centres[some]])
     # Means of 16 and of 64 points are, but for chance, within 6 of their standard deviations.
     spread = dense.std(dim=1) * (1 / 16 + 1 / 64) ** 0.5
     difference = (octree.light.density[some] - dense.mean(dim=1)).abs()
     assert (difference < 6 * spread + 1e-3).all()
 
 
+@torch.no_grad()
 def test_harmonics_of_degree_0_are_the_mean_logit(ball_scene: Scene, teacher: TrainedField) -> None:
-    octree = extracted(teacher, ball_scene, degree=0)
-    centres = ((octree.voxels.coordinates + 0.5) / 128)[:100]
-    towards = fibonacci_sphere(SMALL["directions"])
-    with torch.no_grad():
-        _, geometry = teacher.field.density(centres)
-        shown = torch.stack(
-            [
-                teacher.field.features(
-                    geometry, teacher.field.encode_directions(d.expand(len(centres), 3))
-                )[:, :3]
-                for d in towards
-            ]
-        )
+    octree, centres = extracted(teacher, ball_scene, degree=0)
+    field = teacher.field
+    _, geometry = field.density(centres[:100])
+    towards = (field.encode_directions(d.expand(100, 3)) for d in fibonacci_sphere(8))
+    shown = torch.stack([field.features(geometry, encoded)[:, :3] for encoded in towards])
     logits = shown.clamp(1e-3, 1 - 1e-3).logit().mean(dim=0)
-    got = octree.light.harmonics[:100, 0] * Y00
+    got = octree.light.harmonics[:100, 0] * (4 * math.pi) ** -0.5
     # Products of bfloat16 are rounded in another order: 2 ulps of 16 of its layers' sums.
     assert (got - logits).abs().median() < 0.02
 
@@ -102,6 +90,20 @@ def test_directions_are_spread_evenly() -> None:
     nearest = torch.cdist(directions, directions).fill_diagonal_(9).amin(dim=1)
     # 64 caps that cover the sphere without overlap would be (4 pi / 64)^(1/2) = 0.44 apart.
     assert 0.6 * 0.44 < nearest.min() <= nearest.max() < 1.4 * 0.44
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ({"resolution": 2048, "most_leaves": 1000}, "expected at most 1,000: choose a smaller"),
+        ({"least_weight": 2.0}, "no leaf has a weight of 2"),
+    ],
+)
+def test_too_many_leaves_and_none_are_refused(
+    options: dict[str, float], complaint: str, ball_scene: Scene, teacher: TrainedField
+) -> None:
+    with pytest.raises(SteerbenchError, match=complaint):
+        extracted(teacher, ball_scene, **options)
 
 
 @pytest.mark.slow
@@ -118,10 +120,10 @@ def test_it_learns_a_ball(ball_scene: Scene, shared_log: Log) -> None:
 
 
 def test_only_what_rays_meet_is_changed(ball_scene: Scene, teacher: TrainedField) -> None:
-    octree = extracted(teacher, ball_scene)
-    before = octree.tensors()["density"].clone(), octree.tensors()["harmonics"].clone()
+    octree, _ = extracted(teacher, ball_scene)
+    before = octree.light.density.clone(), octree.light.harmonics.clone()
     options = OctreeLessons(max_rays=64)
-    training = OctreeTraining(octree, ball_scene, TAUGHT, options, seed=0)
+    training = OctreeTraining(octree, ball_scene, TAUGHT, options, TEACHER)
     training.advance()
     met = torch.zeros(len(octree.voxels), dtype=torch.bool)
     met[training.visited.long()] = True
@@ -133,31 +135,13 @@ def test_only_what_rays_meet_is_changed(ball_scene: Scene, teacher: TrainedField
 
 
 def test_what_is_stored_is_chosen_afterwards(ball_scene: Scene, shared_log: Log) -> None:
-    half, full = fitted(ball_scene, shared_log), fitted(ball_scene, shared_log, stored="fp32")
+    half, full = (fitted(ball_scene, shared_log, stored=kind) for kind in ("fp16", "fp32"))
     assert full.train_s == half.train_s  # the same training
     assert full.sizes()["leaves"] == 2 * half.sizes()["leaves"]
     assert half.settings()["precision"] == "fp16"
-    assert (
-        abs(mean_quality(half, ball_scene, "test") - mean_quality(full, ball_scene, "test")) < 0.05
-    )
-
-
-def test_a_frame_says_its_work(ball_scene: Scene, shared_log: Log) -> None:
-    probe, method = Work(), fitted(ball_scene, shared_log)
-    method.render(ball_scene.splits["test"].cameras[0], probe)
-    assert 0 < probe.done["rays"] <= 32 * 32
-    assert 0 < probe.done["shaded_samples"] <= probe.done["samples"]
-
-
-def test_too_many_leaves_are_refused_before_there_are_any(
-    ball_scene: Scene, teacher: TrainedField
-) -> None:
-    with pytest.raises(SteerbenchError, match="expected at most 1,000: choose a smaller"):
-        extracted(teacher, ball_scene, resolution=2048, most_leaves=1000)
-
-
-def test_a_field_in_which_nothing_is_seen_is_refused(
-    ball_scene: Scene, teacher: TrainedField
-) -> None:
-    with pytest.raises(SteerbenchError, match="no leaf has a weight of 2"):
-        extracted(teacher, ball_scene, least_weight=2.0)
+    shown = (mean_quality(method, ball_scene, "test") for method in (half, full))
+    assert next(shown) == pytest.approx(next(shown), abs=0.05)
+    work = Work()
+    half.render(ball_scene.splits["test"].cameras[0], work)
+    assert 0 < work.done["rays"] <= 32 * 32
+    assert 0 < work.done["shaded_samples"] <= work.done["samples"]

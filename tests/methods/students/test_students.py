@@ -16,13 +16,11 @@ from bench.types import Budget, Log, NullProbe, Scene, Unavailable
 from methods.diver.method import Diver
 from methods.diver.training import DiverLessons
 from methods.instant_ngp.stage1 import train_field
-from methods.kilonerf.method import KiloNerf
-from methods.kilonerf.training import KiloLessons
+from methods.kilonerf.method import KiloLessons, KiloNerf
 from methods.nerf.method import Nerf
 from methods.nsvf.method import Nsvf
-from methods.plenoctree.method import PlenOctree
-from methods.plenoctree.start import Extraction
-from methods.plenoctree.training import OctreeLessons
+from methods.plenoctree.method import OctreeLessons, PlenOctree
+from methods.plenoctree.octree import Extraction
 from methods.students.fields import FieldLessons
 from methods.students.method import Student
 from methods.training import loop

@@ -3,78 +3,68 @@ corners in the mean of the features, and pixels (DIVeR: Wu et al. 2022, Sections
 
 The features of a segment are the mean of their trilinear interpolant along it. A small network
 decodes them: they pass a ReLU and a hidden layer. One output is the density, integrated over the
-segment already; the others, with the direction of the ray, give its colour.
+segment already; the others, with the direction of the ray, give its colour. Wrong shapes raise
+ValueError, as do with backend="cpu" other numbers than float32, and layers whose width is no
+multiple of 16.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from bench.types import Rays, check_shape
 from methods.kernels.composite import check_stop
 from methods.kernels.corner_gather import CORNERS
 from methods.kernels.dispatch import implementation
-from methods.kernels.types import Pixels, check_rays, expect
+from methods.kernels.types import Intervals, Pixels, check_rays
 from methods.kernels.voxel_walk import Crossings, Voxels
 
 
 @dataclass(frozen=True)
 class Corners:
-    """What the V voxels of a grid have at their corners.
+    """V voxels, and what they have at their corners, in the order of `corner_gather`."""
 
-    Attributes:
-        rows: [V, 8] int32 rows of `table`, the corners of each voxel in the order of
-            `corner_gather`. They are not checked.
-        table: [C, F] features, float32 or bfloat16.
-    """
-
-    rows: Tensor
-    table: Tensor
+    voxels: Voxels
+    rows: Tensor  # [V, 8] int32 rows of the table. Not checked.
+    table: Tensor  # [C, F] features, float32 or bfloat16
 
 
 @dataclass(frozen=True)
 class Layers:
-    """From F features of a segment, behind a ReLU, to its density and its colour.
+    """From F features of a segment, behind a ReLU, to its density and its colour: a ReLU follows
+    every layer but the last, which a sigmoid follows. To the output of `geometry`, of the hidden
+    layer, the direction of the ray is added."""
 
-    Attributes:
-        hidden, hidden_bias: [H, F], [H]; a ReLU follows.
-        density, density_bias: [1, H], [1]; a ReLU follows.
-        geometry: [H, H], from the hidden layer; the direction of the ray is added to its output,
-            and a ReLU follows.
-        colour, colour_bias: [3, H], [3]; a sigmoid follows.
-    """
+    hidden: Tensor  # [H, F]
+    hidden_bias: Tensor  # [H]
+    density: Tensor  # [1, H]
+    density_bias: Tensor  # [1]
+    geometry: Tensor  # [H, H]
+    colour: Tensor  # [3, H]
+    colour_bias: Tensor  # [3]
 
-    hidden: Tensor
-    hidden_bias: Tensor
-    density: Tensor
-    density_bias: Tensor
-    geometry: Tensor
-    colour: Tensor
-    colour_bias: Tensor
+
+def as_intervals(crossings: Crossings) -> Intervals:
+    """Intervals for `composite`: densities are integrated already, so every length is 1."""
+    return Intervals(crossings.t, torch.ones_like(crossings.t), crossings.offsets)
 
 
 def segment_weights(
     rays: Rays, crossings: Crossings, voxels: Voxels, *, backend: str = "auto"
 ) -> Tensor:
-    """Weights [S, 8] of the corners in the means over the `crossings` of R `rays` through `voxels`.
-
-    A mean is the integral of the trilinear interpolant along the segment, divided by its length
-    (Section 3.2); of a segment of length 0 it is that of the point. Not differentiable.
-
-    Raises:
-        ValueError: rays or voxels do not belong to the crossings; backend "cpu": not float32.
-    """
-    count, crossed = check_rays(rays), len(crossings.offsets) - 1
-    expect(crossed == count, "crossings", f"those of the {count} rays", f"of {crossed}")
+    """Weights [S, 8] of the corners in the means over the `crossings` of R `rays` through `voxels`:
+    integrals of the trilinear interpolant along the segment, divided by its length (Section 3.2).
+    Not differentiable."""
+    check_rays(rays)
     kernel = implementation(__name__, backend, rays.origins.device)
     return kernel.segment_weights(rays, crossings, voxels)
 
 
 def render_segments(
     rays: Rays,
-    voxels: Voxels,
     corners: Corners,
     layers: Layers,
     towards: Tensor,
@@ -83,23 +73,15 @@ def render_segments(
     faint: float = 0.0,
     backend: str = "auto",
 ) -> tuple[Pixels, Tensor, Tensor]:
-    """The pixels of R `rays`, not composited on a background. Not differentiable.
+    """The pixels of R `rays`, which end at the transmittance `stop`, without a background; segments
+    with at most the weight `faint` have an opacity but no colour. Not differentiable.
 
-    Also, for each ray, how many segments lie in front of its end and how many of them have a
-    colour: [R] int32.
-
-    Args:
-        towards: [R, H] what the direction of each ray adds to the output of `layers.geometry`.
-        stop: transmittance at which a ray ends, less than 1.
-        faint: weight up to which a segment has an opacity but no colour.
-
-    Raises:
-        ValueError: wrong shapes, a stop outside [0, 1); backend "cpu": other types, F or H that is
-            no multiple of 16.
+    `towards` [R, H] is what the direction of a ray adds to the output of `layers.geometry`. Also
+    returns how many segments of each ray lie in front of its end, and have a colour: [R] int32.
     """
     check_stop(stop)
-    count, (hidden, features) = check_rays(rays), layers.hidden.shape
-    check_shape("rows", corners.rows, len(voxels), CORNERS)
+    hidden, features = layers.hidden.shape
+    check_shape("rows", corners.rows, len(corners.voxels), CORNERS)
     check_shape("table", corners.table, None, features)
     check_shape("hidden_bias", layers.hidden_bias, hidden)
     check_shape("density", layers.density, 1, hidden)
@@ -107,6 +89,6 @@ def render_segments(
     check_shape("geometry", layers.geometry, hidden, hidden)
     check_shape("colour", layers.colour, 3, hidden)
     check_shape("colour_bias", layers.colour_bias, 3)
-    check_shape("towards", towards, count, hidden)
+    check_shape("towards", towards, check_rays(rays), hidden)
     kernel = implementation(__name__, backend, rays.origins.device)
-    return kernel.render_segments(rays, voxels, corners, layers, towards, stop, faint)
+    return kernel.render_segments(rays, corners, layers, towards, stop, faint)

@@ -1,13 +1,13 @@
-"""Cases of segments: the weights of corners against the published monomials; pixels; NaN."""
+"""Cases of segments: the weights of corners, also against quadrature; pixels; NaN."""
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -40,6 +40,9 @@ DENSEST = 1 / 4
 FARTHEST = 3
 """Largest depth of a segment."""
 
+BITS = torch.arange(CORNERS)[:, None] >> torch.arange(3) & 1
+"""Where the corners of a voxel are in it, [8, 3]."""
+
 WEIGHTS = (
     "ends of a segment, its middle and its nodes are off by 3 u along each of 3 axes, along which "
     "a weight changes by 1 at most; 3 factors and 2 products of them: 5 u; a mean: 2 u: 16 u"
@@ -64,7 +67,7 @@ def _pixels(given: Given, backend: str) -> tuple[Tensor, ...]:
 def _light(given: Given) -> float:
     """How far the opacity of a ray may be off: its n segments' densities, rounding; a weight beside
     `stop` or `faint` may count on one side only, and few lie beside a `faint` of 1e-2."""
-    longest, faint = 3 * given["voxels"].resolution, given["faint"]
+    longest, faint = 3 * given["corners"].voxels.resolution, given["faint"]
     rounding = longest * (468 * DENSEST + 4) * U32
     return rounding + given["stop"] + (longest * faint if faint < 1e-3 else 2 * faint)
 
@@ -92,38 +95,38 @@ RENDER = Operation(
 
 def cases() -> list[Case]:
     """Segments of every kind; few and many rays, both types of tables, rays that end early, NaN."""
-    spoilt = Property(
-        "render_segments",
-        "a NaN among the features spoils the rays through its voxels alone",
-        "exact",
-        on_backends(0),
-    )
-    return [*_weights(), *_rendered(), spoilt.case("NaN in a corner", _nan_error)]
-
-
-def _weights() -> Iterator[Case]:
-    corners = torch.tensor(list(itertools.product((0.0, 0.5, 1.0), repeat=3)))
-    pairs = torch.cartesian_prod(torch.arange(27), torch.arange(27))
-    generator = torch.Generator().manual_seed(1000)
-    kinds: dict[str, Callable[[], Given]] = {
-        "random segments": partial(_inside, *torch.rand(2, 1000, 3, generator=generator)),
-        "between corners, edges, faces and the middle": partial(_inside, *corners[pairs.T]),
-        "without length": partial(_inside, corners, corners),
-        "rays through a full grid": _through,
-    }
     exact = Property(
-        "segment_weights",
-        "weights are those of the published monomials",
+        WEIGH.subject,
+        "weights are those of a quadrature with four nodes, two more than a cubic needs",
         f"{WEIGHTS}; {PLACE}",
         on_backends(36 * SIDE + 16, "fp64"),
     )
-    for name, make in kinds.items():
-        yield from WEIGH.cases(name, make)
-        yield exact.case(f"{name}, by monomials", partial(_moment_error, make))
+    holds = "a NaN among the features spoils the rays through its voxels alone"
+    spoilt = Property(RENDER.subject, holds, "exact", on_backends(0))
+    found = [spoilt.case("NaN in a corner", _nan_error)]
+    for name, make in {"in a voxel": _inside, "rays through a full grid": _through}.items():
+        found += WEIGH.cases(name, make)
+        found.append(exact.case(f"{name}, by quadrature", partial(_quadrature_error, make)))
+    for name, given in {
+        "no ray": (SIDE, 0, torch.float32, 0.0, 0.0),
+        "one ray": (SIDE, 1, torch.float32, 0.0, 0.0),
+        "129 rays": (SIDE, 129, torch.float32, 0.0, 0.0),
+        "129 rays, table of bfloat16": (SIDE, 129, torch.bfloat16, 0.0, 0.0),
+        "129 rays, stop and faint": (SIDE, 129, torch.float32, 1e-4, 1e-5),
+        "8,192 rays in 64^3": (64, 1 << 13, torch.bfloat16, 1e-2, 1e-2),
+    }.items():
+        items = given[1] if given[1] > 129 else None
+        found += RENDER.cases(name, partial(scene, *given), items=items)
+    return found
 
 
-def _inside(entry: Tensor, leave: Tensor) -> Given:
-    """Segments in the first voxel, from `entry` to `leave` in its coordinates."""
+def _inside() -> Given:
+    """Segments in the first voxel: random ones; between corners, middles of edges and faces, and
+    the middle, also from one of them to itself."""
+    places = torch.cartesian_prod(*[torch.tensor([0.0, 0.5, 1.0])] * 3)
+    pairs = torch.cartesian_prod(torch.arange(27), torch.arange(27))
+    drawn = torch.rand(2, 1000, 3, generator=torch.Generator().manual_seed(1000))
+    entry, leave = torch.cat((drawn, places[pairs.T]), dim=1)
     count, rays = len(entry), Rays(entry / SIDE, (leave - entry) / SIDE)
     number, zeros, ones = torch.arange(count), torch.zeros(count), torch.ones(count)
     offsets, first = torch.arange(count + 1), torch.zeros(count, dtype=torch.int32)
@@ -141,51 +144,24 @@ def _through() -> Given:
     return {"rays": rays, "crossings": crossings, "voxels": voxels}
 
 
-def _moment_error(make: Callable[[], Given], backend: str, device: str, precision: str) -> float:
+def _quadrature_error(
+    make: Callable[[], Given], backend: str, device: str, precision: str
+) -> float:
     given, dtype = placed(make(), device), DTYPES[precision]
     rays, crossings, voxels = given.values()
     ray, corner = crossings.ray.long(), voxels.coordinates[crossings.voxel.long()]
     origins, directions = rays.origins[ray].double(), rays.directions[ray].double()
-    spans = crossings.near.double(), crossings.far.double()
-    ends = (((origins + t[:, None] * directions) * SIDE - corner).clamp(0, 1) for t in spans)
+    near, far = (
+        ((origins + t.double()[:, None] * directions) * SIDE - corner).clamp(0, 1)
+        for t in (crossings.near, crossings.far)
+    )
+    exact = torch.zeros(len(ray), CORNERS, dtype=torch.float64, device=device)
+    for place, share in zip(*np.polynomial.legendre.leggauss(4), strict=True):
+        point = (near + far + place * (far - near))[:, None] / 2  # [S, 1, 3]
+        exact += share / 2 * torch.where(BITS.to(device) > 0, point, 1 - point).prod(dim=2)
     rays = Rays(rays.origins.to(dtype), rays.directions.to(dtype))
     crossings = replace(crossings, near=crossings.near.to(dtype), far=crossings.far.to(dtype))
-    return largest_error(
-        (segment_weights(rays, crossings, voxels, backend=backend),), (_moments(*ends),)
-    )
-
-
-def _moments(a: Tensor, b: Tensor) -> Tensor:
-    """Weights [S, 8] from the means of the monomials 1, x, y, xy, ... over a segment, float64."""
-    means = {0: torch.ones_like(a[:, 0])}
-    for d in range(3):
-        means[1 << d] = (a[:, d] + b[:, d]) / 2
-    for d, e in itertools.combinations(range(3), 2):
-        same, crossed = a[:, d] * a[:, e] + b[:, d] * b[:, e], a[:, d] * b[:, e] + b[:, d] * a[:, e]
-        means[1 << d | 1 << e] = same / 3 + crossed / 6
-    means[7] = (a + b).prod(dim=1) / 12 + (a.prod(dim=1) + b.prod(dim=1)) / 6
-    weights = [
-        sum(
-            (-1) ** (monomial ^ corner).bit_count() * means[monomial]
-            for monomial in range(CORNERS)
-            if monomial & corner == corner
-        )
-        for corner in range(CORNERS)
-    ]
-    return torch.stack([torch.as_tensor(weight) for weight in weights], dim=1)
-
-
-def _rendered() -> Iterator[Case]:
-    for name, count, dtype, stop, faint in (
-        ("no ray", 0, torch.float32, 0.0, 0.0),
-        ("one ray", 1, torch.float32, 0.0, 0.0),
-        ("129 rays", 129, torch.float32, 0.0, 0.0),
-        ("129 rays, table of bfloat16", 129, torch.bfloat16, 0.0, 0.0),
-        ("129 rays, stop and faint", 129, torch.float32, 1e-4, 1e-5),
-    ):
-        yield from RENDER.cases(name, partial(scene, SIDE, count, dtype, stop, faint))
-    many = partial(scene, 64, 1 << 13, torch.bfloat16, 1e-2, 1e-2)
-    yield from RENDER.cases("8,192 rays in 64^3", many, items=1 << 13)
+    return largest_error((segment_weights(rays, crossings, voxels, backend=backend),), (exact,))
 
 
 def scene(side: int, count: int, dtype: torch.dtype, stop: float, faint: float) -> Given:
@@ -196,9 +172,7 @@ def scene(side: int, count: int, dtype: torch.dtype, stop: float, faint: float) 
         return torch.rand(*shape, generator=generator) * (high - low) + low
 
     cells = (torch.rand(side, side, side, generator=generator) < 1 / 3).nonzero().int()
-    bits = torch.arange(CORNERS)[:, None] >> torch.arange(3) & 1
-    vertices = cells[:, None] + bits  # [V, 8, 3]
-    rows = (vertices * torch.tensor([(side + 1) ** 2, side + 1, 1])).sum(dim=2).int()
+    rows = (cells[:, None] + BITS) @ torch.tensor([(side + 1) ** 2, side + 1, 1])
     table = between(-1, 1, (side + 1) ** 3, FEATURES).to(dtype)
     layers = Layers(
         between(-1, 1, HIDDEN, FEATURES) / FEATURES,
@@ -211,8 +185,7 @@ def scene(side: int, count: int, dtype: torch.dtype, stop: float, faint: float) 
     )
     return {
         "rays": some_rays(count),
-        "voxels": Voxels(cells, side),
-        "corners": Corners(rows, table),
+        "corners": Corners(Voxels(cells, side), rows.int(), table),
         "layers": layers,
         "towards": between(-0.5, 0.5, count, HIDDEN),
         "stop": stop,
@@ -228,7 +201,7 @@ def _nan_error(backend: str, device: str, precision: str) -> float:
     row = corners.rows[len(corners.rows) // 2, 0]
     corners.table[row] = math.nan
     spoilt, _, _ = render_segments(**given, backend=backend)
-    crossings = walk(given["rays"], given["voxels"], backend="reference")
+    crossings = walk(given["rays"], corners.voxels, backend="reference")
     touched = torch.zeros(len(whole.alpha), dtype=torch.bool, device=device)
     at_corner = (corners.rows == row).any(dim=1)
     touched[crossings.ray[at_corner[crossings.voxel.long()]].long()] = True

@@ -40,20 +40,14 @@ f64 = np.float64
 def segment_weights(rays: Rays, crossings: Crossings, voxels: Voxels) -> Tensor:
     check_float32(rays.origins, rays.directions, crossings.near)
     weights = torch.empty(len(crossings), 8)
-    given = rays.origins, rays.directions, crossings.ray, crossings.near, crossings.far
-    cells = voxels.coordinates, crossings.voxel
-    _segment_weights(*arrays(*given, *cells), f32(voxels.resolution), weights.numpy())
+    segments = crossings.ray, crossings.near, crossings.far, voxels.coordinates, crossings.voxel
+    given = arrays(rays.origins, rays.directions, *segments)
+    _segment_weights(*given, f32(voxels.resolution), weights.numpy())
     return weights
 
 
 def render_segments(
-    rays: Rays,
-    voxels: Voxels,
-    corners: Corners,
-    layers: Layers,
-    towards: Tensor,
-    stop: float,
-    faint: float,
+    rays: Rays, corners: Corners, layers: Layers, towards: Tensor, stop: float, faint: float
 ) -> tuple[Pixels, Tensor, Tensor]:
     parts = [
         layers.hidden.T,
@@ -62,32 +56,25 @@ def render_segments(
         layers.geometry.T,
         *_whole_lanes(layers.colour, layers.colour_bias),
     ]
-    given = rays.origins, rays.directions, towards
-    check_float32(*given, *parts)
-    if any(size % LANES for size in layers.hidden.shape):
-        raise ValueError(
-            f"backend 'cpu' has layers of multiples of {LANES}, got {list(layers.hidden.shape)}: "
-            "use backend='reference'"
-        )
-    if corners.table.dtype == torch.bfloat16:
-        (words,) = arrays(corners.table.detach().contiguous().view(torch.int16))
-        table = words.view(np.uint16)
+    given, table, voxels = (rays.origins, rays.directions, towards), corners.table, corners.voxels
+    if table.dtype == torch.bfloat16:
+        check_float32(*given, *parts)
+        table = table.view(torch.uint16)
     else:
-        check_float32(corners.table)
-        (table,) = arrays(corners.table)
-    count = len(rays.origins)
-    pixels = Pixels.blank(count, 3)
-    crossed, shaded = (torch.zeros(count, dtype=torch.int32) for _ in range(2))
+        check_float32(*given, *parts, table)
+    if any(size % LANES for size in layers.hidden.shape):
+        got = f"got {list(layers.hidden.shape)}: use backend='reference'"
+        raise ValueError(f"backend 'cpu' has layers of multiples of {LANES}, {got}")
+    pixels = Pixels.blank(len(towards), 3)
+    crossed, shaded = torch.zeros(2, len(towards), dtype=torch.int32)
     _render(
         tuple(arrays(*given)),
         maps_of(voxels),
-        (*arrays(voxels.coordinates, corners.rows), table),
+        tuple(arrays(voxels.coordinates, corners.rows, table)),
         f32(voxels.resolution),
         tuple(arrays(*parts)),
-        f64(f32(stop)),
-        f64(f32(faint)),
-        tuple(arrays(pixels.values, pixels.depth_sum, pixels.alpha)),
-        tuple(arrays(crossed, shaded)),
+        (f64(f32(stop)), f64(f32(faint))),
+        tuple(arrays(pixels.values, pixels.depth_sum, pixels.alpha, crossed, shaded)),
     )
     return pixels, crossed, shaded
 
@@ -140,23 +127,33 @@ def _local(origin, direction, t, resolution, corner):
     return min(max(place, f32(0)), f32(1))
 
 
+@njit(cache=True)
+def _three(values, row):
+    return values[row, 0], values[row, 1], values[row, 2]
+
+
+@njit(cache=True)
+def _weights_between(origin, direction, near, far, resolution, corner):
+    """Mean weights in the voxel that begins at `corner`, on a ray from t = `near` to `far`."""
+    (ox, oy, oz), (dx, dy, dz), (x, y, z) = origin, direction, corner
+    return _mean_weights(
+        _local(ox, dx, near, resolution, x),
+        _local(oy, dy, near, resolution, y),
+        _local(oz, dz, near, resolution, z),
+        _local(ox, dx, far, resolution, x),
+        _local(oy, dy, far, resolution, y),
+        _local(oz, dz, far, resolution, z),
+    )
+
+
 @njit(cache=True, fastmath=FAST, parallel=True)
 def _segment_weights(origins, directions, ray, near, far, coordinates, voxel, resolution, weights):
     total = len(near)
     for chunk in prange((total + SEGMENTS - 1) // SEGMENTS):
         for i in range(chunk * SEGMENTS, min(total, (chunk + 1) * SEGMENTS)):
-            r, v = ray[i], voxel[i]
-            ox, oy, oz = origins[r, 0], origins[r, 1], origins[r, 2]
-            dx, dy, dz = directions[r, 0], directions[r, 1], directions[r, 2]
-            x, y, z = coordinates[v, 0], coordinates[v, 1], coordinates[v, 2]
-            found = _mean_weights(
-                _local(ox, dx, near[i], resolution, x),
-                _local(oy, dy, near[i], resolution, y),
-                _local(oz, dz, near[i], resolution, z),
-                _local(ox, dx, far[i], resolution, x),
-                _local(oy, dy, far[i], resolution, y),
-                _local(oz, dz, far[i], resolution, z),
-            )
+            origin, direction = _three(origins, ray[i]), _three(directions, ray[i])
+            corner = _three(coordinates, voxel[i])
+            found = _weights_between(origin, direction, near[i], far[i], resolution, corner)
             _put(weights, i, found)
 
 
@@ -168,13 +165,8 @@ def _layer(rows, inputs, count, weights, bias, outputs, relu):
 
 @njit(cache=True)
 def _shade(count, waiting, buffers, layers, sums, first):
-    """Add the colours of `count` segments to the `sums` of their rays, which begin at ray `first`.
-
-    Args:
-        waiting: what the hidden layer made of each segment, its ray and its weight.
-        buffers: for the outputs of both layers.
-        layers: what the directions add, geometry and its missing bias, colour and its bias.
-    """
+    """Add the colours of `count` segments, of which hidden channels, rays and weights were
+    `waiting`, to the `sums` of their rays, which begin at ray `first`."""
     hidden, rays, weights = waiting
     shown, raw = buffers
     towards, geometry, none, colour, colour_bias = layers
@@ -194,12 +186,12 @@ def _shade(count, waiting, buffers, layers, sums, first):
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def _render(given, maps, voxels, resolution, parts, stop, faint, pixels, counts):
+def _render(given, maps, voxels, resolution, parts, bounds, out):
     origins, directions, towards = given
     coordinates, corners, table = voxels
     hidden_weights, hidden_bias, density, density_bias, geometry, colour, colour_bias = parts
-    values, depth_sum, alpha = pixels
-    crossed, shaded = counts
+    stop, faint = bounds
+    values, depth_sum, alpha, crossed, shaded = out
     rays = len(origins)
     inputs, size = hidden_weights.shape
     none = np.zeros(size, np.float32)
@@ -217,13 +209,12 @@ def _render(given, maps, voxels, resolution, parts, stop, faint, pixels, counts)
         buffers = np.empty(BATCH * size, np.float32), np.empty(BATCH * LANES, np.float32)
         sums = np.zeros((CHUNK, 3))
         for ray in range(first, end):
-            ox, oy, oz = origins[ray, 0], origins[ray, 1], origins[ray, 2]
-            dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
+            origin, direction = _three(origins, ray), _three(directions, ray)
             depth, transmittance = 0.0, 1.0
             start, steps, colours = f32(0), 0, 0
             while start < np.inf and not transmittance <= stop:
-                out = near, far, voxel
-                count, start = walk_ray(origins[ray], directions[ray], maps, start, ROWS, out)
+                room = near, far, voxel
+                count, start = walk_ray(origins[ray], directions[ray], maps, start, ROWS, room)
                 if not count:
                     break
                 # Corners and their features are asked for before any of them is waited for.
@@ -233,17 +224,11 @@ def _render(given, maps, voxels, resolution, parts, stop, faint, pixels, counts)
                     for row in eight_of(corners, voxel[i]):
                         prefetch(table, row * inputs)
                 for i in range(count):
-                    v, near_t, far_t = voxel[i], near[i], far[i]
-                    x, y, z = coordinates[v, 0], coordinates[v, 1], coordinates[v, 2]
-                    weights = _mean_weights(
-                        _local(ox, dx, near_t, resolution, x),
-                        _local(oy, dy, near_t, resolution, y),
-                        _local(oz, dz, near_t, resolution, z),
-                        _local(ox, dx, far_t, resolution, x),
-                        _local(oy, dy, far_t, resolution, y),
-                        _local(oz, dz, far_t, resolution, z),
+                    corner = _three(coordinates, voxel[i])
+                    weights = _weights_between(
+                        origin, direction, near[i], far[i], resolution, corner
                     )
-                    rows = eight_of(corners, v)
+                    rows = eight_of(corners, voxel[i])
                     for k in range(inputs):
                         mean = blended(table, rows, weights, k)
                         features[i * inputs + k] = f32(0) if mean < f32(0) else mean

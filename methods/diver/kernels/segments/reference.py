@@ -7,10 +7,10 @@ from torch import Tensor
 from torch.nn.functional import linear
 
 from bench.types import Rays
-from methods.diver.kernels.segments import Corners, Layers
+from methods.diver.kernels.segments import Corners, Layers, as_intervals
 from methods.kernels.composite import composite, visible, weights
 from methods.kernels.corner_gather import corner_gather, trilinear
-from methods.kernels.types import Intervals, Pixels
+from methods.kernels.types import Pixels
 from methods.kernels.voxel_walk import Crossings, Voxels, walk
 
 CHUNK_RAYS = 1 << 15
@@ -33,45 +33,26 @@ def segment_weights(rays: Rays, crossings: Crossings, voxels: Voxels) -> Tensor:
 
 @torch.no_grad()
 def render_segments(
-    rays: Rays,
-    voxels: Voxels,
-    corners: Corners,
-    layers: Layers,
-    towards: Tensor,
-    stop: float,
-    faint: float,
+    rays: Rays, corners: Corners, layers: Layers, towards: Tensor, stop: float, faint: float
 ) -> tuple[Pixels, Tensor, Tensor]:
     """Evaluates all segments, also those behind the end of a ray, whose weight is 0."""
-    count = len(rays.origins)
-    chunks = [slice(first, first + CHUNK_RAYS) for first in range(0, max(count, 1), CHUNK_RAYS)]
-    parts = [
-        _together(rays.take(some), voxels, corners, layers, towards[some], stop, faint)
-        for some in chunks
-    ]
-    *pixels, crossed, shaded = map(torch.cat, zip(*parts, strict=True))
-    return Pixels(*pixels), crossed, shaded
-
-
-def _together(
-    rays: Rays,
-    voxels: Voxels,
-    corners: Corners,
-    layers: Layers,
-    towards: Tensor,
-    stop: float,
-    faint: float,
-) -> tuple[Tensor, ...]:
-    """Values, depth sums and opacities of `rays`; numbers of segments crossed and shaded."""
-    crossings = walk(rays, voxels, backend="reference")
+    if len(towards) > CHUNK_RAYS:
+        chunks = (slice(at, at + CHUNK_RAYS) for at in range(0, len(towards), CHUNK_RAYS))
+        parts = (
+            render_segments(rays.take(some), corners, layers, towards[some], stop, faint)
+            for some in chunks
+        )
+        columns = ((*vars(pixels).values(), *counts) for pixels, *counts in parts)
+        *joined, crossed, shaded = map(torch.cat, zip(*columns, strict=True))
+        return Pixels(*joined), crossed, shaded
+    crossings = walk(rays, corners.voxels, backend="reference")
     ray = crossings.ray.long()
-    mean = segment_weights(rays, crossings, voxels)
-    features = corner_gather(
-        corners.table, corners.rows, crossings.voxel, mean, backend="reference"
-    )
-    hidden = linear(features.to(towards).relu(), layers.hidden, layers.hidden_bias).relu()
+    mean = segment_weights(rays, crossings, corners.voxels)
+    read = corners.table, corners.rows, crossings.voxel, mean
+    features = corner_gather(*read, backend="reference").to(towards)
+    hidden = linear(features.relu(), layers.hidden, layers.hidden_bias).relu()
     density = linear(hidden, layers.density, layers.density_bias).relu().squeeze(1)
-    # Integrated already: every length is 1.
-    intervals = Intervals(crossings.t, torch.ones_like(crossings.t), crossings.offsets)
+    intervals = as_intervals(crossings)
     weight = weights(density, intervals, stop=stop, backend="reference")
     shown = (linear(hidden, layers.geometry) + towards[ray]).relu()
     colour = linear(shown, layers.colour, layers.colour_bias).sigmoid()
@@ -81,4 +62,4 @@ def _together(
     shaded = torch.zeros(len(towards), dtype=torch.int32, device=towards.device)
     shaded.index_add_(0, ray, seen.int())
     crossed, _ = visible(density, intervals, stop=stop, backend="reference")
-    return pixels.values, pixels.depth_sum, pixels.alpha, crossed.int(), shaded
+    return pixels, crossed.int(), shaded

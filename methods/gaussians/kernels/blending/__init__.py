@@ -4,6 +4,7 @@ alpha_i = min(LARGEST_ALPHA, o_i exp(-(A x^2 + 2 B x y + C y^2) / 2)), 0 below L
 T_i = prod_{j<i} (1 - alpha_j),  w_i = T_i alpha_i,
 values = sum w_i c_i,  depth_sum = sum w_i z_i,  alpha = sum w_i
 at the centre of every pixel, with (x, y) relative to the centre of the ellipse, in depth order.
+Wrong shapes raise ValueError, as do other numbers than float32 with backend="cpu".
 """
 
 from __future__ import annotations
@@ -29,27 +30,17 @@ def blend(
     stop: float = STOP,
     backend: str = "auto",
 ) -> Pixels:
-    """Render the pixels of a width x height picture, row by row, without a background.
+    """Render the pixels of a width x height picture, row by row, without a background, of Gaussians
+    with `opacities` [N] at their centres and `colours` [N, 3]. Behind a transmittance of at most
+    `stop` they have no weight; those of equal depth are blended as they are given.
 
-    Values and alpha are differentiable in centres, conics, opacities and colours; depth has no
-    gradient. Gaussians of equal depth are blended in the order in which they are given.
-
-    Args:
-        ellipses: N Gaussians projected to the picture.
-        opacities: [N] at their centres.
-        colours: [N, 3].
-        stop: Gaussians behind a transmittance of at most `stop` have no weight.
-
-    Raises:
-        ValueError: wrong shapes, no pixel; backend "cpu": not float32.
+    Values and alpha are differentiable in centres, conics, opacities and colours.
     """
     count = len(opacities)
     check_shape("opacities", opacities, None)
     check_shape("colours", colours, count, 3)
     check_shape("centres", ellipses.centres, count, 2)
     check_shape("conics", ellipses.conics, count, 3)
-    if width < 1 or height < 1:
-        raise ValueError(f"width, height: expected 1 or more, got {width} x {height}")
     return implementation(__name__, backend, opacities.device).blend(
         ellipses, opacities, colours, width, height, stop
     )

@@ -41,12 +41,7 @@ P5, P6 = f32(0.001244308151184), f32(0.000216906091570)
 
 
 def blend(
-    ellipses: Ellipses,
-    opacities: Tensor,
-    colours: Tensor,
-    width: int,
-    height: int,
-    stop: float,
+    ellipses: Ellipses, opacities: Tensor, colours: Tensor, width: int, height: int, stop: float
 ) -> Pixels:
     given = ellipses.centres, ellipses.conics, opacities, colours
     check_float32(*given)
@@ -57,73 +52,60 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx, centres, conics, opacities, colours, depth, extents, width, height, stop):
         given = arrays(centres, conics, opacities, colours, depth, extents)
-        order = torch.from_numpy(_by_depth(*given[4:]))
-        packed = torch.empty(len(order), FIELDS)
-        boxes = torch.empty(len(order), 4, dtype=torch.int32)
-        _pack(order.numpy(), *given, width, height, packed.numpy(), boxes.numpy())
-        lists = _Lists(boxes, width, height)
+        order = _by_depth(*given[4:])
+        packed = np.empty((len(order), FIELDS), np.float32)
+        boxes = np.empty((len(order), 4), np.int32)
+        _pack(order, *given, width, height, packed, boxes)
+        lists = _lists(boxes, width, height)
         pixels = Pixels.blank(width * height, 3)
         parts = pixels.values, pixels.depth_sum, pixels.alpha
         out = arrays(*(x.view(height, width, *x.shape[1:]) for x in parts))
-        how = f32(stop), numba.get_num_threads()
-        _forward(packed.numpy(), boxes.numpy(), *lists.arrays, *how, *out)
-        ctx.save_for_backward(order, packed, boxes, pixels.values, pixels.alpha)
-        ctx.lists, ctx.size, ctx.stop, ctx.count = lists, (height, width), stop, len(depth)
+        _forward(packed, boxes, *lists[:2], f32(stop), numba.get_num_threads(), *out)
+        ctx.save_for_backward(pixels.values, pixels.alpha)
+        ctx.gaussians, ctx.lists = (order, packed, boxes), lists
+        ctx.size, ctx.stop, ctx.count = (height, width), stop, len(depth)
         ctx.mark_non_differentiable(pixels.depth_sum)
-        return pixels.values, pixels.depth_sum, pixels.alpha
+        return parts
 
     @staticmethod
     def backward(ctx, grad_values, _grad_depth, grad_alpha):
-        order, packed, boxes, values, alpha = ctx.saved_tensors
+        values, alpha = ctx.saved_tensors
+        (order, packed, boxes), (offsets, ranks, first, slots) = ctx.gaussians, ctx.lists
         grad = torch.cat((grad_values, grad_alpha[:, None]), dim=1)  # [P, 4]
         gain = (grad_values * values).sum(dim=1) + grad_alpha * alpha
-        tiles = ctx.lists
-        sums = np.empty((len(tiles.ranks), SUMS), np.float32)
+        sums = np.empty((len(ranks), SUMS), np.float32)
         light = grad.numpy().reshape(*ctx.size, 4), gain.numpy().reshape(ctx.size)
         how = f32(ctx.stop), numba.get_num_threads()
-        _backward(packed.numpy(), boxes.numpy(), *tiles.arrays, *how, *light, sums)
+        _backward(packed, boxes, offsets, ranks, *how, *light, sums)
         grads = [torch.zeros(ctx.count, n) for n in (2, 3, 1, 3)]
-        given = order.numpy(), packed.numpy(), tiles.first, tiles.slots, sums
-        _collect(*given, *arrays(*grads))
+        _collect(order, packed, first, slots, sums, *arrays(*grads))
         centres, conics, opacities, colours = grads
         return centres, conics, opacities.squeeze(1), colours, None, None, None, None, None
 
 
 def _by_depth(depth: np.ndarray, extents: np.ndarray) -> np.ndarray:
-    """Indices of the visible Gaussians, nearest first; [n] int64.
-
-    Depths are positive, so their bits as integers have the same order. With the index in the lower
-    half, a fast sort of int64 is stable for equal depths.
-    """
+    """Indices [n] of the visible Gaussians, nearest first. Depths are positive, so their bits as
+    integers have the same order; with the index below them, a fast sort is stable."""
     shown = (extents[:, 0] > 0).nonzero()[0]
     keys = depth[shown].view(np.int32).astype(np.int64) << 32 | shown
     keys.sort()
     return keys & 0xFFFFFFFF
 
 
-class _Lists:
-    """Which Gaussians each tile shows.
+def _lists(boxes: np.ndarray, width: int, height: int) -> tuple[np.ndarray, ...]:
+    """Which Gaussians each tile shows: offsets, ranks, first and slots.
 
-    Attributes:
-        offsets: [tiles + 1], tile t owns entries offsets[t] to offsets[t + 1].
-        ranks: [entries] ranks of Gaussians by depth, ascending in a tile.
-        first: [N + 1], the Gaussian of rank r owns first[r] to first[r + 1] of `slots`.
-        slots: [entries] indices of the entries of each Gaussian, tile by tile.
+    Tile t owns entries offsets[t] to offsets[t + 1] of ranks: Gaussians by depth, ascending. That
+    of rank r owns first[r] to first[r + 1] of slots: the indices of its entries, tile by tile.
     """
-
-    def __init__(self, boxes: Tensor, width: int, height: int) -> None:
-        across, down = -(-width // TILE), -(-height // TILE)
-        threads = numba.get_num_threads()
-        counts = np.zeros(across * down, np.int64)
-        self.first = np.zeros(len(boxes) + 1, np.int64)
-        _count(boxes.numpy(), across, threads, counts, self.first)
-        self.offsets = np.concatenate(([0], counts.cumsum()))
-        self.first = self.first.cumsum()
-        self.ranks = np.empty(self.offsets[-1], np.int32)
-        self.slots = np.empty(self.offsets[-1], np.int32)
-        filled = self.offsets[:-1].copy()
-        _fill(boxes.numpy(), across, threads, filled, self.first, self.ranks, self.slots)
-        self.arrays = self.offsets, self.ranks
+    across, down = -(-width // TILE), -(-height // TILE)
+    threads = numba.get_num_threads()
+    counts, first = np.zeros(across * down, np.int64), np.zeros(len(boxes) + 1, np.int64)
+    _count(boxes, across, threads, counts, first)
+    offsets, first = np.concatenate(([0], counts.cumsum())), first.cumsum()
+    ranks, slots = np.empty((2, offsets[-1]), np.int32)
+    _fill(boxes, across, threads, offsets[:-1].copy(), first, ranks, slots)
+    return offsets, ranks, first, slots
 
 
 @njit(cache=True, parallel=True)
@@ -160,10 +142,8 @@ def _tiles(box):
 
 @njit(cache=True, parallel=True)
 def _count(boxes, across, threads, counts, entries):
-    """Count the entries of each tile and of each Gaussian (shifted by one), in n threads.
-
-    Each thread handles every n-th row of tiles.
-    """
+    """Count the entries of each tile and of each Gaussian (shifted by one); each of n threads has
+    every n-th row of tiles."""
     for thread in prange(threads):
         for rank in range(len(boxes)):
             left, right, top, bottom = _tiles(boxes[rank])
@@ -210,15 +190,13 @@ def _forward(packed, boxes, offsets, ranks, stop, threads, values, depth, alpha)
             if offsets[tile] == offsets[tile + 1]:
                 continue
             top, left = tile // across * TILE, tile % across * TILE
-            _tile_forward(
-                packed, boxes, ranks[offsets[tile] : offsets[tile + 1]], stop, top, left, state
-            )
+            own = ranks[offsets[tile] : offsets[tile + 1]]
+            _tile_forward(packed, boxes, own, stop, top, left, state)
             for row in range(top, min(top + TILE, height)):
                 for column in range(left, min(left + TILE, width)):
                     at = (row - top) * TILE + column - left
-                    values[row, column, 0] = state[PIXELS + at]
-                    values[row, column, 1] = state[2 * PIXELS + at]
-                    values[row, column, 2] = state[3 * PIXELS + at]
+                    for k in range(3):
+                        values[row, column, k] = state[(1 + k) * PIXELS + at]
                     depth[row, column] = state[4 * PIXELS + at]
                     alpha[row, column] = ONE - state[at]
 

@@ -15,12 +15,7 @@ BAND = 16
 
 
 def blend(
-    ellipses: Ellipses,
-    opacities: Tensor,
-    colours: Tensor,
-    width: int,
-    height: int,
-    stop: float,
+    ellipses: Ellipses, opacities: Tensor, colours: Tensor, width: int, height: int, stop: float
 ) -> Pixels:
     order = ellipses.depth.argsort(stable=True)
     bands = []

@@ -2,7 +2,8 @@
 
 A Gaussian with rotation R and scales s has the covariance V = (R diag s) (R diag s)^T. Seen by a
 camera with rotation W, its ellipse has the covariance V' = J W V W^T J^T + BLUR I, where J is the
-derivative of the projection at its centre.
+derivative of the projection at its centre. Wrong shapes raise ValueError, as do other numbers than
+float32 with backend="cpu".
 """
 
 from __future__ import annotations
@@ -32,19 +33,15 @@ LEAST_ALPHA = 1 / 255
 class Ellipses:
     """N Gaussians projected to a picture.
 
-    Attributes:
-        centres: [N, 2] continuous pixel coordinates (u, v).
-        conics: [N, 3] A, B, C of the squared distance A x^2 + 2 B x y + C y^2 from the centre, the
-            inverse of V'; pixels^-2.
-        depth: [N] z-depth of the centre.
-        extents: [N, 2] half width and half height of the bounding box of all points where the
-            opacity is at least `LEAST_ALPHA`, in pixels; 0 for an invisible Gaussian.
+    A conic is A, B, C of the squared distance A x^2 + 2 B x y + C y^2 from the centre, the inverse
+    of V'. An extent is half the width and height of the box of all points where the opacity is at
+    least `LEAST_ALPHA`; 0 for an invisible Gaussian.
     """
 
-    centres: Tensor
-    conics: Tensor
-    depth: Tensor
-    extents: Tensor
+    centres: Tensor  # [N, 2] (u, v), pixels
+    conics: Tensor  # [N, 3] pixels^-2
+    depth: Tensor  # [N] z-depth of the centre
+    extents: Tensor  # [N, 2] pixels
 
 
 def project_gaussians(
@@ -56,20 +53,12 @@ def project_gaussians(
     *,
     backend: str = "auto",
 ) -> Ellipses:
-    """Project N Gaussians to ellipses.
+    """Project N Gaussians to ellipses: `means` [N, 3] and standard deviations along their axes,
+    `scales` [N, 3], in scene units; `rotations` [N, 4], quaternions (w, x, y, z) of any non-zero
+    length; `opacities` [N] at the centre.
 
     Centres and conics are differentiable in means, scales and rotations; for invisible Gaussians
     they are zeros without gradient. Depth and extents have no gradient.
-
-    Args:
-        means: [N, 3] centres, scene units.
-        scales: [N, 3] standard deviations along the axes of the Gaussian, scene units.
-        rotations: [N, 4] quaternions (w, x, y, z) of any non-zero length.
-        opacities: [N] at the centre, in [0, 1].
-        camera: on the device of the Gaussians.
-
-    Raises:
-        ValueError: wrong shapes; backend "cpu": not float32.
     """
     count = len(means)
     check_shape("means", means, None, 3)
@@ -83,16 +72,11 @@ def project_gaussians(
 
 def covariances(scales: Tensor, rotations: Tensor) -> Tensor:
     """V [N, 3, 3] of N Gaussians."""
-    factors = rotation_matrices(rotations) * scales[:, None]
-    return factors @ factors.transpose(1, 2)
-
-
-def rotation_matrices(rotations: Tensor) -> Tensor:
-    """R [N, 3, 3] of quaternions [N, 4] (w, x, y, z) of any non-zero length."""
     w, x, y, z = torch.nn.functional.normalize(rotations, dim=1).unbind(dim=1)
-    entries = (
+    entries = (  # of R
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     )  # fmt: skip
-    return torch.stack(entries, dim=1).view(-1, 3, 3)
+    factors = torch.stack(entries, dim=1).view(-1, 3, 3) * scales[:, None]
+    return factors @ factors.transpose(1, 2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -33,8 +34,6 @@ from methods.gaussians.kernels.projection import (
 from methods.kernels.dispatch import served
 
 CAMERA = CAMERAS["looking at the cube"]
-FAR = 3.0
-"""Bound on the variance of an ellipse over the least, `BLUR`; scales and depths ensure it."""
 
 AREA = (
     "conics, of an area that loses a factor of xx yy / area < 64, after 30 roundings of numbers "
@@ -70,23 +69,16 @@ def cases() -> list[Case]:
     for count in (0, 1, 1000, 1 << 16):
         name, items = f"{count:,} Gaussians", count if count > 1000 else None
         found += PROJECT.cases(name, partial(_given, count), items=items)
-    backends = served(__package__)
     slopes = Property(
-        "gaussian projection",
+        PROJECT.subject,
         "the ellipse is that of the derivative of the projection, by autograd",
         "as in the agreement of the backends: 8,000 u",
-        on_backends(8000, "fp64", backends=backends),
+        on_backends(8000, "fp64"),
     )
-    hidden = Property(
-        "gaussian projection",
-        "nothing is shown, and no gradient is not finite",
-        "decided by comparisons: 0 wrong",
-        on_backends(0, "fp64", backends=backends),
-    )
-    found.append(slopes.case("in the picture", _slopes_error))
-    for name, changed in HIDDEN.items():
-        found.append(hidden.case(name, partial(_shown, changed)))
-    return found
+    holds, why = "nothing shows, and no gradient is not finite", "decided by comparisons: 0 wrong"
+    hidden = Property(PROJECT.subject, holds, why, on_backends(0, "fp64"))
+    found += (hidden.case(name, partial(_shown, changed)) for name, changed in HIDDEN.items())
+    return [*found, slopes.case("in the picture", _slopes_error)]
 
 
 def _given(count: int) -> Given:
@@ -111,15 +103,13 @@ def _given(count: int) -> Given:
 
 def _slopes_error(backend: str, device: str, precision: str) -> float:
     *drawn, camera = placed(_given(1000), device).values()
-    means, scales, rotations, opacities = (x.to(DTYPES[precision]) for x in drawn)
-    pixels, depth = project(camera, means)
+    drawn = [x.to(DTYPES[precision]) for x in drawn]
+    pixels, depth = project(camera, drawn[0])
     size = pixels.new_tensor((camera.width, camera.height))
-    seen = (depth > 0.1) & ((pixels > 0) & (pixels < size)).all(dim=1) & (opacities > 0.01)
-    means, scales, rotations, opacities = (x[seen] for x in (means, scales, rotations, opacities))
-    ellipses = project_gaussians(means, scales, rotations, opacities, camera, backend=backend)
-    means, scales, rotations, opacities = (
-        x.double().cpu() for x in (means, scales, rotations, opacities)
-    )
+    seen = (depth > 0.1) & ((pixels > 0) & (pixels < size)).all(dim=1) & (drawn[3] > 0.01)
+    drawn = [x[seen] for x in drawn]
+    ellipses = project_gaussians(*drawn, camera, backend=backend)
+    means, scales, rotations, opacities = (x.double().cpu() for x in drawn)
 
     def centre(point: Tensor) -> Tensor:
         return project(CAMERA, point[None])[0][0]
@@ -127,8 +117,7 @@ def _slopes_error(backend: str, device: str, precision: str) -> float:
     slopes = vmap(jacrev(centre))(means)  # [n, 2, 3]
     spread = slopes @ covariances(scales, rotations) @ slopes.transpose(1, 2)
     spread += BLUR * torch.eye(2, dtype=torch.float64)
-    inverse = spread.inverse()
-    conics = torch.stack((inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]), dim=1)
+    conics = spread.inverse().flatten(1)[:, [0, 1, 3]]
     reach = 2 * (opacities / LEAST_ALPHA).log()[:, None]
     extents = (reach * spread.diagonal(dim1=1, dim2=2)).sqrt()
     width, (exact, z) = camera.width, project(CAMERA, means)
@@ -148,18 +137,14 @@ HIDDEN: dict[str, dict[str, float]] = {
 
 
 def _shown(changed: dict[str, float], backend: str, device: str, precision: str) -> float:
-    camera, dtype = placed(CAMERA, device), DTYPES[precision]
-    depth, scale = changed.get("depth", 1.0), changed.get("scale", 0.01)
-    place = camera.c2w[:, 3] + depth * camera.c2w[:, 2]
-    opacity = torch.tensor([changed.get("opacity", 0.5)])
-    means, scales, rotations = given = [
-        x.to(device, dtype).requires_grad_()
-        for x in (place[None], torch.full((1, 3), scale), torch.tensor([[1.0, 0, 0, 0]]))
-    ]
-    opacity = opacity.to(device, dtype)
-    found = project_gaussians(means, scales, rotations, opacity, camera, backend=backend)
-    (found.centres.sum() + found.conics.sum()).backward()
-    wrong = found.extents.count_nonzero().item()
-    return float(
-        wrong + sum((~x.grad.isfinite()).sum().item() for x in given if x.grad is not None)
-    )
+    """How many numbers are shown, or have a gradient that is not finite."""
+    how: Any = {"device": device, "dtype": DTYPES[precision]}
+    place = CAMERA.c2w[:, 3] + changed.get("depth", 1.0) * CAMERA.c2w[:, 2]
+    scales = torch.full((1, 3), changed.get("scale", 0.01), **how)
+    given = place[None].to(**how), scales, torch.tensor([[1.0, 0, 0, 0]], **how)
+    learned = [x.requires_grad_() for x in given]
+    opacity = torch.tensor([changed.get("opacity", 0.5)], **how)
+    found = project_gaussians(*learned, opacity, placed(CAMERA, device), backend=backend)
+    slopes = torch.autograd.grad(found.centres.sum() + found.conics.sum(), learned)
+    wrong = found.extents.count_nonzero() + sum((~x.isfinite()).sum() for x in slopes)
+    return float(wrong)

@@ -30,25 +30,22 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, scales, rotations, opacities, camera):
         inputs = [x.detach().contiguous() for x in (means, scales, rotations)]
-        view = _view(camera)
-        count = len(means)
-        found = [torch.empty(count, size) for size in (2, 3, 1, 2)]
+        ctx.view = _view(camera)
+        found = [torch.empty(len(means), size) for size in (2, 3, 1, 2)]
         reach = 2 * (opacities.detach() / LEAST_ALPHA).log()  # NaN or below 0: too faint
-        _forward(*arrays(*inputs, reach[:, None]), *view, *arrays(*found))
+        given = tuple(arrays(*inputs, reach[:, None]))
+        _forward(given, *ctx.view, tuple(arrays(*found)))
         centres, conics, depth, extents = found
         depth = depth.squeeze(1)
         ctx.save_for_backward(*inputs, conics, extents)
-        ctx.view = view
         ctx.mark_non_differentiable(depth, extents)
         return centres, conics, depth, extents
 
     @staticmethod
     def backward(ctx, grad_centres, grad_conics, _depth, _extents):
-        *inputs, conics, extents = ctx.saved_tensors
-        grads = [torch.empty_like(x) for x in inputs]
-        parts = inputs, (conics, extents), (grad_centres, grad_conics), grads
-        given, ellipses, asked, out = (tuple(arrays(*part)) for part in parts)
-        _backward(given, ellipses, *ctx.view, asked, out)
+        given = tuple(arrays(*ctx.saved_tensors, grad_centres, grad_conics))
+        grads = [torch.empty(x.shape) for x in ctx.saved_tensors[:3]]
+        _backward(given, *ctx.view, tuple(arrays(*grads)))
         return (*grads, None, None)
 
 
@@ -71,28 +68,24 @@ def _dot(a, b):
 
 
 @njit(cache=True)
-def _load(block, place, source, first, size):
-    """Copy `size` rows of `source`, from `first` on; its columns become rows of the block, from
-    `place` on."""
-    for column in range(source.shape[1]):
-        for i in range(size):
-            block[(place + column) * BLOCK + i] = source[first + i, column]
+def _load(block, sources, first, size):
+    """Copy `size` rows of each source, from `first` on; their columns become rows of the block."""
+    row = 0
+    for source in sources:
+        for column in range(source.shape[1]):
+            for i in range(size):
+                block[row * BLOCK + i] = source[first + i, column]
+            row += 1
 
 
 @njit(cache=True)
-def _load_gaussians(block, means, scales, rotations, first, size):
-    """Rows 0 to 9 of a block."""
-    _load(block, 0, means, first, size)
-    _load(block, 3, scales, first, size)
-    _load(block, 6, rotations, first, size)
-
-
-@njit(cache=True)
-def _store(block, place, target, first, size):
-    """The way back of `_load`."""
-    for column in range(target.shape[1]):
-        for i in range(size):
-            target[first + i, column] = block[(place + column) * BLOCK + i]
+def _store(block, row, targets, first, size):
+    """The way back of `_load`, from a `row` of the block on."""
+    for target in targets:
+        for column in range(target.shape[1]):
+            for i in range(size):
+                target[first + i, column] = block[row * BLOCK + i]
+            row += 1
 
 
 @njit(cache=True)
@@ -128,18 +121,14 @@ def _rotation(qw, qx, qy, qz):
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def _forward(means, scales, rotations, reach, world, origin, view, centres, conics, depth, extents):
-    count = len(means)
+def _forward(given, world, origin, view, out):
+    count = len(given[0])
     for chunk in prange((count + BLOCK - 1) // BLOCK):
         first, size = chunk * BLOCK, min(BLOCK, count - chunk * BLOCK)
         block = np.empty(19 * BLOCK, np.float32)
-        _load_gaussians(block, means, scales, rotations, first, size)
-        _load(block, 10, reach, first, size)
+        _load(block, given, first, size)
         _project(block, size, world, origin, view)
-        _store(block, 11, centres, first, size)
-        _store(block, 13, conics, first, size)
-        _store(block, 16, depth, first, size)
-        _store(block, 17, extents, first, size)
+        _store(block, 11, out, first, size)
 
 
 @njit(cache=True, error_model="numpy")
@@ -178,24 +167,14 @@ def _project(block, size, world, origin, view):
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def _backward(given, ellipses, world, origin, view, asked, grads):
-    means, scales, rotations = given
-    conics, extents = ellipses
-    grad_centres, grad_conics = asked
-    grad_means, grad_scales, grad_rotations = grads
-    count = len(means)
+def _backward(given, world, origin, view, out):
+    count = len(given[0])
     for chunk in prange((count + BLOCK - 1) // BLOCK):
         first, size = chunk * BLOCK, min(BLOCK, count - chunk * BLOCK)
         block = np.empty(30 * BLOCK, np.float32)
-        _load_gaussians(block, means, scales, rotations, first, size)
-        _load(block, 10, conics, first, size)
-        _load(block, 13, extents, first, size)
-        _load(block, 15, grad_centres, first, size)
-        _load(block, 17, grad_conics, first, size)
+        _load(block, given, first, size)
         _differentiate(block, size, world, origin, view)
-        _store(block, 20, grad_means, first, size)
-        _store(block, 23, grad_scales, first, size)
-        _store(block, 26, grad_rotations, first, size)
+        _store(block, 20, out, first, size)
 
 
 @njit(cache=True, error_model="numpy")

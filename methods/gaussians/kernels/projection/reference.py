@@ -49,10 +49,8 @@ def _ellipses(
     limit_y = FRUSTUM * 0.5 * camera.height / camera.fy
     x, y = (z * (x / z).clamp(-limit_x, limit_x), z * (y / z).clamp(-limit_y, limit_y))
     zero = torch.zeros_like(z)
-    jacobian = torch.stack(
-        (camera.fx / z, zero, -camera.fx * x / z**2, zero, camera.fy / z, -camera.fy * y / z**2),
-        dim=1,
-    ).view(-1, 2, 3)
+    rows = camera.fx / z, zero, -camera.fx * x / z**2, zero, camera.fy / z, -camera.fy * y / z**2
+    jacobian = torch.stack(rows, dim=1).view(-1, 2, 3)
     slopes = jacobian @ pose[:, :3].T  # J W
     spread = slopes @ covariances(scales, rotations) @ slopes.transpose(1, 2)
     xx, xy, yy = spread[:, 0, 0] + BLUR, spread[:, 0, 1], spread[:, 1, 1] + BLUR

@@ -19,10 +19,8 @@ def ssim(picture: Tensor, target: Tensor, *, backend: str = "auto") -> Tensor:
     """Mean structural similarity of two pictures [H, W, 3] in [0, 1]; a scalar.
 
     The mean is over all pixels and channels; beyond the border both pictures are black.
-    Differentiable in `picture`.
-
-    Raises:
-        ValueError: wrong shapes; backend "cpu": not float32, or `target` needs a gradient.
+    Differentiable in `picture`. Wrong shapes raise ValueError, as do with backend="cpu" a `target`
+    that needs a gradient, and other numbers than float32.
     """
     check_shape("picture", picture, None, None, 3)
     check_shape("target", target, *picture.shape)

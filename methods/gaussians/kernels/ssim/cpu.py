@@ -12,7 +12,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from methods.gaussians.kernels.ssim import C1, C2, REACH, WINDOW
-from methods.kernels.cpu import check_float32, f32
+from methods.kernels.cpu import arrays, check_float32, f32
 
 WEIGHTS = np.array(WINDOW, np.float32)
 MARGIN = 3 * REACH
@@ -23,19 +23,17 @@ def ssim(picture: Tensor, target: Tensor) -> Tensor:
     check_float32(picture, target)
     if target.requires_grad:
         raise ValueError("backend 'cpu' gives no gradient for target: use backend='reference'")
-    return _Ssim.apply(picture, target.contiguous())
+    return _Ssim.apply(picture.flatten(1), target.flatten(1))
 
 
 class _Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx, picture, target):
-        picture = picture.detach().contiguous()
-        height, width, _ = picture.shape
-        rows = [x.numpy().reshape(height, 3 * width) for x in (picture, target)]
+        rows = arrays(picture, target)
+        height = len(picture)
         spans, seen = np.empty((2, height, 2), np.int64)
         _different(*rows, spans)
-        slopes = torch.empty(3, height, 3 * width)
-        sums = torch.empty(height, dtype=torch.float64)
+        slopes, sums = torch.empty(3, *picture.shape), torch.empty(height, dtype=torch.float64)
         _compare(*rows, spans, slopes.numpy(), sums.numpy(), seen)
         ctx.save_for_backward(picture, target, slopes)
         ctx.seen = seen
@@ -43,12 +41,10 @@ class _Ssim(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad):
-        picture, target, slopes = ctx.saved_tensors
-        height, width, _ = picture.shape
-        rows = (x.numpy().reshape(height, 3 * width) for x in (picture, target))
-        grads = torch.zeros(height, 3 * width)
-        _spread(*rows, slopes.numpy(), ctx.seen, grads.numpy())
-        return grads.view_as(picture) * (grad / picture.numel()), None
+        *rows, slopes = arrays(*ctx.saved_tensors)
+        grads = torch.zeros(rows[0].shape)
+        _spread(*rows, slopes, ctx.seen, grads.numpy())
+        return grads * (grad / grads.numel()), None
 
 
 @njit(cache=True, fastmath={"contract"})
@@ -96,11 +92,9 @@ def _reached(spans, row, size):
 
 @njit(cache=True, parallel=True)
 def _compare(picture, target, spans, slopes, sums, seen):
-    """Sums of the similarity of each row; its derivatives by the mean of x, of x x and of x y.
-
-    Only windows from which a difference can be `seen` are computed. A window in which both pictures
-    are equal has the similarity 1 and no gradient, because that is the maximum.
-    """
+    """Sums of the similarity of each row; its derivatives by the mean of x, of x x and of x y. Only
+    windows from which a difference can be `seen` are computed: where both pictures are equal, the
+    similarity is 1 and has no gradient, because that is the maximum."""
     height, size = picture.shape
     for row in prange(height):
         low, high = _reached(spans, row, size)
@@ -164,8 +158,5 @@ def _spread(picture, target, slopes, seen, grads):
         for k in range(3):
             _across(blurred[k], padded[k])
         for i in range(high - low):
-            grads[row, low + i] = (
-                blurred[0, i]
-                + TWO * picture[row, low + i] * blurred[1, i]
-                + target[row, low + i] * blurred[2, i]
-            )
+            x, y = picture[row, low + i], target[row, low + i]
+            grads[row, low + i] = blurred[0, i] + TWO * x * blurred[1, i] + y * blurred[2, i]

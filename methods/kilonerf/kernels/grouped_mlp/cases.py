@@ -1,4 +1,4 @@
-"""Cases of the small networks."""
+"""Cases of the small networks: sorting, encoding, single layers and whole networks."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from bench.case import U32, Bound, Case, Given, Operation, uniform
 from methods.kernels.dispatch import served
 from methods.kilonerf.kernels.grouped_mlp import (
     HIDDEN,
+    POSITION_FREQUENCIES,
+    SHAPES,
     Networks,
     colours,
     densities,
@@ -20,21 +22,19 @@ from methods.kilonerf.kernels.grouped_mlp import (
     order,
 )
 
-SHAPES = {"in": (63, 32), "mid": (32, 32), "density": (32, 1)} | {
-    "feature": (32, 32),
-    "direction": (59, 32),
-    "colour": (32, 3),
-}
 KINDS = {
     "some samples without a network": (1000, 7),
     "no sample": (0, 3),
     "one sample": (1, 1),
     "fewer samples than go together": (5, 1),
     "most networks empty": (40, 300),
+    "150 thousand in 250": (150_000, 250),
 }
 """Numbers of samples and networks."""
 
-MANY = 150_000, 250
+MANY = 1000
+"""Samples of more than this are timed."""
+
 ANGLES = 188 * U32
 """An angle of at most 512 is rounded by none, reduced with an error below 4 u, and its sine within
 4 u; each of 4 doublings doubles the error and adds 4 u: 16 x 8 u + 60 u."""
@@ -49,14 +49,12 @@ LOCATE = Operation(
         "positions": Bound("a quotient below 5 that is rounded once more: 8 u", 8 * U32),
     },
 )
-
-
-def _ordered(given: Given, backend: str) -> tuple[Tensor, ...]:
-    groups = order(**given, backend=backend)
-    return groups.permutation, groups.offsets
-
-
-ORDER = Operation("order", served(__package__), _ordered, {"permutation": EXACT, "offsets": EXACT})
+ORDER = Operation(
+    "order",
+    served(__package__),
+    lambda given, backend: order(**given, backend=backend),
+    {"permutation": EXACT, "offsets": EXACT},
+)
 ENCODE = Operation(
     "encode frequencies",
     served(__package__),
@@ -65,17 +63,9 @@ ENCODE = Operation(
 )
 
 
-def _sums(inputs: Tensor, weights: Tensor, biases: Tensor, offsets: Tensor) -> Tensor:
-    """How far a layer's outputs may be off by its own roundings, for exact inputs: a sum of I
-    products and a bias by I + 1 u of the sum of their sizes, by both."""
-    values, factors, added = (x.double().abs() for x in (inputs, weights, biases))
-    total = grouped_linear(values, factors, added, offsets, backend="reference")
-    return 2 * (weights.shape[1] + 1) * U32 * total
-
-
 def _of_network(given: Given) -> Tensor:
-    """The same for the sums over the n samples of each network: see `OF_NETWORK`."""
-    counts = given["offsets"].diff().double()
+    """How far sums over the samples of each network may be off, [N, 1]."""
+    counts = given["offsets"].diff().double()[:, None]
     return 6 * counts.sqrt() * (counts + 1) * U32
 
 
@@ -89,8 +79,8 @@ LINEAR = Operation(
     lambda given, backend: (grouped_linear(**given, backend=backend),),
     {
         "outputs": Bound(
-            "a sum of I products and a bias, I + 1 u of the sum of their sizes, by both",
-            lambda given: _sums(*(given[x] for x in ("inputs", "weights", "biases", "offsets"))),
+            "I products below 1 / 8 and a bias of at most 16, by both: 2 (I + 1) (I / 8 + 16) u",
+            lambda given: 2 * (1 + (i := given["weights"].shape[1])) * (i / 8 + 16) * U32,
         )
     },
     {
@@ -98,68 +88,46 @@ LINEAR = Operation(
             "sums of O products below 1 / 8, by both: 2 O x O / 8 u",
             lambda given: given["weights"].shape[2] ** 2 / 4 * U32,
         ),
-        "weights": Bound(OF_NETWORK, lambda given: _of_network(given)[:, None, None]),
-        "biases": Bound(OF_NETWORK, lambda given: _of_network(given)[:, None]),
+        "weights": Bound(OF_NETWORK, lambda given: _of_network(given)[:, None]),
+        "biases": Bound(OF_NETWORK, _of_network),
     },
 )
 
 
-def _grown(given: Given, first: Tensor, off: float, names: tuple[str, ...]) -> Tensor:
-    """How far the outputs of the last of some layers may be off, one after the other, if the inputs
-    `first` of the first one are `off`: each passes the errors of its inputs on, times the sizes of
-    its weights, and adds its own."""
-    networks: Networks = given["networks"]
-    numbers = given["numbers"] if "numbers" in given else given["geometry"][:, HIDDEN].int()
-    groups = order(numbers, networks.count, backend="reference")
-    place, offsets = groups.permutation, groups.offsets
-    x = first[place].double()
-    error = torch.full_like(x, off)
+def _grown(off: float, *names: str) -> float:
+    """How far the outputs of the last of some layers may be off, one after the other, whose inputs
+    of at most 1 are `off`; weights and biases are at most 1 / 8. Each layer passes the errors of
+    its inputs on, times its weights, and adds I + 1 u of the sum of their sizes, by both."""
+    size = 1.0
     for name in names:
-        weights, biases = (tensor.double() for tensor in networks.layer(name))
-        if name == "direction":
-            seen = given["encoded"][place].double()
-            x, error = torch.cat((x, seen), dim=1), torch.cat((error, 0 * seen), dim=1)
-        sizes, relu = (weights.abs(), 0 * biases, offsets), name in ("in", "mid", "direction")
-        passed = grouped_linear(error, *sizes, backend="reference")
-        error = passed + _sums(x, weights, biases, offsets)
-        x = grouped_linear(x, weights, biases, offsets, relu=relu, backend="reference")
-    return error.new_zeros(len(first), error.shape[1]).index_copy(0, place, error)
+        inputs, _ = SHAPES[name]
+        most = (inputs * size + 1) / 8
+        off, size = inputs / 8 * off + 2 * (inputs + 1) * U32 * most, most
+    return off
 
 
-def _off_densities(given: Given, *names: str) -> Tensor:
-    encoded = encode_frequencies(given["positions"], 10, backend="reference")
-    return _grown(given, encoded, ANGLES, names)
-
-
-def _off_geometry(given: Given) -> Tensor:
-    hidden = _off_densities(given, "in", "mid")
-    return torch.cat((hidden, 0 * hidden[:, :1]), dim=1)  # the number is exact
-
-
-def _off_colours(given: Given) -> Tensor:
-    hidden, names = given["geometry"][:, :HIDDEN], ("feature", "direction", "colour")
-    return _grown(given, hidden, 0.0, names) / 4 + 8 * U32
-
-
-GROWN = "each layer passes the errors of its inputs on, times the sizes of its weights, and adds "
-GROWN += "I + 1 u of the sum of the sizes, by both"
 DENSITIES = Operation(
     "densities of networks",
     served(__package__),
     lambda given, backend: densities(**given, backend=backend),
     {
         "densities": Bound(
-            f"angles off by 188 u; {GROWN}",
-            lambda given: _off_densities(given, "in", "mid", "density").squeeze(1),
+            "three layers, as `_grown` says, of angles off by 188 u",
+            _grown(ANGLES, "in", "mid", "density"),
         ),
-        "geometry": Bound("the same, of two layers", _off_geometry),
+        "geometry": Bound("the same, of two layers", _grown(ANGLES, "in", "mid")),
     },
 )
 COLOURS = Operation(
     "colours of networks",
     served(__package__),
     lambda given, backend: (colours(**given, backend=backend),),
-    {"colours": Bound(f"{GROWN}; a sigmoid has a quarter of it and 8 u of its own", _off_colours)},
+    {
+        "colours": Bound(
+            "three layers, as `_grown` says; a sigmoid has a quarter of it and 8 u of its own",
+            _grown(0.0, "feature", "direction", "colour") / 4 + 8 * U32,
+        )
+    },
 )
 
 
@@ -167,12 +135,11 @@ def cases() -> list[Case]:
     """Sorting, encoding, single layers forward and backward, and whole networks."""
     found = []
     for count in (0, 1, 1000, 1 << 18):
-        items = count if count > 1000 else None
+        items = count if count > MANY else None
         found += LOCATE.cases(f"{count:,} positions", partial(_placed, count), items=items)
-        angles = partial(_angles, count)
-        found += ENCODE.cases(f"{count:,} samples", angles, items=items)
-    for name, size in (KINDS | {"150 thousand in 250": MANY}).items():
-        items = size[0] if size == MANY else None
+        found += ENCODE.cases(f"{count:,} samples", partial(_angles, count), items=items)
+    for name, (count, networks) in KINDS.items():
+        size, items = (count, networks), count if count > MANY else None
         found += ORDER.cases(name, partial(_sorted, *size), items=items)
         found += DENSITIES.cases(name, partial(_in_cubes, *size), items=items)
         found += COLOURS.cases(name, partial(_seen, *size), items=items)
@@ -180,12 +147,6 @@ def cases() -> list[Case]:
             layer = partial(_layer, *size, inputs, outputs)
             found += LINEAR.cases(f"{name}, {inputs} to {outputs}", layer, items=items)
     return found
-
-
-def _numbers(count: int, networks: int) -> Tensor:
-    """A network, or -1 for none, for each sample."""
-    generator = torch.Generator().manual_seed(count)
-    return torch.randint(-1, networks, (count,), generator=generator)
 
 
 def _uniform(seed: int, *shape: int) -> Tensor:
@@ -201,16 +162,19 @@ def _placed(count: int) -> Given:
 
 
 def _sorted(count: int, networks: int) -> Given:
-    return {"networks": _numbers(count, networks), "count": networks}
+    """A network, or -1 for none, for each sample."""
+    generator = torch.Generator().manual_seed(count)
+    numbers = torch.randint(-1, networks, (count,), generator=generator)
+    return {"networks": numbers, "count": networks}
 
 
 def _angles(count: int) -> Given:
-    return {"inputs": _uniform(count, count, 3), "frequencies": 10}
+    return {"inputs": _uniform(count, count, 3), "frequencies": POSITION_FREQUENCIES}
 
 
 def _layer(count: int, networks: int, inputs: int, outputs: int) -> Given:
     """With a ReLU, biases keep sums away from 0, where rounding would decide."""
-    offsets = order(_numbers(count, networks), networks, backend="reference").offsets
+    _, offsets = order(**_sorted(count, networks), backend="reference")
     relu, biases = outputs > 3, _uniform(3, networks, outputs)
     return {
         "inputs": _uniform(1, int(offsets[-1]), inputs),
@@ -223,20 +187,20 @@ def _layer(count: int, networks: int, inputs: int, outputs: int) -> Given:
 
 def _few(networks: int) -> Networks:
     """Their weights are at most 1 / 8."""
-    weights, biases = {}, {}
-    for n, (name, (inputs, outputs)) in enumerate(SHAPES.items()):
-        weights[name] = _uniform(10 + n, networks, inputs, outputs) / 8
-        biases[name] = _uniform(20 + n, networks, outputs) / 8
-    return Networks(weights, biases)
+    found = {}
+    for n, (name, shape) in enumerate(SHAPES.items()):
+        weights, biases = _uniform(10 + n, networks, *shape), _uniform(20 + n, networks, shape[1])
+        found[name] = weights / 8, biases / 8
+    return found
 
 
 def _in_cubes(count: int, networks: int) -> Given:
-    positions, numbers = _uniform(5, count, 3), _numbers(count, networks)
-    return {"positions": positions, "numbers": numbers, "networks": _few(networks)}
+    numbers = _sorted(count, networks)["networks"]
+    return {"positions": _uniform(5, count, 3), "numbers": numbers, "networks": _few(networks)}
 
 
 def _seen(count: int, networks: int) -> Given:
-    numbers = _numbers(count, networks)[:, None].float()
+    numbers = _sorted(count, networks)["networks"][:, None].float()
     return {
         "geometry": torch.cat((_uniform(6, count, HIDDEN), numbers), dim=1),
         "encoded": _uniform(7, count, SHAPES["direction"][0] - HIDDEN),

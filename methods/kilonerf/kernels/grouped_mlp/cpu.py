@@ -22,14 +22,14 @@ from methods.kernels.cpu import (
     f32,
     multiply,
     prefetch,
+    prefetch_row,
     tall,
 )
-from methods.kilonerf.kernels.grouped_mlp import HIDDEN, Groups, Networks
+from methods.kilonerf.kernels.grouped_mlp import HIDDEN, POSITION_FREQUENCIES, Networks
 
 SLOT = TALL + -TALL % 8
 """Numbers in a row of `_encode`: `TALL` and a few idle ones, whole vectors."""
 
-LINE = 16  # float32 in a cache line
 AHEAD = 24
 """Samples from the one that is computed to the one that is prefetched."""
 
@@ -58,23 +58,21 @@ def locate(positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor) -> tu
     check_float32(positions, corner, side)
     networks = torch.empty(len(positions), dtype=torch.int16)
     local = torch.empty(len(positions), 3)
-    given = arrays(positions, cubes, corner)
-    _locate(*given, f32(side.item()), networks.numpy(), local.numpy())
+    _locate(*arrays(positions, cubes, corner), f32(side.item()), *arrays(networks, local))
     return networks, local
 
 
-def order(networks: Tensor, count: int) -> Groups:
+def order(networks: Tensor, count: int) -> tuple[Tensor, Tensor]:
     offsets = torch.zeros(count + 1, dtype=torch.int64)
     places = torch.empty(len(networks), dtype=torch.int64)
-    numbers = networks.contiguous().numpy()
-    _sort(numbers, offsets.numpy(), places.numpy())
-    return Groups(places[: int(offsets[-1])], offsets)
+    _sort(*arrays(networks, offsets, places))
+    return places[: int(offsets[-1])], offsets
 
 
 def encode_frequencies(inputs: Tensor, frequencies: int) -> Tensor:
     check_float32(inputs)
     out = torch.empty(len(inputs), 3 + 6 * frequencies)
-    _encode_all(inputs.detach().contiguous().numpy(), frequencies, out.numpy())
+    _encode_all(*arrays(inputs), frequencies, out.numpy())
     return out
 
 
@@ -86,34 +84,26 @@ def grouped_linear(
 
 
 def densities(positions: Tensor, numbers: Tensor, networks: Networks) -> tuple[Tensor, Tensor]:
-    layers = _layers(networks, "in", "mid", "density")
+    layers = *networks["in"], *networks["mid"], *networks["density"]
     check_float32(positions, *layers)
-    groups = order(numbers, networks.count)
-    raw = torch.empty(len(positions))
-    geometry = torch.empty(len(positions), HIDDEN + 1)
-    if len(groups.permutation) < len(positions):
+    groups = order(numbers, len(layers[0]))
+    raw, geometry = torch.empty(len(positions)), torch.empty(len(positions), HIDDEN + 1)
+    if len(groups[0]) < len(positions):
         raw.zero_()
         geometry.zero_()
-    parts = (positions,), layers, (groups.permutation, groups.offsets)
-    given = (tuple(arrays(*part)) for part in parts)
-    _densities(*given, networks.frequencies, raw.numpy(), geometry.numpy())
+    given = (tuple(arrays(*part)) for part in ((positions,), layers, groups))
+    _densities(*given, POSITION_FREQUENCIES, *arrays(raw, geometry))
     geometry[:, HIDDEN] = numbers
     return raw, geometry
 
 
 def colours(geometry: Tensor, encoded: Tensor, networks: Networks) -> Tensor:
-    layers = _layers(networks, "feature", "direction", "colour")
+    layers = *networks["feature"], *networks["direction"], *networks["colour"]
     check_float32(geometry, encoded, *layers)
-    groups = order(geometry[:, HIDDEN].int(), networks.count)
+    groups = order(geometry[:, HIDDEN].int(), len(layers[0]))
     raw = torch.full((len(geometry), 3), -torch.inf)  # whose sigmoid is 0
-    parts = (geometry, encoded), layers, (groups.permutation, groups.offsets)
-    _colours(*(tuple(arrays(*part)) for part in parts), raw.numpy())
+    _colours(*(tuple(arrays(*part)) for part in ((geometry, encoded), layers, groups)), raw.numpy())
     return raw.sigmoid_()
-
-
-def _layers(networks: Networks, *names: str) -> list[Tensor]:
-    """Weights and biases of some layers, in turns."""
-    return [part for name in names for part in networks.layer(name)]
 
 
 def _whole_vectors(tensor: Tensor) -> Tensor:
@@ -140,14 +130,11 @@ class _Linear(torch.autograd.Function):
         inputs, weights, offsets, out = ctx.saved_tensors
         outputs, wanted = grad.shape[1], ctx.needs_input_grad[0]
         grad = _whole_vectors(grad)
-        grads = torch.empty_like(weights), torch.empty(len(weights), out.shape[1])
+        grads = torch.empty(weights.shape), torch.empty(len(weights), out.shape[1])
         channels = inputs.shape[1]
         grad_inputs = torch.empty(len(inputs) if wanted else 0, channels + -channels % LANES)
-        _backward(
-            *arrays(inputs, weights, offsets, out, grad),
-            ctx.relu,
-            *(part.numpy() for part in (grad_inputs, *grads)),
-        )
+        given = arrays(inputs, weights, offsets, out, grad)
+        _backward(*given, ctx.relu, *arrays(grad_inputs, *grads))
         cut = tuple(part[..., :outputs] for part in grads)
         return grad_inputs[:, :channels] if wanted else None, *cut, None, None
 
@@ -337,8 +324,7 @@ def _densities(given, layers, groups, frequencies, raw, geometry):
                     s = permutation[r]
                     prefetch(places, 3 * s)
                     prefetch(raw, s)
-                    for i in range(0, HIDDEN + 1, LINE):
-                        prefetch(found, s * (HIDDEN + 1) + i)
+                    prefetch_row(found, s * (HIDDEN + 1), HIDDEN + 1)
                 _encode(encoded, frequencies)
                 _block(encoded, 1, SLOT, into, in_biases[n], one, HIDDEN, channels, True)
                 _block(one, HIDDEN, 1, mid, mid_biases[n], two, HIDDEN, HIDDEN, True)
@@ -357,9 +343,8 @@ def _colours(given, layers, groups, raw):
     """Colours before the sigmoid."""
     geometry, directions = given
     permutation, offsets = groups
-    feature_weights, feature_biases = layers[0], layers[1]
-    direction_weights, direction_biases = layers[2], layers[3]
-    colour_weights, colour_biases = layers[4], layers[5]
+    feature_weights, feature_biases, direction_weights, direction_biases = layers[:4]
+    colour_weights, colour_biases = layers[4:]
     seen = directions.shape[1]
     channels, end = HIDDEN + seen, len(permutation)
     borders = _borders(offsets)
@@ -388,16 +373,12 @@ def _colours(given, layers, groups, raw):
                         joined[r * channels + HIDDEN + i] = directions[s, i]
                 for r in range(first + AHEAD, min(first + AHEAD + TALL, end)):
                     s = permutation[r]
-                    for i in range(0, HIDDEN + 1, LINE):
-                        prefetch(hidden, s * (HIDDEN + 1) + i)
-                    for i in range(0, seen, LINE):
-                        prefetch(towards, s * seen + i)
-                    prefetch(towards, s * seen + seen - 1)
+                    prefetch_row(hidden, s * (HIDDEN + 1), HIDDEN + 1)
+                    prefetch_row(towards, s * seen, seen)
                     prefetch(shown, 3 * s)
-                of = feature_biases[n]
-                _block(given, HIDDEN, 1, feature, of, joined, channels, HIDDEN, False)
-                of = direction_biases[n]
-                _block(joined, channels, 1, direction, of, inner, HIDDEN, channels, True)
+                of_feature, of_direction = feature_biases[n], direction_biases[n]
+                _block(given, HIDDEN, 1, feature, of_feature, joined, channels, HIDDEN, False)
+                _block(joined, channels, 1, direction, of_direction, inner, HIDDEN, channels, True)
                 tall(inner, 0, HIDDEN, 1, last, 0, LANES, bias, 0, result, 0, LANES, HIDDEN, False)
                 for r in range(rows):
                     for c in range(3):

@@ -5,13 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from methods.kilonerf.kernels.grouped_mlp import (
-    Groups,
-    Networks,
-    composed_colours,
-    composed_densities,
-)
-
 
 def locate(positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
     scaled = (positions.detach() - corner) / side
@@ -22,11 +15,10 @@ def locate(positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor) -> tu
     return torch.where(inside, cubes[x, y, z], -1), 2 * (scaled - cell) - 1
 
 
-def order(networks: Tensor, count: int) -> Groups:
+def order(networks: Tensor, count: int) -> tuple[Tensor, Tensor]:
     sorted_, permutation = networks.long().sort(stable=True)
-    numbers = torch.arange(count + 1, device=networks.device)
-    offsets = torch.searchsorted(sorted_, numbers)
-    return Groups(permutation[int(offsets[0]) :], offsets - offsets[0])
+    offsets = torch.searchsorted(sorted_, torch.arange(count + 1, device=networks.device))
+    return permutation[int(offsets[0]) :], offsets - offsets[0]
 
 
 def encode_frequencies(inputs: Tensor, frequencies: int) -> Tensor:
@@ -42,11 +34,3 @@ def grouped_linear(
     out = [torch.addmm(bias, part, weight) for part, weight, bias in layers]
     joined = torch.cat(out) if out else inputs.new_zeros(0, weights.shape[2])
     return joined.relu() if relu else joined
-
-
-def densities(positions: Tensor, numbers: Tensor, networks: Networks) -> tuple[Tensor, Tensor]:
-    return composed_densities(positions, numbers, networks, "reference")
-
-
-def colours(geometry: Tensor, encoded: Tensor, networks: Networks) -> Tensor:
-    return composed_colours(geometry, encoded, networks, "reference")

@@ -1,7 +1,8 @@
 """Colours of voxels that hold a density and spherical harmonics: pixels, and samples to train on.
 
 A voxel has the opacity 1 - exp(-sigma delta) over a length delta, and shows sigmoid(sum_k c_k
-Y_k(d)) in direction d (Yu et al. 2021, Eq. 1 to 3).
+Y_k(d)) in direction d (Yu et al. 2021, Eq. 1 to 3). Wrong shapes raise ValueError, as do other
+numbers than float32 with backend="cpu".
 """
 
 from __future__ import annotations
@@ -20,15 +21,10 @@ from methods.kernels.voxel_walk import Voxels
 
 @dataclass(frozen=True)
 class Light:
-    """The contents of V voxels.
+    """The contents of V voxels."""
 
-    Attributes:
-        density: [V] 1 / scene unit, not negative.
-        harmonics: [V, C, 3] coefficients of the first C spherical harmonics, C of 1, 4, 9 or 16.
-    """
-
-    density: Tensor
-    harmonics: Tensor
+    density: Tensor  # [V] 1 / scene unit, not negative
+    harmonics: Tensor  # [V, C, 3] coefficients of the first C of `spherical`: 1, 4, 9 or 16
 
 
 def render_voxels(
@@ -40,16 +36,10 @@ def render_voxels(
     faint: float = 0.0,
     backend: str = "auto",
 ) -> tuple[Pixels, Tensor, Tensor]:
-    """Render R `rays` without a background. Not differentiable.
+    """Render R `rays`, which end at the transmittance `stop`, without a background; voxels with at
+    most the weight `faint` count for opacity but are not shaded. Not differentiable.
 
     Returns the pixels and, for each ray, the numbers of crossed and of shaded voxels: [R] int32.
-
-    Args:
-        stop: transmittance at which a ray ends, less than 1.
-        faint: voxels with at most this weight count for opacity but are not shaded.
-
-    Raises:
-        ValueError: wrong shapes, a stop outside [0, 1); backend "cpu": not float32.
     """
     check_stop(stop)
     check_rays(rays)
@@ -68,21 +58,11 @@ def shade_voxels(
     grad_buffer: Tensor | None = None,
     backend: str = "auto",
 ) -> Tensor:
-    """Colours [S, 3] of S voxels in the directions of their rays.
+    """Colours [S, 3] of some voxels, rows `voxel` [S] int32 of the `harmonics` [V, C, 3], in the
+    direction of their `ray` [S] int32, a row of the unit vectors `directions` [R, 3].
 
-    Differentiable in `harmonics`.
-
-    Args:
-        harmonics: [V, C, 3] coefficients of the first C harmonics in the order of `spherical`;
-            C is 1, 4, 9 or 16.
-        voxel: [S] int32 rows of `harmonics`; rows may repeat.
-        ray: [S] int32 rows of `directions`.
-        directions: [R, 3] unit vectors.
-        grad_buffer: [V, C, 3]; if given, the gradient of `harmonics` is added to it in place and
-            hidden from autograd.
-
-    Raises:
-        ValueError: wrong shapes; backend "cpu": not float32.
+    Differentiable in `harmonics`; if a `grad_buffer` of their shape is given, the gradient is added
+    to it in place and hidden from autograd.
     """
     check_harmonics("harmonics", harmonics, None)
     check_shape("voxel", voxel, None)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -53,10 +53,11 @@ RENDER = Operation(
 )
 
 
-def _visits(given: Given) -> Tensor:
-    """How often each voxel is seen."""
+def _slopes(given: Given) -> Tensor:
+    """How far the gradient of a voxel that is seen n times may be off."""
     voxels = len(given["harmonics"])
-    return torch.bincount(given["voxel"].long(), minlength=voxels).double()[:, None, None]
+    n = torch.bincount(given["voxel"].long(), minlength=voxels).double()[:, None, None]
+    return n * (2 * (COLOUR + 4) + 12 + n / 2) * U32
 
 
 SHADE = Operation(
@@ -74,7 +75,7 @@ SHADE = Operation(
             "n visits of a voxel: each a harmonic below 2, off by 48 u, times a slope of at most "
             "1 / 4, off as colours are and by 4 u; n sums of at most n / 2: n (2 (COLOUR + 4) + "
             "12 + n / 2) u",
-            lambda given: (n := _visits(given)) * (2 * (COLOUR + 4) + 12 + n / 2) * U32,
+            _slopes,
         )
     },
 )
@@ -82,42 +83,38 @@ SHADE = Operation(
 
 def cases() -> list[Case]:
     """Rays of every kind of light; no, one and many samples of all degrees."""
-    return [*_rendered(), *_shaded()]
-
-
-def _rendered() -> Iterator[Case]:
-    for name, rays, kind in (
-        ("one ray", 1, "cloud"),
-        ("no ray", 0, "cloud"),
-        ("cloud", 129, "cloud"),
-        ("mist", 129, "mist"),
-        ("stone", 129, "stone"),
-        ("voxels without density", 129, "clear"),
-        ("no voxel", 129, "nothing"),
-    ):
-        yield from RENDER.cases(name, partial(_scene, 24, rays, kind, 0.0, 0.0))
-    yield from RENDER.cases("stop and faint", partial(_scene, 24, 129, "cloud", 1e-4, 1e-5))
-    many = 1 << 13
-    frame = partial(_scene, 128, many, "cloud", 1e-4, 1e-5)
-    yield from RENDER.cases("a frame of 128^3", frame, items=many)
-
-
-def _scene(size: int, rays: int, kind: str, stop: float, faint: float) -> Given:
-    """Voxels in a thick shell, every second one, of random density and light."""
-    coordinates = cells("empty" if kind == "nothing" else "porous shell", size).nonzero()
-    generator = torch.Generator().manual_seed(size)
-    scale = {"clear": 0.0, "mist": 2.0, "stone": 1e4}.get(kind, 20.0)
-    density = scale * torch.rand(len(coordinates), generator=generator)
-    harmonics = torch.randn(len(coordinates), 9, 3, generator=generator).clamp(-6, 6)
-    light, voxels = Light(density, harmonics), Voxels(coordinates, size)
-    return {"rays": some_rays(rays), "voxels": voxels, "light": light, "stop": stop, "faint": faint}
-
-
-def _shaded() -> Iterator[Case]:
+    found, many = [], 1 << 13
+    scenes: dict[str, tuple[Any, ...]] = {
+        "one ray": (24, 1, 20.0),
+        "no ray": (24, 0, 20.0),
+        "cloud": (24, 129, 20.0),
+        "mist": (24, 129, 2.0),
+        "stone": (24, 129, 1e4),
+        "voxels without density": (24, 129, 0.0),
+        "no voxel": (24, 129, None),
+        "stop and faint": (24, 129, 20.0, 1e-4, 1e-5),
+        "a frame of 128^3": (128, many, 20.0, 1e-4, 1e-5),
+    }
+    for name, given in scenes.items():
+        items = many if many in given else None
+        found += RENDER.cases(name, partial(_scene, *given), items=items)
     for count in (0, 1, 300, 1 << 16):
         for size in (1, 4, 9, 16) if count == 300 else (9,):
             name, items = f"{count:,} of {size} harmonics", count if count > 300 else None
-            yield from SHADE.cases(name, partial(_samples, count, size), items=items)
+            found += SHADE.cases(name, partial(_samples, count, size), items=items)
+    return found
+
+
+def _scene(
+    size: int, rays: int, densest: float | None, stop: float = 0.0, faint: float = 0.0
+) -> Given:
+    """Voxels in a thick shell, every second one, of random density and light; or none at all."""
+    coordinates = cells("empty" if densest is None else "porous shell", size).nonzero()
+    generator = torch.Generator().manual_seed(size)
+    density = (densest or 0.0) * torch.rand(len(coordinates), generator=generator)
+    harmonics = torch.randn(len(coordinates), 9, 3, generator=generator).clamp(-6, 6)
+    light, voxels = Light(density, harmonics), Voxels(coordinates, size)
+    return {"rays": some_rays(rays), "voxels": voxels, "light": light, "stop": stop, "faint": faint}
 
 
 def _samples(count: int, size: int) -> Given:

@@ -44,22 +44,17 @@ ONE, TWO, THREE = u64(1), u64(2), u64(3)
 def render_voxels(
     rays: Rays, voxels: Voxels, light: Light, stop: float, faint: float
 ) -> tuple[Pixels, Tensor, Tensor]:
-    given = rays.origins, rays.directions, light.density, light.harmonics
-    check_float32(*given)
-    count = len(rays.origins)
-    pixels = Pixels.blank(count, 3)
-    crossed, shaded = (torch.zeros(count, dtype=torch.int32) for _ in range(2))
+    check_float32(rays.origins, rays.directions, light.density, light.harmonics)
+    pixels = Pixels.blank(len(rays.origins), 3)
+    crossed, shaded = torch.zeros(2, len(rays.origins), dtype=torch.int32)
     basis = spherical_harmonics(normalize(rays.directions, dim=1), backend="cpu")
-    origins, directions, density, harmonics = arrays(*given)
     _render(
-        (origins, directions, *arrays(basis.view(-1))),
-        (density, harmonics.reshape(-1)),
+        tuple(arrays(rays.origins, rays.directions, basis.view(-1))),
+        tuple(arrays(light.density, light.harmonics.reshape(-1))),
         light.harmonics.shape[1],
         maps_of(voxels),
-        f64(f32(stop)),
-        f64(f32(faint)),
-        tuple(arrays(pixels.values, pixels.depth_sum, pixels.alpha)),
-        tuple(arrays(crossed, shaded)),
+        (f64(f32(stop)), f64(f32(faint))),
+        tuple(arrays(pixels.values, pixels.depth_sum, pixels.alpha, crossed, shaded)),
     )
     return pixels, crossed, shaded
 
@@ -77,25 +72,22 @@ class _Shade(torch.autograd.Function):
     def forward(ctx, harmonics, voxel, ray, basis, grad_buffer):
         given = [x.detach().contiguous() for x in (voxel, ray, basis.view(-1))]
         colours = torch.empty(len(voxel), 3)
-        flat = harmonics.detach().reshape(-1)
-        _shade(flat.numpy(), *(x.numpy() for x in given), harmonics.shape[1], colours.numpy())
+        _shade(*arrays(harmonics.reshape(-1), *given), harmonics.shape[1], colours.numpy())
         ctx.save_for_backward(*given, colours)
         ctx.shape, ctx.grad_buffer = harmonics.shape, grad_buffer
         return colours
 
     @staticmethod
     def backward(ctx, grad):
-        *given, colours = ctx.saved_tensors
         buffer = ctx.grad_buffer
         target = torch.zeros(ctx.shape) if buffer is None else buffer
         parts = 1 << (get_num_threads() - 1).bit_length()
-        given += [colours, grad.contiguous(), target.view(-1)]
-        _scatter(*(x.numpy() for x in given), ctx.shape[1], parts)
+        _scatter(*arrays(*ctx.saved_tensors, grad, target.view(-1)), ctx.shape[1], parts)
         return target if buffer is None else None, None, None, None, None
 
 
 @njit(cache=True, error_model="numpy")
-def weighted_sum(harmonics, voxel, basis, ray, terms):
+def _weighted_sum(harmonics, voxel, basis, ray, terms):
     """Three colours of a voxel as a ray sees it, before the sigmoid; `harmonics` and `basis` are
     flat."""
     at, of = u64(voxel * terms * 3), u64(ray * CHANNELS)
@@ -116,7 +108,7 @@ def _shade(harmonics, voxel, ray, basis, terms, colours):
         first, end = chunk * CHUNK, min(total, (chunk + 1) * CHUNK)
         for i in range(first, end):
             prefetch_row(harmonics, voxel[min(i + AHEAD, end - 1)] * terms * 3, terms * 3)
-            colours[i, 0], colours[i, 1], colours[i, 2] = weighted_sum(
+            colours[i, 0], colours[i, 1], colours[i, 2] = _weighted_sum(
                 harmonics, voxel[i], basis, ray[i], terms
             )
         shown = colours[first:end].reshape(-1)
@@ -126,10 +118,8 @@ def _shade(harmonics, voxel, ray, basis, terms, colours):
 
 @njit(cache=True, parallel=True)
 def _scatter(voxel, ray, basis, colours, grad, target, terms, parts):
-    """Adjoint of `_shade`: target[voxel] += Y(d) times the gradient before the sigmoid.
-
-    `basis` and `target` are flat, `parts` a power of two.
-    """
+    """Adjoint of `_shade`: target[voxel] += Y(d) times the gradient before the sigmoid. `basis` and
+    `target` are flat, `parts` a power of two."""
     for part in prange(parts):
         for i in range(len(voxel)):
             if (voxel[i] // NEAR) & (parts - 1) == part:
@@ -146,12 +136,12 @@ def _scatter(voxel, ray, basis, colours, grad, target, terms, parts):
 
 
 @njit(cache=True, parallel=True)
-def _render(rays, light, terms, maps, stop, faint, pixels, counts):
+def _render(rays, light, terms, maps, bounds, out):
     """Flat: the harmonics' values in the directions of rays, and the coefficients of the light."""
     origins, directions, basis = rays
     density, harmonics = light
-    values, depth_sum, alpha = pixels
-    crossed, shaded = counts
+    stop, faint = bounds
+    values, depth_sum, alpha, crossed, shaded = out
     total = len(origins)
     for chunk in prange((total + RAYS - 1) // RAYS):
         near, far = np.empty(ROUND, np.float32), np.empty(ROUND, np.float32)
@@ -162,8 +152,8 @@ def _render(rays, light, terms, maps, stop, faint, pixels, counts):
             red, green, blue, depth, transmittance = 0.0, 0.0, 0.0, 0.0, 1.0
             start, steps, colours = f32(0), 0, 0
             while start < np.inf and transmittance > stop:
-                out = near, far, voxel
-                count, start = walk_ray(origin, direction, maps, start, ROUND, out)
+                room = near, far, voxel
+                count, start = walk_ray(origin, direction, maps, start, ROUND, room)
                 # All that may be read is asked for before anything is waited for.
                 for i in range(count):
                     prefetch(density, np.int64(voxel[i]))
@@ -181,7 +171,7 @@ def _render(rays, light, terms, maps, stop, faint, pixels, counts):
                     depth += weight * f64((near[i] + far[i]) * f32(0.5))
                     if weight > faint:
                         colours += 1
-                        r, g, b = weighted_sum(harmonics, voxel[i], basis, ray, terms)
+                        r, g, b = _weighted_sum(harmonics, voxel[i], basis, ray, terms)
                         red += weight * f64(sigmoid(r))
                         green += weight * f64(sigmoid(g))
                         blue += weight * f64(sigmoid(b))

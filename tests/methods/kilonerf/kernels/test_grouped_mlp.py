@@ -10,32 +10,30 @@ from torch import nn
 
 from bench.case import U32
 from methods.kilonerf.kernels.grouped_mlp import (
+    SHAPES,
     Networks,
     colours,
     densities,
-    encode_frequencies,
-    grouped_linear,
-    order,
 )
 
-SHAPES = {"in": (63, 32), "mid": (32, 32), "density": (32, 1)} | {
-    "feature": (32, 32),
-    "direction": (59, 32),
-    "colour": (32, 3),
-}
-BACKENDS = ["reference", "cpu"]
+both = pytest.mark.parametrize("backend", ["reference", "cpu"])
 
 
 def networks(count: int) -> tuple[Networks, list[dict[str, nn.Linear]]]:
     """The same ones, for the kernel and as modules of torch."""
     torch.manual_seed(count)
     modules = [{name: nn.Linear(*shape) for name, shape in SHAPES.items()} for _ in range(count)]
-    weights = {n: torch.stack([m[n].weight.detach().T for m in modules]) for n in SHAPES}
-    biases = {n: torch.stack([m[n].bias.detach() for m in modules]) for n in SHAPES}
-    return Networks(weights, biases), modules
+    few = {
+        name: (
+            torch.stack([module[name].weight.detach().T for module in modules]),
+            torch.stack([module[name].bias.detach() for module in modules]),
+        )
+        for name in SHAPES
+    }
+    return few, modules
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@both
 def test_they_are_those_of_torch_one_by_one(backend: str) -> None:
     few, modules = networks(4)
     numbers = torch.tensor([2, -1, 0, 2, 3, 0, 2, -1, 2, 2, 2, 2, 2])
@@ -45,9 +43,7 @@ def test_they_are_those_of_torch_one_by_one(backend: str) -> None:
     assert torch.equal(geometry[:, 32].long(), numbers)
     for s, n in enumerate(numbers.tolist()):
         if n < 0:
-            assert not raw[s]
-            assert not geometry[s, :32].any()
-            assert not shown[s].any()
+            assert not any(part.any() for part in (raw[s], geometry[s, :32], shown[s]))
             continue
         layers, x = modules[n], positions[s]
         parts = [x, *(f(2**k * x) for k in range(10) for f in (torch.sin, torch.cos))]
@@ -60,44 +56,10 @@ def test_they_are_those_of_torch_one_by_one(backend: str) -> None:
         torch.testing.assert_close(shown[s], colour, rtol=0, atol=188 * 6**3 * U32)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_gradient_comes_from_the_samples_of_its_network_alone(backend: str) -> None:
-    generator = torch.Generator().manual_seed(0)
-    weights = torch.randn(3, 8, 16, generator=generator, requires_grad=True)
-    biases = torch.randn(3, 16, generator=generator, requires_grad=True)
-    inputs = torch.randn(20, 8, generator=generator)
-    scaled = torch.cat((inputs[:10], -3 * inputs[10:]))
-    offsets = torch.tensor([0, 10, 10, 20])
-    found = []
-    for given in (inputs, scaled):
-        out = grouped_linear(given, weights, biases, offsets, relu=True, backend=backend)
-        found.append(torch.autograd.grad(out.square().sum(), (weights, biases)))
-    for one, other in zip(*found, strict=True):
-        assert one[0].any()
-        assert torch.equal(one[0], other[0])
-        assert not one[1].any()
-        assert not torch.equal(one[2], other[2])
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
+@both
 def test_nan_stays_with_its_sample(backend: str) -> None:
     few, _ = networks(1)
     positions = torch.zeros(12, 3)
     positions[5] = math.nan
     raw, _ = densities(positions, torch.zeros(12, dtype=torch.int32), few, backend=backend)
     assert raw.isnan().nonzero().flatten().tolist() == [5]
-
-
-def test_wrong_inputs_are_refused() -> None:
-    with pytest.raises(ValueError, match="numbers below 2, negative ones for none, got 2"):
-        order(torch.tensor([0, 2]), 2)
-    with pytest.raises(ValueError, match="whole numbers"):
-        order(torch.tensor([0.5]), 2)
-    with pytest.raises(ValueError, match="frequencies: expected 1 or more"):
-        encode_frequencies(torch.zeros(1, 3), 0)
-    with pytest.raises(ValueError, match="expected to end at the 4 inputs"):
-        grouped_linear(
-            torch.zeros(4, 2), torch.zeros(1, 2, 3), torch.zeros(1, 3), torch.tensor([0, 3])
-        )
-    with pytest.raises(ValueError, match="use backend='reference'"):
-        encode_frequencies(torch.zeros(1, 3, dtype=torch.float64), 2, backend="cpu")

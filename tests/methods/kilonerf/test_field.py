@@ -3,24 +3,15 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from methods.kernels.types import Occupancy
-from methods.kilonerf.field import KiloField
-from methods.kilonerf.grid import Pieces, place_networks
+from methods.kilonerf.field import KiloField, place_networks
 
 BOUNDS = torch.tensor([[0.1, 0.2, 0.1], [0.9, 0.8, 0.7]])
 
 
 def occupied(*cells: tuple[int, int, int]) -> Occupancy:
-    occupancy = torch.zeros(32, 32, 32, dtype=torch.bool)
-    for cell in cells:
-        occupancy[cell] = True
-    return Occupancy(occupancy)
-
-
-def middle(low: Tensor, high: Tensor) -> Tensor:
-    return (low + high) / 2
+    return Occupancy.at(torch.tensor(cells).reshape(len(cells), 3), 32)
 
 
 def test_networks_are_where_matter_is() -> None:
@@ -30,10 +21,8 @@ def test_networks_are_where_matter_is() -> None:
     # cube only, and [0.625, 0.656] x [0.375, 0.406] x [0.281, 0.3125], which faces cross twice.
     there = (grid.networks >= 0).nonzero().tolist()
     assert there == [[0, 0, 0], [2, 0, 0], [2, 0, 1], [2, 1, 0], [2, 1, 1]]
-    assert len(pieces.low) == len(there)
-    for low, high in zip(pieces.low, pieces.high, strict=True):
-        cell = (middle(low, high) * 32).long().tolist()
-        assert cell in ([8, 8, 8], [20, 12, 9])
+    cells = ((pieces.low + pieces.high) / 2 * 32).long().tolist()
+    assert cells == [[8, 8, 8]] + 4 * [[20, 12, 9]]
 
 
 def test_the_pieces_of_a_cell_make_up_the_cell() -> None:
@@ -47,40 +36,31 @@ def test_the_pieces_of_a_cell_make_up_the_cell() -> None:
 def test_lessons_are_as_many_for_each_network_and_in_it() -> None:
     grid, pieces = place_networks(occupied((8, 8, 8), (8, 8, 9), (20, 12, 9)), BOUNDS, 4)
     points = pieces.draw(50, torch.Generator().manual_seed(0))
-    assert points.shape == (50 * grid.count, 3)
     cube = ((points - grid.corner) / grid.side).floor().long()
     numbers = grid.networks[tuple(cube.T)]
     assert numbers.tolist() == [n for n in range(grid.count) for _ in range(50)]
 
 
-def test_nothing_is_where_no_network_is() -> None:
-    grid, _ = place_networks(occupied((8, 8, 8)), BOUNDS, 4)
+def test_networks_begin_alike_and_nothing_is_where_there_is_none() -> None:
+    grid, _ = place_networks(occupied((8, 8, 8), (20, 12, 9)), BOUNDS, 4)
     field = KiloField(grid, "auto", torch.Generator().manual_seed(0))
+    for parameter in field.parameters():
+        assert (parameter == parameter[:1]).all()
     with torch.no_grad():
         field.biases["density"].fill_(5.0)
         positions = torch.rand(4000, 3, generator=torch.Generator().manual_seed(1))
         sigma, geometry = field.density(positions)
         colour = field.features(geometry, field.encode_directions(torch.ones(4000, 3)))
     cube = ((positions - grid.corner) / grid.side).floor().long()
-    size = torch.tensor(grid.networks.shape)
-    inside = ((cube >= 0) & (cube < size)).all(dim=1)
+    inside = ((cube >= 0) & (cube < torch.tensor(grid.networks.shape))).all(dim=1)
     there = inside & (grid.networks[tuple(torch.where(inside[:, None], cube, 0).T)] >= 0)
     assert there.any()
     assert torch.equal(sigma > 0, there)
     assert torch.equal((colour > 0).all(dim=1), there)
 
 
-def test_all_networks_begin_alike() -> None:
-    grid, _ = place_networks(occupied((8, 8, 8), (20, 12, 9)), BOUNDS, 4)
-    field = KiloField(grid, "auto", torch.Generator().manual_seed(0))
-    for parameter in field.parameters():
-        assert (parameter == parameter[:1]).all()
-
-
 def test_a_scene_without_matter_has_no_network() -> None:
-    grid, pieces = place_networks(occupied(), BOUNDS, 4)
+    grid, _ = place_networks(occupied(), BOUNDS, 4)
     assert grid.count == 0
-    assert isinstance(pieces, Pieces)
-    field = KiloField(grid, "auto")
-    sigma, _ = field.density(torch.rand(9, 3))
+    sigma, _ = KiloField(grid, "auto").density(torch.rand(9, 3))
     assert not sigma.any()

@@ -1,0 +1,54 @@
+"""DIVeR's decoder: as many parameters as published, and the same after layers were merged."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from bench.types import NullProbe
+from methods.diver.kernels.segments import as_intervals
+from methods.diver.method import Baked
+from methods.diver.model import CornerModel, Decoder, encode_directions
+from methods.kernels.composite import composite
+from methods.kernels.march.cases import some_rays
+from methods.kernels.voxel_walk import walk
+
+SIZE = 16
+
+
+def test_it_has_the_parameters_of_the_published_one() -> None:
+    assert sum(parameter.numel() for parameter in Decoder().parameters()) == 5220
+
+
+def test_directions_are_encoded_by_sines_and_cosines() -> None:
+    encoded = encode_directions(torch.tensor([[0.0, 3.0, 4.0]]))
+    want = [0.0, 0.6, 0.8]
+    for k in range(4):
+        for function in (math.sin, math.cos):
+            want += [function(math.pi * 2**k * x) for x in (0.0, 0.6, 0.8)]
+    # Angles of up to 8 pi are rounded to 2^-20, and doubled three times.
+    torch.testing.assert_close(encoded, torch.tensor([want]), rtol=0, atol=8 * 2.0**-20)
+
+
+def test_rendered_rays_are_those_of_the_trained_model() -> None:
+    """The baked model, in rounds, with merged layers, against the layers as they were trained; all
+    voxels of a small grid, with random features."""
+    generator, rays = torch.Generator().manual_seed(0), some_rays(200)
+    voxels = torch.cartesian_prod(*[torch.arange(SIZE)] * 3).int()
+    model = CornerModel(voxels, SIZE, Decoder(generator), "auto")
+    with torch.no_grad():
+        model.table.normal_(generator=generator)
+        model.decoder.first.bias.normal_(generator=generator)
+        model.decoder.third.bias.normal_(generator=generator)[0] = 1.0
+        crossings = walk(rays, model.voxels)
+        features = model.features(crossings.voxel, model.weights(rays, crossings))
+        raw, geometry = model.decoder.density(features)
+        encoded = encode_directions(rays.directions)
+        colours = model.decoder.colours(geometry, encoded, crossings.ray)
+        want = composite(raw.relu(), colours, as_intervals(crossings), stop=0.0)
+    got = Baked(model, "fp32").render_rays(rays, NullProbe(), stop=0.0, faint=0.0)
+    # Five layers of 32 numbers below 8 with sums of 32 roundings: 5 x 32 x 8 u = 8e-5.
+    torch.testing.assert_close(got.values, want.values, rtol=0, atol=1e-4)
+    torch.testing.assert_close(got.alpha, want.alpha, rtol=0, atol=1e-4)
+    assert got.alpha.max() > 0.5
