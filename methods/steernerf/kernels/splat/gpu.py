@@ -51,8 +51,7 @@ def _move(kernel: triton.JITFunction, values: Tensor, index: Tensor, rows: Tenso
 
 @triton.jit
 def _splat(pixels, depth, points, width, height, index, BLOCK: tl.constexpr):
-    """Compared as floats, where comparisons with NaN are false; converting huge or non-finite
-    values to integers is undefined."""
+    """Compared as floats, as on a CPU."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     u = tl.load(pixels + 2 * i, mask=i < points, other=-1.0)
     v = tl.load(pixels + 2 * i + 1, mask=i < points, other=-1.0)
