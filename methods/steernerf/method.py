@@ -104,26 +104,36 @@ class SteerNerf:
         device: str = "auto",
         seed: int = 0,
     ) -> None:
-        self.stage2 = self.kind(model, renderer, joint, after)
-        with torch.random.fork_rng(devices=[]):
-            self.stage2.make()  # what a 2D renderer refuses, it refuses before anything is trained
         mode, off = rendering.range.mode, "off without preceding frames (L = 0)"
         expect(model.frames > 0 or mode == "off", "rendering.range.mode", off, mode)
+        self.stage2 = self.kind(model, renderer, joint, after)
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
         engine.check(self.setup.device)
+        with torch.random.fork_rng(devices=[]):  # it refuses what it cannot do before a training
+            self.stage2.make(self.setup)
         self.rendering, self.engine, self.name = rendering, engine, name
         self.steps, self.train_s = steps, 0.0
         self.memory, self.buffer = model.frames, Buffer(maxlen=model.frames)
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
-        """Train both stages, or load their results if they were trained before."""
+        """Train both stages, or load their results if they were trained before; build the network
+        of the 2D renderer with the engine, which computes it from now on."""
         budget = replace(budget, renderer_steps=self.steps or budget.renderer_steps)
         with torch_threads(budget.threads):
             self.trained = train_field(self.setup, scene, budget, log)
             given = self.trained, self.setup, self.stage2, scene, budget, log
-            self.pipeline, key, seconds = train_stage2(*given)
+            self.pipeline, trained, seconds = train_stage2(*given)
         self.train_s = self.trained.train_s + seconds
-        self._build_network(key, scene, log)
+        renderer, engine = self.pipeline.renderer, self.engine
+        count = engine.samples(renderer.network)
+        samples = partial(self.record, self.pipeline, scene, count, log)
+
+        def folder() -> Path:
+            key = {"trained": trained, "engine": engine.key(), "recorded": digest(type(self))}
+            return log.stage_dir("network", key)
+
+        built = engine.build(renderer.network, samples, folder, log)
+        renderer.engine, self.renderer_bytes = built.run, built.size
 
     def reset(self) -> None:
         """Forget preceding frames."""
@@ -139,34 +149,17 @@ class SteerNerf:
 
     def settings(self) -> dict[str, str]:
         """Those of the field, with the engine and precision of the 2D renderer."""
-        return self.setup.settings() | {
-            "engine": self.engine.name,
-            "precision": self.engine.computed(self.setup.device),
-        }
-
-    def _build_network(self, trained: dict[str, object], scene: Scene, log: Log) -> None:
-        """Build the network of the 2D renderer, whose weights have the key `trained`, with the
-        engine, which computes it from now on."""
-        renderer, engine = self.pipeline.renderer, self.engine
-        count = engine.samples(renderer.network)
-
-        def folder() -> Path:
-            key = {"trained": trained, "engine": engine.key(), "recorded": digest(type(self))}
-            return log.stage_dir("network", key)
-
-        samples = partial(self.record, self.pipeline, scene, count, log)
-        built = engine.build(renderer.network, samples, folder, log)
-        renderer.engine, self.renderer_bytes = built.run, built.size
+        precision = self.engine.computed(self.setup.device)
+        return self.setup.settings() | {"engine": self.engine.name, "precision": precision}
 
     def record(self, pipeline: Pipeline, scene: Scene, count: int, log: Log) -> list[Inputs]:
         """The inputs of the network in `count` training views, evenly spread, on which an engine is
-        calibrated. They are rendered as in training, so that the result does not depend on
-        `rendering`, each after L + 1 frames of a random smooth motion: even the oldest frame in the
-        buffer had a preceding one."""
+        calibrated. They are rendered as in training, whatever `rendering` is, each after L + 1
+        frames of a random motion: even the oldest frame in the buffer had a preceding one."""
         generator = torch.Generator().manual_seed(self.setup.seed)
         cameras, target = scene.splits["train"].cameras, viewing_target(scene)
-        rendering, degrees = self.stage2.rendering, self.stage2.joint.motion.degrees
-        network, frames = pipeline.renderer.network, pipeline.model.frames
+        network, frames, joint = pipeline.renderer.network, pipeline.model.frames, self.stage2.joint
+        rendering, degrees = joint.rendering(pipeline.model), joint.motion.degrees
         recorded: list[Inputs] = []
         with log.progress("frames to build the network on", count) as progress:
             for place in range(count):

@@ -33,24 +33,17 @@ class Model:
 
 @dataclass(frozen=True)
 class RangeReduction:
-    """Where along a ray to sample, given the depth D of the newest preceding frame (Section 3.2).
+    """Where along a ray to sample, by the depth D of the newest preceding frame (Section 3.2)."""
 
-    `mode` "off": everywhere; "paper": within `epsilon`, in scene units along z, of the depth
-    reprojected onto the pixel. `depth` says which D is reprojected: "sum", the sum of w t as the
-    release renders it, or "expected", the same divided by the opacity. The two differ at
-    silhouettes.
-    """
-
-    mode: Literal["off", "paper"]
-    epsilon: float
-    depth: Literal["sum", "expected"]
+    mode: Literal["off", "paper"]  # off: everywhere; paper: near the D reprojected onto the pixel
+    epsilon: float  # how near, in scene units along z
+    depth: Literal["sum", "expected"]  # D: sum w t, as in the release, or that / the opacity
 
     def __post_init__(self) -> None:
         expect(self.epsilon > 0, "range.epsilon", "more than 0", self.epsilon)
 
 
-EVERYWHERE = RangeReduction("off", epsilon=1.0, depth="sum")
-"""No range reduction; `epsilon` and `depth` say nothing."""
+EVERYWHERE = RangeReduction("off", epsilon=1.0, depth="sum")  # the last two say nothing
 
 
 @dataclass(frozen=True)
@@ -134,6 +127,10 @@ class JointOptions:
         views, share = self.distilled_views, self.distilled_share
         expect(views >= 0, "joint.distilled_views", "0 or more", views)
         expect(0 <= share <= 1, "joint.distilled_share", "a share of 0 to 1", share)
+
+    def rendering(self, model: Model) -> Rendering:
+        """How frames are rendered in training: everywhere, which serves all later choices."""
+        return Rendering(model.step, model.stop, EVERYWHERE, Skips(empty=True, hidden=True))
 
     def distilled(self, steps: int, frames: int) -> int:
         """How many distilled views a training of `steps` steps can use. With no preceding `frames`

@@ -50,24 +50,20 @@ def distilled_views(
     names = [str(number) for number in range(count)]
     with missing(path, log) as to_render:
         if to_render:
-            began, pictures = time.monotonic(), {}
+            began, pictures, probe = time.monotonic(), {}, NullProbe()
+            field, occupancy = trained.field, trained.occupancy
+            background = scene.background.to(field.device)
+            render = everywhere(field, occupancy, probe, trained.sampling)
             with log.progress("distilling", count) as progress:
                 for name, camera in zip(names, cameras, strict=True):
-                    pictures[name] = _picture(trained, camera, scene.background)
+                    placed = place_camera(camera, field.device)
+                    rgb = render_frame(placed, occupancy, background, probe, render).values
+                    pictures[name] = (rgb.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
                     progress.advance()
             checkpoint.write(path, pictures, {"seconds": time.monotonic() - began})
     pictures, figures = checkpoint.read(path)
     with checkpoint.restoring(path):
         return Split(cameras, [pictures[name] for name in names], names), figures["seconds"]
-
-
-def _picture(trained: TrainedField, camera: Camera, background: Tensor) -> Tensor:
-    """Render one view: uint8 [H, W, 3]."""
-    field, probe = trained.field, NullProbe()
-    camera, background = place_camera(camera, field.device), background.to(field.device)
-    render = everywhere(field, trained.occupancy, probe, trained.sampling)
-    frame = render_frame(camera, trained.occupancy, background, probe, render)
-    return (frame.values.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
 
 
 @dataclass
@@ -81,23 +77,20 @@ class Example:
 
 
 class Examples:
-    """A pool of examples that end in random views, those of `scene` and `distilled` ones.
-
-    The frames that precede a view are rendered by `pipeline`, as `rendering` says; when an example
-    is replaced, `options.motion` says. `generator` is the source of all random numbers.
-    """
+    """A pool of examples that end in random views, those of `scene` and `distilled` ones. The
+    frames before a view are rendered by `pipeline`; `options.motion` says when an example is
+    replaced; `generator` is the source of all random numbers."""
 
     def __init__(
         self,
         pipeline: Pipeline,
-        rendering: Any,
         scene: Scene,
         distilled: Split,
         options: JointOptions,
         generator: torch.Generator,
     ) -> None:
-        self.pipeline, self.rendering, self.options = pipeline, rendering, options
-        self.learning = options.field == "joint"  # whether the field learns
+        self.pipeline, self.rendering = pipeline, options.rendering(pipeline.model)
+        self.options, self.learning = options, options.field == "joint"
         self.generator, self._pool = generator, list[Example]()
         real, self._target = scene.splits["train"], viewing_target(scene)
         self.cameras = [*real.cameras, *distilled.cameras]
@@ -179,7 +172,7 @@ class Patch:
     """A patch of the view that an example ends in."""
 
     example: Example
-    view: View  # its cameras
+    view: View
     truth: Tensor  # [H, W, 3] the true picture
     points: Sequence[Points]  # features of preceding frames, reprojected into `view`
 
@@ -195,8 +188,8 @@ class Batch:
 
 
 class Patches(Examples):
-    """Batches of random patches, each cut from an example. A subclass may override `place`,
-    `points` and `observations`."""
+    """Batches of random patches, each cut from an example. A subclass may override `place` and
+    `observations`."""
 
     def draw(self, count: int) -> Batch:
         """Draw `count` patches."""
@@ -210,15 +203,11 @@ class Patches(Examples):
         top, left = self.place(example, side, size)
         cut = view.crop(left, top, side)
         truth = self._truth(example, top, left, cut.full)
-        return Patch(example, cut, truth, self.points(example, cut))
+        return Patch(example, cut, truth, self.pipeline.reproject(example.buffer, cut))
 
     def place(self, example: Example, side: int, size: tuple[int, int]) -> Sequence[int]:
         """Choose the first row and column of a patch of `side` in a frame of `size` h, w."""
         return [self.random(extent - side + 1) for extent in size]
-
-    def points(self, example: Example, view: View) -> Sequence[Points]:
-        """The features of preceding frames that the 2D renderer is shown in `view`."""
-        return [self.pipeline.reproject(cloud, view) for cloud in example.buffer]
 
     def _truth(self, example: Example, top: int, left: int, full: Camera) -> Tensor:
         """The true picture [H, W, 3] of the patch. Beyond the border of a picture whose sides are
@@ -235,7 +224,10 @@ class Patches(Examples):
         """Render `patches` as far as the input of the 2D renderer."""
         parts = [part for patch in patches for part in self._rendered(patch)]
         chosen = indices_where([mask for _, mask in parts])
-        each = [_rays_of(camera, some) for (camera, _), some in zip(parts, chosen, strict=True)]
+        each = [
+            cast(camera, pixel_grid(camera.width, camera.height, some.device)[some])
+            for (camera, _), some in zip(parts, chosen, strict=True)
+        ]
         rays, field, jitter = Rays.joined(each), self.pipeline.field, None
         if self.options.jitter:
             jitter = torch.rand(len(rays.origins), generator=self.generator)
@@ -288,8 +280,3 @@ def _shown(index: Tensor, count: int) -> Tensor:
     """Which of `count` points occur in `index`, which is -1 for none: [count] bool."""
     shown = torch.zeros(count + 1, dtype=torch.bool, device=index.device)
     return shown.index_fill_(0, index.flatten().long() % (count + 1), True)[:count]
-
-
-def _rays_of(camera: Camera, pixels: Tensor) -> Rays:
-    """Rays through the centres of `pixels` [P], counted row by row."""
-    return cast(camera, pixel_grid(camera.width, camera.height, pixels.device)[pixels])

@@ -12,8 +12,8 @@ from torch.nn import functional
 
 from bench.cameras import crop_camera, place_camera, scale_camera
 from bench.types import Camera, Frame, NullProbe, Probe
+from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.types import Occupancy
-from methods.rendering.field import Field
 from methods.rendering.frame import FeatureFrame, everywhere, render_frame
 from methods.steernerf.buffer import Buffer, Cloud
 from methods.steernerf.options import Model, Rendering
@@ -28,13 +28,6 @@ class View:
     low: Camera  # the same view at 1/s of the resolution; K_l of Eq. 7
     scale: int  # s
 
-    @classmethod
-    def of(cls, camera: Camera, scale: int) -> View:
-        """Make the view of `camera`; low resolution is 1/`scale` of its own, rounded up."""
-        width, height = -(-camera.width // scale), -(-camera.height // scale)
-        full = replace(camera, width=width * scale, height=height * scale)
-        return cls(full, scale_camera(full, width, height), scale)
-
     def crop(self, left: int, top: int, side: int) -> View:
         """Crop to a square of `side` low-resolution pixels, the first at `left`, `top`."""
         s = self.scale
@@ -43,32 +36,28 @@ class View:
 
 
 class Pipeline:
-    """A `field` and a 2D `renderer` that together render frames, one after the other.
-
-    `occupancy` says where the field may hold matter, `background` [3] is that of the scene, `model`
-    is what both are trained for. A subclass may override each step of a frame: which preceding
-    frames are used (`select`), what the 2D renderer is shown (`observe`) and draws (`draw`), and
-    what later frames need of this one (`keep`, an object of the class `kept`).
-    """
+    """A `trained` field and a 2D `renderer`, both for `model`, that together render frames, one
+    after the other, on `background` [3]. A subclass may override each step of a frame: which
+    preceding frames are used (`select`), what the 2D renderer is shown (`observe`) and draws
+    (`draw`), and what later frames need of this one (`keep`, an object of the class `kept`)."""
 
     kept: type[Cloud] = Cloud
 
     def __init__(
-        self,
-        field: Field,
-        occupancy: Occupancy,
-        background: Tensor,
-        renderer: Renderer2d,
-        model: Model,
+        self, trained: TrainedField, background: Tensor, renderer: Renderer2d, model: Model
     ) -> None:
-        self.field, self.occupancy, self.renderer = field, occupancy, renderer
-        self.model, self.backend = model, field.backend
+        self.field, self.occupancy, self.renderer = trained.field, trained.occupancy, renderer
+        self.model, self.backend = model, trained.field.backend
         more = (0, model.channels - 3)
+        background = background.to(trained.field.device)
         self.background = functional.pad(background, more, value=model.feature_background)  # [K]
 
     def view(self, camera: Camera) -> View:
-        """The view of `camera`, on the device of the field."""
-        return View.of(place_camera(camera, self.background.device), self.model.scale)
+        """The view of `camera`, on the device of the field; low resolution is rounded up."""
+        s, camera = self.model.scale, place_camera(camera, self.background.device)
+        width, height = -(-camera.width // s), -(-camera.height // s)
+        full = replace(camera, width=width * s, height=height * s)
+        return View(full, scale_camera(full, width, height), s)
 
     @torch.no_grad()
     def render(self, camera: Camera, buffer: Buffer, rendering: Any, probe: Probe) -> Frame:
@@ -118,9 +107,9 @@ class Pipeline:
             render = everywhere(self.field, where, probe, how)
             return render_frame(view.low, where, self.background, probe, render)
 
-    def reproject(self, cloud: Cloud, view: View) -> Points:
-        """Reproject the features of a preceding frame into the present view (Eq. 9, 10)."""
-        return Points(cloud.values, cloud.splat(view.full, self.backend)[0])
+    def reproject(self, preceding: Sequence[Cloud], view: View) -> Sequence[Points]:
+        """The features of the `preceding` frames that the present view shows (Eq. 9, 10)."""
+        return [Points(old.values, old.splat(view.full, self.backend)[0]) for old in preceding]
 
     def observe(
         self,
@@ -131,8 +120,7 @@ class Pipeline:
         probe: Probe,
     ) -> Any:
         """What the 2D renderer is shown: the present `frame` and the `preceding` features."""
-        points = [self.reproject(cloud, view) for cloud in preceding]
-        return Observation(frame, points, self.backend)
+        return Observation(frame, self.reproject(preceding, view), self.backend)
 
     def draw(self, shown: Any, view: View, rendering: Any, probe: Probe) -> Tensor:
         """The picture I [H, W, 3] of what the 2D renderer is `shown` (Eq. 11)."""

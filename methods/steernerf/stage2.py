@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from bench.sources import digest, libraries
-from bench.types import Budget, Log, Scene, Split, SteerbenchError
+from bench.types import Budget, Log, Scene
 from methods.instant_ngp.optimiser import FieldOptimiser
 from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.instant_ngp.training import restore_field
@@ -21,7 +21,7 @@ from methods.kernels import multiplies_bf16
 from methods.kernels.types import expect
 from methods.rendering.batch import opacity_entropy
 from methods.rendering.occupancy import EVERY
-from methods.steernerf.options import EVERYWHERE, JointOptions, Model, Rendering, Skips
+from methods.steernerf.options import JointOptions, Model
 from methods.steernerf.patches import Batch, Patches, distilled_views
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.unet import Renderer2d
@@ -29,8 +29,7 @@ from methods.training import checkpoint, loop
 from methods.training.optimiser import cosine, step_at
 
 MARKS = (0.125, 0.25, 0.5)
-"""Shares of the steps after which the weights are saved as well, so that an ablation can be shown
-as a curve over the steps."""
+"""Shares of the steps after which the weights are saved as well: an ablation becomes a curve."""
 
 
 class JointTraining:
@@ -95,17 +94,15 @@ class JointTraining:
         return first * cosine(self.step / self.steps, final, waves)
 
     def watched(self) -> dict[str, Tensor]:
-        """Renderer, and the table and networks of a field that learns."""
-        watched = _named("renderer.", dict(self.renderer.named_parameters()))
-        if self.trained:
-            watched |= {"table": self.trained.field.table, **self.trained.field.layers}
-        return watched
+        """The parameters of the renderer, and of a field that learns."""
+        field = self.trained.field.named_parameters("field") if self.trained else ()
+        return dict([*self.renderer.named_parameters("renderer"), *field])
 
     def result(self) -> dict[str, Tensor]:
         """Renderer, and field and density grid if they learn."""
-        result = _named("outcome.", self.outcome.state_dict())
+        result = self.outcome.state_dict(prefix="outcome.")
         if self.trained:
-            result |= _named("field.", self.trained.field.state_dict())
+            result |= self.trained.field.state_dict(prefix="field.")
             result["grid.density"] = self.trained.grid.density
         return result
 
@@ -119,7 +116,7 @@ class JointTraining:
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
         """Optimisers, random numbers, and the examples that patches are cut from."""
         tensors = checkpoint.optimiser_tensors(self.optimiser, "renderer_adam.")
-        tensors |= _named("patches.", self.patches.state())
+        tensors |= {f"patches.{name}": x for name, x in self.patches.state().items()}
         tensors["generator"] = self.generator.get_state()
         if self.trained:
             tensors |= {"visits": self._visits.get_state(), **self.field_optimiser.tensors()}
@@ -136,17 +133,13 @@ class JointTraining:
             self._visits.set_state(tensors["visits"].cpu())
 
 
-def _named(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {f"{prefix}{name}": x for name, x in tensors.items()}
-
-
 @dataclass(frozen=True)
 class Stage2:
-    """What is trained in stage 2, and how. A variant of the method overrides `make`, `rendering`,
-    and the classes of the pipeline, of its patches and of the training."""
+    """What is trained in stage 2, and how. A variant of the method has other classes of the
+    pipeline, of its patches and of the training."""
 
     model: Model  # the settings it is trained for
-    renderer: Callable[..., Renderer2d]  # factory of the 2D renderer
+    renderer: Callable[..., Renderer2d]  # makes the 2D renderer for K, L and s
     joint: JointOptions  # how it is trained
     after: float = 1.0  # share of the steps whose weights are used, 1 or one of `MARKS`
 
@@ -157,16 +150,6 @@ class Stage2:
     def __post_init__(self) -> None:
         marks = ", ".join(map(str, MARKS))
         expect(self.after in (*MARKS, 1), "after", f"{marks} or 1", self.after)
-
-    def make(self) -> Renderer2d:
-        """Make an untrained 2D renderer."""
-        return self.renderer(self.model.channels, self.model.frames, self.model.scale)
-
-    @property
-    def rendering(self) -> Any:
-        """How frames are rendered in training: everywhere, which serves all later choices."""
-        skips = Skips(empty=True, hidden=True)
-        return Rendering(self.model.step, self.model.stop, EVERYWHERE, skips)
 
     def key(self, budget: Budget) -> dict[str, object]:
         """Everything that the training depends on, besides the field of stage 1."""
@@ -181,36 +164,19 @@ class Stage2:
             "stage2_libraries": libraries(type(self), kind),
         }
 
-    def new_renderer(self, setup: Setup) -> Renderer2d:
+    def make(self, setup: Setup) -> Renderer2d:
         """Make the untrained 2D renderer of the seed and the device of `setup`."""
         torch.manual_seed(setup.seed)
-        made = self.make().to(setup.device)
-        return made.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-
-    def patches_of(
-        self,
-        scene: Scene,
-        distilled: Split,
-        trained: TrainedField,
-        renderer: Renderer2d,
-        generator: torch.Generator,
-    ) -> Patches:
-        """Patches of `scene` and of `distilled` views, which `trained` and `renderer` render."""
-        background = scene.background.to(trained.field.device)
-        given = trained.field, trained.occupancy, background, renderer, self.model
-        pipeline, how = self.pipeline(*given), self.rendering
-        return self.patches(pipeline, how, scene, distilled, self.joint, generator)
+        made: Any = self.renderer(self.model.channels, self.model.frames, self.model.scale)
+        return made.to(setup.device, memory_format=torch.channels_last)
 
 
 def train_stage2(
     trained: TrainedField, setup: Setup, stage2: Stage2, scene: Scene, budget: Budget, log: Log
 ) -> tuple[Pipeline, dict[str, object], float]:
     """Train `stage2` on the field that `setup` made for `scene`, or load the result of the same
-    training. The field is widened to K features and changed in place.
-
-    Returns:
-        the trained pipeline, the key of its weights, and the seconds of stage 2 spent on them.
-    """
+    training. The field is widened to K features and changed in place. Returns the pipeline, the
+    key of its weights, and the seconds of stage 2 spent on them."""
     model, joint, steps = stage2.model, stage2.joint, budget.renderer_steps
     key = {**setup.key(scene, budget), **stage2.key(budget)}
     folder = log.stage_dir("steernerf", key)
@@ -220,20 +186,16 @@ def train_stage2(
     random = torch.Generator().manual_seed(setup.seed) if joint.features == "random" else None
     trained.field.widen(model.channels, random)
 
-    renderer, generator = stage2.new_renderer(setup), torch.Generator().manual_seed(setup.seed)
-    patches = stage2.patches_of(scene, distilled, trained, renderer, generator)
-    learning = trained if patches.learning else None
-    training, pipeline = stage2.training(renderer, patches, steps, learning), patches.pipeline
+    renderer, generator = stage2.make(setup), torch.Generator().manual_seed(setup.seed)
+    pipeline = stage2.pipeline(trained, scene.background, renderer, model)
+    patches = stage2.patches(pipeline, scene, distilled, joint, generator)
+    training = stage2.training(renderer, patches, steps, trained if patches.learning else None)
     pipeline.renderer, training.seconds = training.outcome, distilled_s
 
-    marks = {share: folder / f"after-{share}.safetensors" for share in MARKS}
-    at = {mark: math.ceil(share * steps) for share, mark in marks.items()}
-    loop.train(training, finished, "training the 2D renderer", log, at)
+    marks = {folder / f"after-{share}.safetensors": math.ceil(share * steps) for share in MARKS}
+    loop.train(training, finished, "training the 2D renderer", log, marks)
     if stage2.after < 1:
-        mark = marks[stage2.after]
-        if not mark.exists():
-            raise SteerbenchError(f"{mark} is missing: remove {folder} to train again")
-        loop.load(training, mark)
+        loop.load(training, folder / f"after-{stage2.after}.safetensors")
         key["after"] = stage2.after
     trained.field.requires_grad_(False).gradients = None
     pipeline.renderer.requires_grad_(False)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -37,21 +35,18 @@ class Observation:
     backend: str  # of the kernels that a renderer calls
 
 
-class Renderer2d(nn.Module, ABC):
-    """Turns observations into pictures with a `network`, which an `engine` computes if set."""
+class Renderer2d(nn.Module):
+    """Turns observations into pictures [B, H, W, 3] with a `network`, which an `engine` computes if
+    set (Eq. 11). A subclass has a method `forward(observations, probe)`, as that of `UNet`."""
 
     network: Network
     engine: Callable[..., tuple[Tensor, ...]] | None = None
 
     def run(self, probe: Probe, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Compute the network's output, with the engine if there is one."""
+        """Compute the network's output."""
         probe.count("products", self.network.products(*inputs))
         with probe.stage("network"):
             return (self.engine or self.network)(*inputs)
-
-    @abstractmethod
-    def forward(self, observations: Sequence[Any], probe: Probe = UNWATCHED) -> Any:
-        """Draw all observations: pictures [B, H, W, 3], or what a subclass says (Eq. 11)."""
 
 
 class UNet(Renderer2d):
@@ -61,8 +56,7 @@ class UNet(Renderer2d):
     of the preceding frames at the pixels where their points land, zero elsewhere. Its output is
     added to the bilinearly enlarged RGB of the present frame, which keeps every pixel in its place
     if `aligned`; the release uses align_corners=True, which moves all pixels but the middle one.
-    `channels`, `frames` and `scale` are K, L and s; `width` is the number of channels at full
-    resolution, 64 in the release.
+    `channels`, `frames`, `scale` are K, L, s; `width` channels, in the release 64, are of full size.
     """
 
     def __init__(
@@ -77,13 +71,9 @@ class UNet(Renderer2d):
         """Draw all observations: pictures [B, H, W, 3]."""
         inputs = torch.stack([self._inputs(o) for o in observations])
         (correction,) = self.run(probe, inputs)  # Eq. 11
-        return self.base(observations) + correction.to(inputs).permute(0, 2, 3, 1)
-
-    def base(self, observations: Sequence[Observation]) -> Tensor:
-        """The pictures [B, H, W, 3] that the network corrects: the present RGB, enlarged."""
         rgb = torch.stack([o.frame.values[..., :3] for o in observations]).permute(0, 3, 1, 2)
-        how: Any = {"mode": "bilinear", "align_corners": not self.aligned}
-        return functional.interpolate(rgb, scale_factor=self.scale, **how).permute(0, 2, 3, 1)
+        base = functional.interpolate(rgb, None, self.scale, "bilinear", not self.aligned)
+        return base.permute(0, 2, 3, 1) + correction.to(inputs).permute(0, 2, 3, 1)
 
     def _inputs(self, observation: Observation) -> Tensor:
         """[K (L + 1), H, W]: the RGB of all frames, then their other features; zeros for preceding
@@ -164,5 +154,4 @@ def _kaiming(layer: nn.Conv2d, scale: float) -> None:
     nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
     assert layer.bias is not None
     nn.init.zeros_(layer.bias)
-    with torch.no_grad():
-        layer.weight.mul_(scale)
+    layer.weight.data.mul_(scale)

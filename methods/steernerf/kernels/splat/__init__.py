@@ -18,13 +18,10 @@ def splat(
 ) -> Tensor:
     """Find which of N points each pixel of a width x height picture shows: [height, width] int32.
 
-    An entry is the index of the last point that lands there, whatever its depth, -1 for none: in
+    The points have continuous coordinates (u, v) `pixels` [N, 2] and a z-depth `depth` [N]. An
+    entry is the index of the last point that lands there, whatever its depth, -1 for none: in
     SteerNeRF's release points overwrite each other. Only points inside the picture with a finite
     positive depth count. Not differentiable; for features use `gather`.
-
-    Args:
-        pixels: [N, 2] continuous coordinates (u, v), in pixels.
-        depth: [N] z-depth.
     """
     check_shape("pixels", pixels, None, 2)
     check_shape("depth", depth, len(pixels))

@@ -1,7 +1,5 @@
-"""Splatting with Triton: one lane per point; points compete for their pixel with atomics.
-
-A maximum does not depend on the order of the atomics, so that the result is repeatable.
-"""
+"""Splatting with Triton: one lane per point; points compete for their pixel with atomics. A maximum
+does not depend on their order, so that the result is repeatable."""
 
 from __future__ import annotations
 
