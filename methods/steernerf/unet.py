@@ -56,7 +56,7 @@ class UNet(Renderer2d):
     of the preceding frames at the pixels where their points land, zero elsewhere. Its output is
     added to the bilinearly enlarged RGB of the present frame, which keeps every pixel in its place
     if `aligned`; the release uses align_corners=True, which moves all pixels but the middle one.
-    `channels`, `frames`, `scale` are K, L, s; `width` channels, in the release 64, are of full size.
+    `channels`, `frames`, `scale` are K, L, s; `width` is the number of channels at full size.
     """
 
     def __init__(

@@ -18,17 +18,11 @@ from methods.steernerf_lean.observation import LeanObservation
 
 @dataclass(frozen=True)
 class Layout:
-    """Which inputs a network reads.
+    """Which inputs a network reads."""
 
-    Attributes:
-        channels: K.
-        scale: s.
-        history: whether it reads the preceding picture.
-    """
-
-    channels: int
-    scale: int
-    history: bool
+    channels: int  # K
+    scale: int  # s
+    history: bool  # whether it reads the preceding picture
 
     @property
     def columns(self) -> dict[str, int]:
@@ -53,13 +47,11 @@ class Layout:
 class CellInputs:
     """The inputs of N cells.
 
-    Attributes:
-        base: [N, s^2, 3] present colours, bilinearly enlarged with a repeated border; the network
-            corrects them.
-        parts: by the names of `Layout.columns`: present colour [N, 3], opacity [N, 1] and rest
-            [N, K - 3]; of each pixel, colour [N, s^2, 3] and validity [N, s^2, 1] of the preceding
-            picture, and colour [N, s^2, 3], opacity [N, s^2, 1] and rest [N, s^2, K - 3] of the
-            surface. 0 where nothing is known.
+    `base` [N, s^2, 3] are the present colours, bilinearly enlarged with a repeated border; the
+    network corrects them. `parts` have the names of `Layout.columns`: present colour [N, 3],
+    opacity [N, 1] and rest [N, K - 3]; of each pixel, colour [N, s^2, 3] and validity [N, s^2, 1]
+    of the preceding picture, and colour [N, s^2, 3], opacity [N, s^2, 1] and rest [N, s^2, K - 3]
+    of the surface. 0 where nothing is known.
     """
 
     base: Tensor
@@ -80,12 +72,9 @@ class CellInputs:
 
     def drawn(self, output: Tensor, matrix: Tensor) -> Tensor:
         """Pixels [N, s^2, 3] = base + correction + share * preceding colour + matrix [opacity *
-        colour, opacity, rest of the surface].
-
-        Args:
-            output: [N, 3 s^2] corrections; with history followed by [N, s^2] logits of the shares.
-            matrix: [N, 3 (K + 1)], shared by the pixels of a cell.
-        """
+        colour, opacity, rest of the surface]. `output` has [N, 3 s^2] corrections, with history
+        followed by [N, s^2] logits of the shares; the pixels of a cell share `matrix`, [N, 3 (K +
+        1)]."""
         parts, pixels = self.parts, self.base.shape[1]
         drawn = self.base + output[:, : 3 * pixels].view_as(self.base)
         if "history" in parts:

@@ -57,11 +57,7 @@ def paint(
     cells: Sequence[Tensor], size: torch.Size, scale: int, pixels: Tensor, background: Tensor
 ) -> Tensor:
     """Draw pictures [B, h s, w s, C] of `pixels` [N, s^2, C], which belong to the `cells` of one
-    picture after the other, on `background` [C].
-
-    Args:
-        size: h, w.
-    """
+    picture after the other, on `background` [C]; `size` is h, w."""
     height, width = size
     row = background.repeat(width * scale)  # whole rows: three numbers at a time are slow
     canvas = row.repeat(len(cells) * height * scale, 1).unflatten(1, (width * scale, -1))
