@@ -14,9 +14,15 @@ from methods.kernels.encode import HashGrid
 from methods.kernels.types import Occupancy
 from methods.rendering.occupancy import DensityGrid
 from methods.rendering.sampling import Sampling
-from methods.steernerf.options import EVERYWHERE, Model, Rendering, Skips
+from methods.steernerf.options import (
+    EVERYWHERE,
+    JointOptions,
+    Model,
+    MotionOptions,
+    Rendering,
+    Skips,
+)
 from methods.steernerf.pipeline import Pipeline
-from methods.steernerf.training.options import JointOptions, MotionOptions
 from methods.steernerf.unet import UNet
 from methods.steernerf_lean.lean_renderer import LeanRenderer
 from methods.steernerf_lean.options import LeanJointOptions, LeanModel, LeanRendering, LeanSkips
@@ -124,10 +130,8 @@ def misty_field(precision: str = "bf16", backend: str = "auto", channels: int = 
 
 def lean_renderer(model: LeanModel, *, width: int = 8) -> LeanRenderer:
     """An untrained lean 2D renderer of one block for `model`."""
-    history = model.frames > 0
-    return LeanRenderer(
-        model.channels, model.scale, history=history, width=width, blocks=1, init="scratch"
-    )
+    size = model.channels, model.frames, model.scale
+    return LeanRenderer(*size, width=width, blocks=1, init="scratch")
 
 
 def new_pipeline(model: Model = MODEL) -> Pipeline:
@@ -135,7 +139,7 @@ def new_pipeline(model: Model = MODEL) -> Pipeline:
     torch.manual_seed(0)
     field = misty_field(channels=model.channels)
     unet = UNet(model.channels, model.frames, model.scale, width=4, aligned=False)
-    return Pipeline(field, shell(), torch.ones(3), unet, model)
+    return Pipeline(trained_field(field), torch.ones(3), unet, model)
 
 
 def lean_pipeline(model: LeanModel | None = None) -> LeanPipeline:
@@ -143,4 +147,4 @@ def lean_pipeline(model: LeanModel | None = None) -> LeanPipeline:
     torch.manual_seed(0)
     model = model or lean_model()
     field = misty_field(channels=model.channels)
-    return LeanPipeline(field, shell(), torch.ones(3), lean_renderer(model), model)
+    return LeanPipeline(trained_field(field), torch.ones(3), lean_renderer(model), model)

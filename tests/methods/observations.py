@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from methods.rendering.frame import FeatureFrame
-from methods.steernerf.renderer import Observation, Points, Renderer2d
+from methods.steernerf.unet import Observation, Points, Renderer2d
 from methods.steernerf_lean.cells import cells_near
 from methods.steernerf_lean.lean_renderer import LeanRenderer
 from methods.steernerf_lean.observation import Detail, LeanObservation
@@ -188,9 +188,8 @@ def new_renderer(
     channels: int = 6, scale: int = 4, *, history: bool = True, width: int = 16, blocks: int = 2
 ) -> LeanRenderer:
     """An untrained lean renderer."""
-    return LeanRenderer(
-        channels, scale, history=history, width=width, blocks=blocks, init="scratch"
-    )
+    size = channels, int(history), scale
+    return LeanRenderer(*size, width=width, blocks=blocks, init="scratch")
 
 
 def to_picture(blocks: Tensor, scale: int) -> Tensor:

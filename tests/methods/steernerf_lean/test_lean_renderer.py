@@ -11,12 +11,10 @@ from torch.nn import functional
 from torch.utils.flop_counter import FlopCounterMode
 
 from methods.steernerf_lean.cell_inputs import CellInputs
-from methods.steernerf_lean.cell_network import LEAK
 from methods.steernerf_lean.cells import REACH
-from methods.steernerf_lean.lean_renderer import LeanRenderer
+from methods.steernerf_lean.lean_renderer import LEAK, LeanRenderer
 from methods.steernerf_lean.observation import Detail, LeanObservation
 from tests.methods.observations import (
-    BACKGROUND,
     FLOAT32_ERROR,
     ROUNDING,
     at_surface,
@@ -143,12 +141,6 @@ def test_an_index_that_names_no_point_of_the_surface_is_refused(wrong: int) -> N
         new_renderer()([observation])
 
 
-def test_a_renderer_without_history_ignores_the_preceding_picture() -> None:
-    observation = observe()
-    renderer, without = shaken(new_renderer(history=False)), replace(observation, history=None)
-    assert torch.equal(renderer([observation]).pictures, renderer([without]).pictures)
-
-
 @pytest.mark.parametrize("history", [False, True])
 def test_gradients_reach_every_parameter_and_the_features_of_all_that_is_shown(
     history: bool,
@@ -217,19 +209,6 @@ def test_the_surface_covers_the_base_as_far_as_it_is_opaque() -> None:
     covered = base + values[..., -1:] * (values[..., :3] - base)
     want = torch.where(known[..., None] > 0, covered, base)
     assert 0.5 < known.mean() < 0.8
-    torch.testing.assert_close(renderer([observation]).pictures[0], want, rtol=0, atol=BLENDING)
-
-
-@pytest.mark.parametrize("column", [3, 4, 6])
-def test_a_matrix_reads_opacity_and_other_features_less_the_background(column: int) -> None:
-    """Of K = 6: the opacity is behind the colours, then come the others."""
-    scale, renderer, observation = 4, new_renderer(history=False), observe()
-    with torch.no_grad():
-        renderer.network.read.bias.view(3, -1)[1, column] = 1.0  # into green
-    values, known = at_surface(observation, scale)
-    read = values[..., -1] if column == 3 else values[..., column - 1] - BACKGROUND[column - 1]
-    want = enlarged(observation, scale)
-    want[..., 1] += known * read
     torch.testing.assert_close(renderer([observation]).pictures[0], want, rtol=0, atol=BLENDING)
 
 

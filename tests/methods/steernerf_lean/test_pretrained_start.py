@@ -73,7 +73,7 @@ def test_pretrained_weights_are_read_from_their_file(
     halves = {name: x.half() for name, x in pretrained().network.state_dict().items()}
     save_file(halves, tmp_path / "lean.safetensors")
     monkeypatch.setattr(lean_renderer, "PRETRAINED", tmp_path / "lean.safetensors")
-    renderer = LeanRenderer(3, 4, history=True, width=16, blocks=2, init="pretrained")
+    renderer = LeanRenderer(3, 1, 4, width=16, blocks=2, init="pretrained")
     for name, weight in renderer.network.state_dict().items():
         assert torch.equal(weight, halves[name].float()), name
 

@@ -1,4 +1,5 @@
-"""Stage 2 of the lean method: its losses, its patches, the mean of its weights."""
+"""Stage 2 of the lean method: its losses, its patches, the mean of its weights; a renderer for any
+scene, trained on several."""
 
 from __future__ import annotations
 
@@ -9,39 +10,50 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import load_file
 from torch import Tensor
 
-from bench.types import NullProbe, Scene
-from methods.steernerf.training.examples import TrainingViews
-from methods.steernerf.training.patches import Batch
+from bench.console import ConsoleLog
+from bench.types import Budget, Log, NullProbe, Scene, Split, SteerbenchError
+from methods.steernerf.patches import Batch
+from methods.steernerf.stage2 import JointTraining
+from methods.steernerf_lean import lean_renderer as renderers
 from methods.steernerf_lean.cells import pixels_of
 from methods.steernerf_lean.lean_renderer import LeanRenderer
-from methods.steernerf_lean.training import LEAST_ERROR, LeanStage2, LeanTraining
-from methods.training import loop
+from methods.steernerf_lean.pipeline import LeanPipeline
+from methods.steernerf_lean.training import (
+    LEAST_ERROR,
+    AnyOf,
+    LeanPatches,
+    LeanStage2,
+    LeanTraining,
+    pretrain_renderer,
+)
+from methods.training import checkpoint, loop
 from tests.methods.models import (
     lean_joint,
     lean_model,
     lean_renderer,
     misty_field,
-    shell,
     small_motion,
     trained_field,
 )
 from tests.methods.observations import shaken
+from tests.methods.trainings import TEACHER
 
 MOTION = small_motion(pool=3, uses=4, length=2)
 OPTIONS = lean_joint(patch=4, motion=MOTION, refined=0.0)
-RENDERER = partial(LeanRenderer, width=8, blocks=1, init="scratch")
+RENDERER = partial(LeanRenderer, width=8, blocks=1, init="pretrained")
+BUDGET = Budget("test", steps=40, samples=1024, renderer_steps=8)
 
 
 def new_training(scene: Scene, options=OPTIONS, frames: int = 1, steps: int = 12) -> LeanTraining:
     torch.manual_seed(0)
-    model, field = lean_model(frames=frames), misty_field()
-    renderer, generator = lean_renderer(model), torch.Generator().manual_seed(1)
-    stage2 = LeanStage2(model, RENDERER, options)
-    pipeline = stage2.pipeline(field, shell(), scene.background, renderer, model)
-    patches = stage2.patches_of(pipeline, TrainingViews.of(scene), True, generator)
-    training = LeanTraining(renderer, patches, options, steps, generator, trained_field(field))
+    model, trained = lean_model(frames=frames), trained_field(misty_field())
+    pipeline = LeanPipeline(trained, scene.background, lean_renderer(model), model)
+    generator = torch.Generator().manual_seed(1)
+    patches = LeanPatches(pipeline, scene, Split([], [], []), options, generator)
+    training = LeanTraining(pipeline.renderer, patches, steps, trained)
     pipeline.renderer = training.outcome
     return training
 
@@ -138,7 +150,7 @@ def test_a_patch_lies_around_content(ball_scene: Scene) -> None:
     """Of a side of 2: the corner of a picture has none."""
     options = replace(OPTIONS, patch=2, motion=replace(MOTION, uses=100))
     source = new_training(ball_scene, options).patches
-    patches = [source.cut(source.pool.draw()) for _ in range(100)]
+    patches = [source.cut(source.example()) for _ in range(100)]
     assert not any((patch.truth == 1).all() for patch in patches)
     assert len({(patch.view.low.cx, patch.view.low.cy) for patch in patches}) > 15
 
@@ -158,3 +170,82 @@ def test_wrong_options_are_named() -> None:
         lean_joint(average=1.0)
     with pytest.raises(ValueError, match=r"^joint\.clip: expected more than 0, or null, got 0"):
         lean_joint(clip=0.0)
+
+
+def train(scenes: list[Scene], output: Path, log: Log, channels: int = 3) -> dict[str, Tensor]:
+    model = lean_model(channels=channels, step=4.0)
+    joint = lean_joint(patch=4, motion=small_motion(pool=2, length=2))
+    stage2 = LeanStage2(model, partial(RENDERER, init="scratch"), joint)
+    pretrain_renderer(TEACHER, stage2, scenes, BUDGET, output, log)
+    return load_file(output)
+
+
+@pytest.mark.slow
+def test_the_weights_of_several_scenes_are_what_a_renderer_starts_from(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    on_black = replace(ball_scene, name="on black", background=torch.zeros(3), digest="on black")
+    output = tmp_path / "new folder" / "lean.safetensors"
+    written = train([ball_scene, on_black], output, quiet_log)
+    assert checkpoint.read(output)[1] == {"scenes": 2, "steps": BUDGET.renderer_steps}
+    assert {weight.dtype for weight in written.values()} == {torch.float16}
+    log = ConsoleLog(tmp_path / "again", quiet=True)  # where nothing is found again
+    again = train([ball_scene, on_black], tmp_path / "again.safetensors", log)
+    assert all(torch.equal(weight, again[name]) for name, weight in written.items())
+    for name in ("enter.weight", "leave.weight", "read.weight", "read.bias"):
+        assert written[name].isfinite().all(), name
+        assert written[name].any(), name  # the last three were 0 before the training
+    monkeypatch.setattr(renderers, "PRETRAINED", output)
+    started = RENDERER(3, 1, 4)
+    assert started.network.state_dict().keys() == written.keys()
+    for name, weight in started.network.state_dict().items():
+        assert torch.equal(weight, written[name].float()), name
+    for channels, frames in ((6, 1), (3, 0), (4, 0)):
+        other = RENDERER(channels, frames, 4)
+        assert torch.equal(other.network.trunk[0].spread, started.network.trunk[0].spread)
+
+
+@pytest.mark.parametrize("channels", [4, 6])
+def test_features_that_mean_something_else_in_every_scene_are_refused(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log, channels: int
+) -> None:
+    output = tmp_path / "lean.safetensors"
+    with pytest.raises(SteerbenchError, match=rf"channels \(K\) of 3, got {channels}"):
+        train([ball_scene], output, quiet_log, channels)
+    assert not list(tmp_path.rglob("*.safetensors"))  # nothing was trained before
+
+
+def test_a_renderer_that_was_trained_on_the_same_scenes_is_found_again(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = train([ball_scene], tmp_path / "first.safetensors", quiet_log)
+    monkeypatch.delattr(JointTraining, "advance")
+    again = train([ball_scene], tmp_path / "again.safetensors", quiet_log)
+    for name, weight in first.items():
+        assert torch.equal(again[name], weight), name
+    with pytest.raises(AttributeError, match="advance"):  # with other scenes, another training
+        train([ball_scene, ball_scene], tmp_path / "other.safetensors", quiet_log)
+
+
+class Source:
+    """Patches of which all that is known is the source they are from."""
+
+    def __init__(self, number: int, generator: torch.Generator) -> None:
+        self.number, self.options, self.generator = number, OPTIONS, generator
+
+    def draw(self, count: int) -> Batch:
+        return Batch([], [], torch.full((count,), self.number), torch.zeros(0))
+
+
+def test_a_batch_is_of_one_source_and_every_source_has_its_turn() -> None:
+    def drawn(seed: int) -> list[int]:
+        generator = torch.Generator().manual_seed(seed)
+        patches = AnyOf([Source(number, generator) for number in range(3)])
+        batches = [patches.draw(2).truth.tolist() for _ in range(300)]
+        assert all(first == second for first, second in batches)
+        return [first for first, _ in batches]
+
+    numbers = drawn(0)
+    for number in range(3):
+        assert numbers.count(number) == pytest.approx(100, abs=41)  # 5 standard deviations
+    assert numbers == drawn(0) != drawn(1)

@@ -201,16 +201,6 @@ def test_some_cells_are_those_of_the_whole(backend: str) -> None:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("scale", [1, 3, 4])
-def test_a_camera_that_rests_sees_the_picture_again(scale: int, backend: str) -> None:
-    camera = straight(6 * scale, 5 * scale)
-    picture = noise(5 * scale, 6 * scale)
-    values, valid = warp(picture, camera, torch.full((5, 6), 2.0), camera, scale, backend=backend)
-    assert torch.equal(whole(values, scale), picture)
-    assert (valid == 1).all()
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_a_plane_moves_by_focal_length_times_offset_over_depth(backend: str) -> None:
     camera, depth = straight(24, 16), torch.full((4, 6), 2.0)
     picture = noise(16, 24)
@@ -224,21 +214,6 @@ def test_a_plane_moves_by_focal_length_times_offset_over_depth(backend: str) -> 
     assert not valid[:, -3:].any()
     assert not values[:2].any()
     assert not values[:, -3:].any()
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_depth_is_taken_in_the_middle_of_its_cell(backend: str) -> None:
-    camera = straight(24, 16)
-    depth = torch.full((4, 6), math.inf)
-    depth[2, 3] = 2.0
-    picture = torch.ones(16, 24, 1)
-    _, valid = warp(picture, camera, depth, camera, 4, backend=backend)
-    row, column = whole(valid[..., None], 4)[..., 0].nonzero().unbind(dim=1)
-    # All pixels less than 4 away from the sample at (14, 10).
-    for places, centre in ((column, 14), (row, 10)):
-        near = [i for i in range(24) if abs(i + 0.5 - centre) < 4]
-        assert places.unique().tolist() == near
-    assert len(row) == 64
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -291,11 +266,9 @@ def test_wrong_arguments_are_named() -> None:
         warp_cells(picture[:, 1:], camera, depth, cells, camera, 4)
     with pytest.raises(ValueError, match=r"depth: expected shape \[6, 16\], got \[96\]"):
         warp_cells(picture, camera, depth.flatten(), cells, camera, 4)
-    with pytest.raises(ValueError, match=r"camera: expected cells of 4 x 4 pixels, got 12 x 9"):
-        warp_cells(picture, camera, depth, cells, replace(camera, height=9), 4)
-    with pytest.raises(ValueError, match="warps float32"):
+    with pytest.raises(ValueError, match="computes with float32"):
         warp_cells(picture.double(), camera, depth, cells, camera, 4, backend="cpu")
     with pytest.raises(ValueError, match=r"depth: expected shape \[any, any\], got \[96\]"):
         enlarge_cells(depth.flatten(), cells, 4)
-    with pytest.raises(ValueError, match="warps float32"):
+    with pytest.raises(ValueError, match="computes with float32"):
         enlarge_cells(depth.double(), cells, 4, backend="cpu")
