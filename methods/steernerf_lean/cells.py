@@ -1,8 +1,5 @@
-"""Cells: the s x s pixels of a picture that one low-resolution pixel covers.
-
-Only cells near matter are drawn. Cells are given by their row-major indices [N], their pixels as
-[N, s^2, ...], also row by row.
-"""
+"""Cells: the s x s pixels of a picture that one low-resolution pixel covers. They are given by their
+row-major indices [N], their pixels as [N, s^2, ...], also row by row."""
 
 from __future__ import annotations
 
@@ -11,8 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-REACH = 1
-"""Distance from matter, in cells, within which cells are drawn; everything farther is empty."""
+REACH = 1  # distance from matter, in cells, within which cells are drawn; what is farther is empty
 
 
 def cells_near(seen: Tensor) -> Tensor:

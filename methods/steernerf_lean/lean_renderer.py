@@ -24,9 +24,7 @@ from methods.steernerf_lean.observation import LeanObservation
 PRETRAINED = Path(__file__).parent / "weights" / "lean.safetensors"
 """Weights trained on other scenes, by `steerbench pretrain`."""
 
-PRETRAINED_LAYOUT = Layout(channels=3, scale=4, history=True)
-"""The inputs that those weights expect."""
-
+PRETRAINED_LAYOUT = Layout(channels=3, scale=4, history=True)  # of their inputs
 
 LEAK = 0.1
 """Slope of the activations below 0. With plain ReLU, units die on the sparse inputs and never
@@ -68,11 +66,8 @@ class CellNetwork(Network):
 
 class _Linear(nn.Linear):
     def forward(self, x: Tensor) -> Tensor:
-        """x W^T + b of `x` [N, C].
-
-        Without gradient it is computed as a 1 x 1 convolution: torch hands products of float32 to
-        MKL, but convolutions to oneDNN, which is twice as fast on non-Intel processors.
-        """
+        """x W^T + b of `x` [N, C]. Without gradient it is a 1 x 1 convolution: torch hands products
+        of float32 to MKL, but convolutions to oneDNN, twice as fast on non-Intel processors."""
         if torch.is_grad_enabled() or torch.jit.is_tracing() or not len(x):
             return super().forward(x)
         picture = x[None, :, None].permute(0, 3, 1, 2)  # [1, C, N, 1], channels last in memory
@@ -110,17 +105,14 @@ class LeanRenderer(Renderer2d):
     A picture starts from the base: the present RGB, bilinearly enlarged with every pixel in its
     place. Each of its pixels is blended with the preceding picture where that is known. Then a
     correction is added, and the features at the surface of the pixel times a matrix that all pixels
-    of a cell share. The network gives the blending shares, corrections and matrices, and also the
-    error to expect in each cell.
+    of a cell share. The network gives shares, corrections, matrices, and the error to expect.
 
     Only the cells of an observation are drawn; all others are background, and 0 to their
-    neighbours. So nothing is computed for them, and a part of a frame is drawn exactly as in the
-    whole, but for the cells near the cut, whose neighbours are missing. The background is
-    subtracted from all features, so that empty space is 0.
+    neighbours: a part of a frame is drawn exactly as in the whole, but for the cells near the cut.
 
-    `channels`, `frames` and `scale` are K, L (1: the preceding picture is used) and s; the trunk
-    has `width` channels and so many residual `blocks`. `init` "pretrained" starts from the weights
-    that come with the package, trained on other scenes, "scratch" from random ones.
+    `channels`, `frames`, `scale` are K, L (1: the preceding picture is used), s; `width` and
+    `blocks` those of the network; `init` "pretrained" starts from the weights that come with the
+    package, "scratch" from random ones.
     """
 
     network: CellNetwork
@@ -136,6 +128,7 @@ class LeanRenderer(Renderer2d):
         init: Literal["pretrained", "scratch"],
     ) -> None:
         super().__init__()
+        expect(0 <= frames <= 1, "model.frames", "0 to 1", frames)
         expect(1 <= width <= 4096, "renderer.width", "1 to 4096", width)
         expect(0 <= blocks <= 256, "renderer.blocks", "0 to 256", blocks)
         self.layout = Layout(channels, scale, history=frames > 0)

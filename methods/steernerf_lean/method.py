@@ -17,6 +17,10 @@ REFINED = turned("refined", f"{HOW}.refined", (0, 0.03, 0.06, 0.25, 0.5, 1))
 REFINED_STEPS = turned("refined step", f"{HOW}.refined_step", (1, 1.5, 3))
 STEPS = turned("step", f"{HOW}.step", (1, 1.5, 3, 4))
 SHARES = [REFINED[0], *REFINED[2:]]
+SCRATCH = "method.renderer.init=scratch"
+PARTS = {"feature_reprojection/surface": "surface", "refinement": "refinement"}
+PAPERS = ("method=steernerf", "method.renderer.width=64", "budget.renderer_steps=8")
+"""The release's network; its cost does not depend on how well it is trained."""
 
 
 def _both(one: Variant, other: Variant) -> Variant:
@@ -44,9 +48,7 @@ class SteerNerfLean(SteerNerf):
         trained={
             **STUDY.trained,
             "L, trained": turned("L", "method.model.frames", (0,)),
-            "s, trained": turned(
-                "s", "method.model.scale", (2, 4, 8), "method.renderer.init=scratch"
-            ),
+            "s, trained": turned("s", "method.model.scale", (2, 4, 8), SCRATCH),
             "step, trained": turned("trained step", "method.model.step", (1, 3)),
         },
         exact=(
@@ -58,20 +60,8 @@ class SteerNerfLean(SteerNerf):
         skips=ALL_SKIPS,
         skips_with=(f"{HOW}.refined=0",),  # refinement takes a share of the cells drawn
         axes={name: axis for name, axis in STUDY.axes.items() if name != "L"},
-        parts={
-            **STUDY.parts,
-            "feature_reprojection/surface": "surface",
-            "refinement": "refinement",
-        },
-        beside={
-            **STUDY.beside,
-            # The release's network; its cost does not depend on how well it is trained.
-            "the paper's": (
-                "method=steernerf",
-                "method.renderer.width=64",
-                "budget.renderer_steps=8",
-            ),
-        },
+        parts={**STUDY.parts, **PARTS},
+        beside={**STUDY.beside, "the paper's": PAPERS},
     )
 
     def pretrain_renderer(

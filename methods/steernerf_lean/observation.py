@@ -21,11 +21,8 @@ from methods.steernerf.unet import Points
 from methods.steernerf_lean.cells import centres
 from methods.steernerf_lean.kernels.warp import warp
 
-OVERLAP_POINTS = 256
-"""At most this many evenly spaced points estimate how much of a frame another view shares."""
-
-LAYER = 4 * STEP
-"""Thickness, in scene units, of the layer that a single sample of the surface stands for."""
+OVERLAP_POINTS = 256  # at most, evenly spaced, to estimate how much of a frame another view shares
+LAYER = 4 * STEP  # thickness, in scene units, of the layer that a sample of the surface stands for
 
 
 @dataclass(frozen=True)
@@ -62,24 +59,22 @@ class Kept(Cloud):
 
 
 def overlap(cloud: Cloud, camera: Camera) -> Tensor:
-    """Estimate the share of what a frame shows that `camera` can see: a scalar, 0 to 1.
+    """Estimate the share of what a frame shows that `camera` can see: a scalar, 0 to 1; 0 of nothing.
 
     Every point inside the other picture counts (1 + cos t) / 2, where t is the angle between the
     two views of it: on a ball, the share of the visible disc that both cameras see. Occlusion is
-    ignored. A frame that shows nothing gives 0.
+    ignored.
     """
-    clear = cloud.clear
-    number = clear.cumsum(dim=0)  # from 1
+    number = cloud.clear.cumsum(dim=0)  # from 1
     every = (number[-1:] + OVERLAP_POINTS - 1) // OVERLAP_POINTS
-    sampled = clear & ((number - 1) % every.clamp(min=1) == 0)
+    sampled = cloud.clear & ((number - 1) % every.clamp(min=1) == 0)
     kept = kept_indices(sampled)
     points = cloud.points[kept]
     pixels, depth = project(camera, points)
     inside = sampled[kept] & (depth > 0) & within(pixels, camera.width, camera.height)
     here, there = (points - view.c2w[:3, 3] for view in (cloud.camera, camera))
     seen = (1 + functional.cosine_similarity(here, there, dim=1)) / 2
-    share = torch.where(inside, seen, 0).sum() / sampled.sum()
-    return share.nan_to_num(nan=0.0)
+    return (torch.where(inside, seen, 0).sum() / sampled.sum()).nan_to_num(nan=0.0)
 
 
 def surface_points(field: Field, depth: Tensor, cells: Tensor, view: View, probe: Probe) -> Points:

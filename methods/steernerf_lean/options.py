@@ -11,15 +11,6 @@ from methods.steernerf.options import EVERYWHERE, JointOptions, Model, Rendering
 
 
 @dataclass(frozen=True)
-class LeanModel(Model):
-    """A model whose 2D renderer reads the preceding picture, if L = 1; L = 0: it does not."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        expect(self.frames <= 1, "frames", "0 to 1", self.frames)
-
-
-@dataclass(frozen=True)
 class LeanSkips(Skips):
     """Further work to skip."""
 

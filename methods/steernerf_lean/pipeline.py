@@ -1,8 +1,7 @@
 """One frame of the lean SteerNeRF: the steps in which it differs from the paper's `Pipeline`.
 
-The 2D renderer is shown the preceding picture (`history`) and the field at the surface of each
-pixel (`surface`), but no features of preceding frames. The field itself then renders the cells with
-the largest estimated error (`refinement`).
+The 2D renderer is shown the preceding picture and the field at the surface of each pixel, but no
+features of preceding frames. The field then renders the cells with the largest estimated error.
 """
 
 from __future__ import annotations
@@ -88,8 +87,7 @@ class LeanPipeline(Pipeline):
     def draw(
         self, shown: LeanObservation, view: View, rendering: LeanRendering, probe: Probe
     ) -> Tensor:
-        """The picture [H, W, 3], with the cells of the largest estimated error as rendered by the
-        field."""
+        """The picture [H, W, 3]; the field renders the cells of the largest estimated error."""
         with probe.stage("renderer2d"):
             pictures, error = self.renderer([shown], probe)
             picture: Tensor = pictures[0].clamp_(0, 1)

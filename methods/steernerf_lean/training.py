@@ -29,8 +29,7 @@ from methods.steernerf_lean.options import LeanJointOptions, LeanRendering
 from methods.steernerf_lean.pipeline import LeanPipeline, rays_of_cells, worst_cells
 from methods.training import checkpoint, loop
 
-LEAST_ERROR = 1e-6
-"""Added to the mean squared error of a cell: below this, one error is as good as another."""
+LEAST_ERROR = 1e-6  # added to that of a cell: below this, one mean squared error is like another
 
 
 class LeanPatches(Patches):
@@ -198,9 +197,8 @@ def pretrain_renderer(
 ) -> None:
     """Fit a field to each of `scenes`, train one renderer on all of them, write it to `output`.
 
-    Trained stages are cached. The fields are frozen: what a renderer learns from them must hold for
-    fields it has never seen. Raises SteerbenchError unless K is 3: further features mean something
-    different in every scene.
+    The fields are frozen: what a renderer learns must hold for fields it has never seen. Raises
+    SteerbenchError unless K is 3: further features mean something different in every scene.
     """
     model, joint = stage2.model, replace(stage2.joint, field="frozen")
     if model.channels != 3:

@@ -25,7 +25,7 @@ from methods.steernerf.options import (
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.unet import UNet
 from methods.steernerf_lean.lean_renderer import LeanRenderer
-from methods.steernerf_lean.options import LeanJointOptions, LeanModel, LeanRendering, LeanSkips
+from methods.steernerf_lean.options import LeanJointOptions, LeanRendering, LeanSkips
 from methods.steernerf_lean.pipeline import LeanPipeline
 
 SMALL_GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=16)
@@ -78,9 +78,9 @@ def small_joint(**others: Any) -> JointOptions:
     return replace(JOINT, **others)
 
 
-def lean_model(**others: Any) -> LeanModel:
+def lean_model(**others: Any) -> Model:
     """K = 4, L = 1, s = 4, long steps; `others` replace fields."""
-    return replace(LeanModel(**vars(MODEL) | {"frames": 1}), **others)
+    return replace(MODEL, **{"frames": 1} | others)
 
 
 def lean_rendering(**others: Any) -> LeanRendering:
@@ -128,7 +128,7 @@ def misty_field(precision: str = "bf16", backend: str = "auto", channels: int = 
     return field
 
 
-def lean_renderer(model: LeanModel, *, width: int = 8) -> LeanRenderer:
+def lean_renderer(model: Model, *, width: int = 8) -> LeanRenderer:
     """An untrained lean 2D renderer of one block for `model`."""
     size = model.channels, model.frames, model.scale
     return LeanRenderer(*size, width=width, blocks=1, init="scratch")
@@ -142,7 +142,7 @@ def new_pipeline(model: Model = MODEL) -> Pipeline:
     return Pipeline(trained_field(field), torch.ones(3), unet, model)
 
 
-def lean_pipeline(model: LeanModel | None = None) -> LeanPipeline:
+def lean_pipeline(model: Model | None = None) -> LeanPipeline:
     """A misty field and an untrained lean 2D renderer on white; always the same weights."""
     torch.manual_seed(0)
     model = model or lean_model()

@@ -114,7 +114,7 @@ def test_the_time_to_see_what_frames_share_is_that_of_a_stage(monkeypatch) -> No
 
 def test_settings_that_make_no_frame_are_refused() -> None:
     with pytest.raises(ValueError, match="frames: expected 0 to 1, got 2"):
-        lean_model(frames=2)
+        lean_pipeline(lean_model(frames=2))
     with pytest.raises(ValueError, match=r"refined_step: expected a length of more than 0"):
         lean_rendering(refined_step=0.0)
     with pytest.raises(ValueError, match=r"refined: expected a share of 0 to 1, got 1\.5"):

@@ -1,13 +1,9 @@
 """Backward warping: looks up the preceding picture at the points that the current picture shows.
 
-A pixel of the current picture takes its depth from the low-resolution depths around it, is
-unprojected to a point, and shows the colour of the preceding picture at that point, interpolated
-bilinearly. Its depth is the bilinear mean over those of the four nearest low-resolution pixels that
-have a depth at most `TOLERANCE` behind the nearest of the four, because the front surface hides
-what is behind it.
-
-The s x s pixels of a low-resolution pixel, its cell, are stored together. Only the given cells are
-warped.
+A pixel of the current picture is unprojected to a point, and shows the colour of the preceding
+picture there, interpolated bilinearly. Its depth is the bilinear mean over those of the four
+nearest low-resolution pixels that have a depth at most `TOLERANCE` behind the nearest of the four:
+the front surface hides what is behind it. Only the given cells are warped.
 """
 
 from __future__ import annotations
@@ -56,10 +52,8 @@ def warp(
 
 
 def source_from_camera(source: Camera, camera: Camera) -> tuple[Tensor, Tensor]:
-    """M [3, 3], m [3]: homogeneous source pixel = z M (u, v, 1) + m.
-
-    In float64, on the device of the cameras, to which intrinsics are copied without waiting.
-    """
+    """M [3, 3], m [3]: homogeneous source pixel = z M (u, v, 1) + m, in float64, on the device of
+    the cameras, to which intrinsics are copied without waiting."""
     to, of = source.c2w.double(), camera.c2w.double()
     rotation = to[:, :3].T @ of[:, :3]
     offset = to[:, :3].T @ (of[:, 3] - to[:, 3])
