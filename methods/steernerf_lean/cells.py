@@ -1,5 +1,5 @@
-"""Cells: the s x s pixels of a picture that one low-resolution pixel covers. They are given by their
-row-major indices [N], their pixels as [N, s^2, ...], also row by row."""
+"""Cells: the s x s pixels of a picture that one low-resolution pixel covers. Cells have row-major
+indices [N], their pixels are [N, s^2, ...], also row by row."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class Kept(Cloud):
 
 
 def overlap(cloud: Cloud, camera: Camera) -> Tensor:
-    """Estimate the share of what a frame shows that `camera` can see: a scalar, 0 to 1; 0 of nothing.
+    """Estimate the share of what a frame shows that `camera` can see: a scalar, 0 to 1.
 
     Every point inside the other picture counts (1 + cos t) / 2, where t is the angle between the
     two views of it: on a ball, the share of the visible disc that both cameras see. Occlusion is

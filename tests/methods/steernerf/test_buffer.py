@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.cameras import pixel_grid, project, scale_camera, unproject
+from bench.cameras import project, scale_camera, unproject
 from bench.types import Camera
 from methods.kernels.types import Occupancy
 from methods.rendering.frame import FeatureFrame, everywhere, render_frame
@@ -44,14 +44,6 @@ def low_camera(scale: int) -> Camera:
     camera = look_at_the_middle(0.1, 0.3)
     full = replace(camera, cx=4.25 * scale, cy=2.5 * scale, width=8 * scale, height=6 * scale)
     return scale_camera(replace(full, fx=9.0 * scale, fy=10.0 * scale), 8, 6)
-
-
-def test_a_point_is_where_the_corner_of_its_pixel_sees_it() -> None:
-    low = low_camera(4)
-    frame = frame_of(low)
-    cloud = Cloud.of(frame)
-    assert torch.equal(cloud.values, frame.values.view(48, 4))
-    assert torch.equal(cloud.points, unproject(low, pixel_grid(8, 6) - 0.5, frame.depth.flatten()))
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

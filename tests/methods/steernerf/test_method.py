@@ -99,7 +99,9 @@ def test_steps_of_its_own_replace_those_of_the_budget(
     assert stages(tmp_path) == ["distilled", "field", "steernerf", "steernerf"]
 
 
-def test_reset_forgets(ball_scene: Scene, shared_log: Log) -> None:
+def test_reset_forgets_and_sizes_are_those_of_all_that_a_frame_needs(
+    ball_scene: Scene, shared_log: Log
+) -> None:
     method = new_method(rate=1e-2)
     method.fit(ball_scene, BUDGET, shared_log)
     camera = ball_scene.splits["test"].cameras[0]
@@ -109,14 +111,9 @@ def test_reset_forgets(ball_scene: Scene, shared_log: Log) -> None:
     assert torch.equal(method.render(camera, NullProbe()).rgb, cold)
     assert not torch.equal(steady, cold)
     assert method.memory == 2
-
-
-def test_sizes_are_those_of_all_that_a_frame_needs(ball_scene: Scene, shared_log: Log) -> None:
-    method = new_method()
-    method.fit(ball_scene, BUDGET, shared_log)
-    renderer = RENDERER(5, 2, 4)
-    numbers = sum(p.numel() for p in renderer.parameters())
-    assert method.sizes()["renderer2d"] == 4 * numbers
+    assert method.sizes()["renderer2d"] == 4 * sum(
+        p.numel() for p in RENDERER(5, 2, 4).parameters()
+    )
     assert set(method.sizes()) == {"hash_table", "field_networks", "occupancy", "renderer2d"}
 
 

@@ -15,7 +15,6 @@ from torch.nn import functional
 from torch.utils.flop_counter import FlopCounterMode
 
 from methods.steernerf_lean import lean_renderer
-from methods.steernerf_lean.cell_inputs import CellInputs
 from methods.steernerf_lean.cells import REACH
 from methods.steernerf_lean.lean_renderer import (
     LEAK,
@@ -167,23 +166,6 @@ def test_gradients_reach_every_parameter_and_the_features_of_all_that_is_shown(
     for tensor in features:
         assert tensor.grad is not None
         assert tensor.grad.any(dim=0).all()  # every channel, RGB and others
-
-
-def test_gradients_of_inputs_and_pixels_are_finite_differences() -> None:
-    observation, layout = doubled(observe(2, 3, channels=4, scale=2)), new_renderer(4, 2).layout
-    output, matrix = torch.rand(6, 16, dtype=torch.float64), torch.rand(6, 15, dtype=torch.float64)
-
-    def computed(values: Tensor, surface: Tensor, *outputs: Tensor) -> tuple[Tensor, ...]:
-        shown = replace(
-            observation,
-            frame=replace(observation.frame, values=values),
-            surface=replace(observation.surface, values=surface),
-        )
-        inputs = CellInputs.of([shown], layout)
-        return inputs.rows(), inputs.drawn(*outputs)
-
-    learned = [*features_of(observation), output, matrix]
-    assert torch.autograd.gradcheck(computed, [x.requires_grad_() for x in learned])
 
 
 @pytest.mark.parametrize("scale", [1, 2, 3, 4])
