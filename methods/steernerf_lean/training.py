@@ -202,10 +202,8 @@ def pretrain_renderer(
     """
     model, joint = stage2.model, replace(stage2.joint, field="frozen")
     if model.channels != 3:
-        raise SteerbenchError(
-            f"a renderer for many scenes reads colours alone: expected channels (K) of 3, got "
-            f"{model.channels}"
-        )
+        wanted = "a renderer for many scenes reads colours alone: expected channels (K) of 3"
+        raise SteerbenchError(f"{wanted}, got {model.channels}")
     with explained(output.parent):
         output.parent.mkdir(parents=True, exist_ok=True)
     renderer, generator = stage2.make(setup), torch.Generator().manual_seed(setup.seed)

@@ -96,16 +96,10 @@ def test_distilled_views_are_found_again_without_rendering(
         views_of(trained, ball_scene, tmp_path / "elsewhere")
     left = (tmp_path / "elsewhere" / "stages").glob("*/*")
     assert [path.name for path in left] == ["lock"]
-
-
-def test_the_seed_alone_decides_which_views_are_distilled(
-    trained: TrainedField, ball_scene: Scene, tmp_path: Path
-) -> None:
-    first, again, other = (
-        views_of(trained, ball_scene, tmp_path / name, seed)
-        for name, seed in (("first", 0), ("again", 0), ("other", 1))
-    )
-    assert same(first, again)
+    # The seed alone decides which they are.
+    monkeypatch.undo()
+    assert same(views_of(trained, ball_scene, tmp_path / "again"), first)
+    other = views_of(trained, ball_scene, tmp_path, seed=1)
     pairs = zip(first.cameras, other.cameras, strict=True)
     assert not any(torch.equal(a.c2w, b.c2w) for a, b in pairs)
 
