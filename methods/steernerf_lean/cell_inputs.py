@@ -95,9 +95,8 @@ def _inputs(o: LeanObservation, layout: Layout) -> CellInputs:
     if layout.history and o.history is None:
         parts |= {"history": torch.zeros_like(base), "valid": torch.zeros_like(base[..., :1])}
     elif layout.history and o.history is not None:
-        valid = o.history.valid[..., None]
-        recent = (o.history.values - o.background[:3] - base) * valid
-        parts |= {"history": recent, "valid": valid}
+        values, valid = o.history[0], o.history[1][..., None]
+        parts |= {"history": (values - o.background[:3] - base) * valid, "valid": valid}
     less = o.surface.values - functional.pad(o.background, (0, 1))
     rows, index = functional.pad(less, (0, 0, 1, 0)), o.surface.index  # -1 shows a row of 0
     seen = rows.index_select(0, index.flatten() + 1).view(*index.shape, rows.shape[1])

@@ -9,7 +9,7 @@ from pathlib import Path
 from bench.study import Variant, turned
 from bench.types import Budget, Log, Scene
 from methods.steernerf.method import SKIPS, STUDY, SteerNerf, not_skipped
-from methods.steernerf_lean.training import LeanStage2, pretrain_renderer
+from methods.steernerf_lean.training import LeanStage2
 
 HOW = "method.rendering"
 ALL_SKIPS = {**SKIPS, "background cells": f"{HOW}.skip.background"}
@@ -68,4 +68,4 @@ class SteerNerfLean(SteerNerf):
         self, scenes: Sequence[Scene], budget: Budget, output: Path, log: Log
     ) -> None:
         """Train a 2D renderer on many scenes, as a start for others."""
-        pretrain_renderer(self.setup, self.stage2, scenes, budget, output, log)
+        self.stage2.pretrain(self.setup, scenes, budget, output, log)

@@ -1,5 +1,5 @@
-"""What the lean 2D renderer is shown: the preceding picture, warped into the present view, and the
-field evaluated once per pixel, at the surface that the low-resolution depth gives."""
+"""What the lean 2D renderer is shown: the preceding picture, and the field evaluated once a pixel, at
+the surface that the low-resolution depth gives."""
 
 from __future__ import annotations
 
@@ -19,18 +19,9 @@ from methods.steernerf.buffer import Cloud
 from methods.steernerf.pipeline import View
 from methods.steernerf.unet import Points
 from methods.steernerf_lean.cells import centres
-from methods.steernerf_lean.kernels.warp import warp
 
 OVERLAP_POINTS = 256  # at most, evenly spaced, to estimate how much of a frame another view shares
 LAYER = 4 * STEP  # thickness, in scene units, of the layer that a sample of the surface stands for
-
-
-@dataclass(frozen=True)
-class Detail:
-    """The pixels of N cells."""
-
-    values: Tensor  # [N, s^2, C]
-    valid: Tensor  # [N, s^2] where they are known
 
 
 @dataclass(frozen=True)
@@ -41,7 +32,8 @@ class LeanObservation:
     background: Tensor  # [K] that they are composited on
     cells: Tensor  # [N] int64, the cells to draw
     surface: Points  # of `surface_points`; the index of every pixel of `cells` [N, s^2]
-    history: Detail | None  # the preceding picture in `cells`; None after a cold start and at L = 0
+    history: tuple[Tensor, Tensor] | None  # the preceding picture, warped into `cells` [N, s^2, 3],
+    # and where it is known [N, s^2]; None after a cold start and at L = 0
     backend: str  # of the kernels that the renderer calls
 
 
@@ -49,13 +41,8 @@ class LeanObservation:
 class Kept(Cloud):
     """A preceding frame with the `picture` [H, W, 3] that the camera `full` saw."""
 
-    full: Camera
     picture: Tensor
-
-    def warped(self, depth: Tensor, cells: Tensor, view: View, backend: str) -> Detail:
-        """Warp the picture into `cells` of `view`, whose depth is `depth` [N, s^2]."""
-        seen_by = self.picture, self.full
-        return Detail(*warp(*seen_by, depth, cells, view.full, view.scale, backend=backend))
+    full: Camera
 
 
 def overlap(cloud: Cloud, camera: Camera) -> Tensor:

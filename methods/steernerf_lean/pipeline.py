@@ -20,7 +20,7 @@ from methods.steernerf.buffer import Buffer, Cloud
 from methods.steernerf.pipeline import Pipeline, View
 from methods.steernerf.unet import Points
 from methods.steernerf_lean.cells import cells_near, centres, put_pixels
-from methods.steernerf_lean.kernels.warp import enlarge
+from methods.steernerf_lean.kernels.warp import enlarge, warp
 from methods.steernerf_lean.observation import Kept, LeanObservation, overlap, surface_points
 from methods.steernerf_lean.options import LeanRendering
 
@@ -76,7 +76,8 @@ class LeanPipeline(Pipeline):
             surface = surface_points(self.field, depth, cells, view, probe)
         history = None
         if preceding and isinstance(kept := preceding[0], Kept):
-            history = kept.warped(depth, cells, view, self.backend)
+            into = depth, cells, view.full, view.scale
+            history = warp(kept.picture, kept.full, *into, backend=self.backend)
         return LeanObservation(frame, self.background, cells, surface, history, self.backend)
 
     def near(self, frame: FeatureFrame, rendering: LeanRendering) -> Tensor:

@@ -14,7 +14,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from bench.errors import explained
-from bench.sources import digest
 from bench.types import Budget, Log, NullProbe, Rays, Scene, Split, SteerbenchError
 from methods.instant_ngp.stage1 import Setup, train_field
 from methods.rendering.batch import render_batch
@@ -158,13 +157,6 @@ class LeanTraining(JointTraining):
         self.renderer.load_state_dict(checkpoint.part(tensors, "learning."))
 
 
-class LeanStage2(Stage2):
-    """What is trained in stage 2 of the lean SteerNeRF, and how."""
-
-    joint: LeanJointOptions
-    pipeline, patches, training = LeanPipeline, LeanPatches, LeanTraining
-
-
 class AnyOf(Patches):
     """Draws each batch of patches from one of `sources`, which their `generator` chooses."""
 
@@ -187,39 +179,39 @@ class AnyOf(Patches):
             source.restore(checkpoint.part(tensors, f"{number}."))
 
 
-def pretrain_renderer(
-    setup: Setup,
-    stage2: LeanStage2,
-    scenes: Sequence[Scene],
-    budget: Budget,
-    output: Path,
-    log: Log,
-) -> None:
-    """Fit a field to each of `scenes`, train one renderer on all of them, write it to `output`.
+class LeanStage2(Stage2):
+    """What is trained in stage 2 of the lean SteerNeRF, and how."""
 
-    The fields are frozen: what a renderer learns must hold for fields it has never seen. Raises
-    SteerbenchError unless K is 3: further features mean something different in every scene.
-    """
-    model, joint = stage2.model, replace(stage2.joint, field="frozen")
-    if model.channels != 3:
-        wanted = "a renderer for many scenes reads colours alone: expected channels (K) of 3"
-        raise SteerbenchError(f"{wanted}, got {model.channels}")
-    with explained(output.parent):
-        output.parent.mkdir(parents=True, exist_ok=True)
-    renderer, generator = stage2.make(setup), torch.Generator().manual_seed(setup.seed)
-    sources = []
-    for number, scene in enumerate(scenes, 1):
-        log.info(f"scene {number} of {len(scenes)}: {scene.name}")
-        trained = train_field(setup, scene, budget, log)
-        pipeline = stage2.pipeline(trained, scene.background, renderer, model)
-        sources.append(stage2.patches(pipeline, scene, Split([], [], []), joint, generator))
-    training = stage2.training(renderer, AnyOf(sources), budget.renderer_steps, None)
-    for source in sources:
-        source.pipeline.renderer = training.outcome
-    fields = [setup.key(scene, budget) for scene in scenes]
-    key = {"fields": fields, "code": digest(pretrain_renderer), **stage2.key(budget)}
-    finished = log.stage_dir("pretrained", key) / "renderer.safetensors"
-    loop.train(training, finished, "training a renderer for many scenes", log)
-    halves = {name: x.half() for name, x in training.outcome.network.state_dict().items()}
-    checkpoint.write(output, halves, {"scenes": len(scenes), "steps": training.steps})
-    log.info(f"written: {output}")
+    joint: LeanJointOptions
+    pipeline, patches, training = LeanPipeline, LeanPatches, LeanTraining
+
+    def pretrain(
+        self, setup: Setup, scenes: Sequence[Scene], budget: Budget, output: Path, log: Log
+    ) -> None:
+        """Fit a field to each of `scenes`, train one renderer on all of them, write it to `output`.
+
+        The fields are frozen: what a renderer learns must hold for fields it has never seen. Raises
+        SteerbenchError unless K is 3: further features mean something different in every scene.
+        """
+        joint, channels = replace(self.joint, field="frozen"), self.model.channels
+        if channels != 3:
+            wanted = "a renderer for many scenes reads colours alone: expected channels (K) of 3"
+            raise SteerbenchError(f"{wanted}, got {channels}")
+        with explained(output.parent):
+            output.parent.mkdir(parents=True, exist_ok=True)
+        renderer, generator = self.make(setup), torch.Generator().manual_seed(setup.seed)
+        sources = []
+        for number, scene in enumerate(scenes, 1):
+            log.info(f"scene {number} of {len(scenes)}: {scene.name}")
+            trained = train_field(setup, scene, budget, log)
+            pipeline = self.pipeline(trained, scene.background, renderer, self.model)
+            sources.append(self.patches(pipeline, scene, Split([], [], []), joint, generator))
+        training = self.training(renderer, AnyOf(sources), budget.renderer_steps, None)
+        for source in sources:
+            source.pipeline.renderer = training.outcome
+        key = {"fields": [setup.key(scene, budget) for scene in scenes], **self.key(budget)}
+        finished = log.stage_dir("pretrained", key) / "renderer.safetensors"
+        loop.train(training, finished, "training a renderer for many scenes", log)
+        halves = {name: x.half() for name, x in training.outcome.network.state_dict().items()}
+        checkpoint.write(output, halves, {"scenes": len(scenes), "steps": training.steps})
+        log.info(f"written: {output}")

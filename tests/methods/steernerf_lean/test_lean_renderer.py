@@ -22,7 +22,7 @@ from methods.steernerf_lean.lean_renderer import (
     PRETRAINED_LAYOUT,
     LeanRenderer,
 )
-from methods.steernerf_lean.observation import Detail, LeanObservation
+from methods.steernerf_lean.observation import LeanObservation
 from tests.methods.observations import (
     FLOAT32_ERROR,
     ROUNDING,
@@ -131,7 +131,7 @@ def test_cells_are_drawn_as_by_a_dense_network(
 def test_a_picture_and_a_surface_that_are_missing_show_nothing() -> None:
     renderer, warm = shaken(new_renderer()), observe()
     assert warm.history is not None
-    unknown = Detail(warm.history.values, torch.zeros_like(warm.history.valid))
+    unknown = warm.history[0], torch.zeros_like(warm.history[1])
     cold = renderer([replace(warm, history=None)]).pictures
     assert torch.equal(renderer([replace(warm, history=unknown)]).pictures, cold)
     assert (renderer([warm]).pictures - cold).abs().max() > 1e-3

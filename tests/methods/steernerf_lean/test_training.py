@@ -27,7 +27,6 @@ from methods.steernerf_lean.training import (
     LeanPatches,
     LeanStage2,
     LeanTraining,
-    pretrain_renderer,
 )
 from methods.training import checkpoint
 from tests.methods.models import (
@@ -165,7 +164,7 @@ def train(scenes: list[Scene], output: Path, log: Log, channels: int = 3) -> dic
     model = lean_model(channels=channels, step=4.0)
     joint = lean_joint(patch=4, motion=small_motion(pool=2, length=2))
     stage2 = LeanStage2(model, partial(RENDERER, init="scratch"), joint)
-    pretrain_renderer(TEACHER, stage2, scenes, BUDGET, output, log)
+    stage2.pretrain(TEACHER, scenes, BUDGET, output, log)
     return load_file(output)
 
 
