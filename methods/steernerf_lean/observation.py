@@ -1,5 +1,5 @@
-"""What the lean 2D renderer is shown: the preceding picture, and the field evaluated once a pixel, at
-the surface that the low-resolution depth gives."""
+"""What the lean 2D renderer is shown: the preceding picture, and the field evaluated once a pixel,
+at the surface that the low-resolution depth gives."""
 
 from __future__ import annotations
 
