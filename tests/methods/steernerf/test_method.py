@@ -150,6 +150,8 @@ def test_a_training_depends_on_its_model_and_on_nothing_that_is_chosen_afterward
     usual, skip = new_method(), Skips(empty=False, hidden=True)
     other = new_method(step=1.5, stop=1e-1, range=RANGED, skip=skip)
     assert key_of(other) == key_of(usual)
+    everywhere = small_rendering(step=4.0)
+    assert other.stage2.joint.rendering(other.stage2.model) == everywhere
     model = replace(usual.stage2.model, feature_background=1.0)
     assert key_of(usual, model=model) != key_of(usual)
 
@@ -178,14 +180,6 @@ def test_the_weights_after_a_share_of_the_steps_are_of_the_same_training(
     same = all(torch.equal(one[name], other[name]) for name in one)
     assert same == (after == 1)
     assert (part.train_s < whole.train_s) == (after < 1)
-
-
-def test_training_renders_everywhere_whatever_is_chosen_afterwards() -> None:
-    stage2 = new_method(step=1.0, stop=0.5, range=RANGED).stage2
-    rendering = stage2.joint.rendering(stage2.model)
-    assert (rendering.step, rendering.stop) == (4.0, small_model().stop)
-    assert rendering.range.mode == "off"
-    assert rendering.skip == Skips(empty=True, hidden=True)
 
 
 def test_settings_that_do_not_fit_are_refused() -> None:

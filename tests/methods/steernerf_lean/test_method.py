@@ -53,16 +53,10 @@ def test_a_training_depends_on_its_options_and_on_nothing_that_is_chosen_afterwa
     usual, skip = new_method().stage2, LeanSkips(empty=True, hidden=True, background=False)
     other = new_method(overlap=0.5, refined=0.25, refined_step=2.0, skip=skip).stage2
     assert other.key(BUDGET) == usual.key(BUDGET)
+    as_trained = lean_rendering(step=4.0, refined=0.2, refined_step=2.0)
+    assert other.joint.rendering(other.model) == as_trained
     joint = replace(usual.joint, average=0.5)
     assert replace(usual, joint=joint).key(BUDGET) != usual.key(BUDGET)
-
-
-def test_training_renders_everywhere_and_refines_as_its_options_say() -> None:
-    stage2 = new_method(refined=0.9, overlap=0.9).stage2
-    rendering = stage2.joint.rendering(stage2.model)
-    assert (rendering.step, rendering.refined, rendering.refined_step) == (4.0, 0.2, 2.0)
-    assert (rendering.range.mode, rendering.overlap) == ("off", 0.0)
-    assert rendering.skip == LeanSkips(empty=True, hidden=True, background=True)
 
 
 def test_of_a_frame_for_the_engine_only_its_own_inputs_are_recorded(
