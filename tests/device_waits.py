@@ -23,7 +23,7 @@ from bench.probes import Line, device_waits
 from bench.types import NullProbe, Scene, Split
 from methods.instant_ngp.training import FieldTraining
 from methods.steernerf.pipeline import Pipeline
-from methods.steernerf.training.joint import JointTraining
+from methods.steernerf.stage2 import JointTraining
 from methods.steernerf_lean.pipeline import LeanPipeline
 from tests.methods.conftest import ball, look_at_the_middle
 from tests.methods.test_on_a_gpu import BUDGET, METHODS

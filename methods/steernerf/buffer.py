@@ -18,16 +18,13 @@ from bench.types import Camera
 from methods.rendering.frame import FeatureFrame
 from methods.steernerf.kernels.splat import splat
 
-CLEAR_ALPHA = 0.1
-"""The expected depth of a pixel is reliable if its opacity is more than this."""
+CLEAR_ALPHA = 0.1  # the expected depth of a pixel is reliable if its opacity is more than this
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """The pixels of a low-resolution frame, as points in the scene.
-
-    Their depth is the sum of w t: too near where alpha < 1, and at the camera where it is 0.
-    """
+    """The pixels of a low-resolution frame, as points in the scene. Their depth is the sum of w t:
+    too near where alpha < 1, and at the camera where it is 0."""
 
     camera: Camera  # of the frame
     points: Tensor  # [N, 3] positions in scene units, row by row
@@ -44,22 +41,19 @@ class Cloud:
         points = unproject(camera, corners, depth)  # Eq. 6
         return cls(camera, points, frame.values.flatten(0, 1), alpha)
 
-    def expected(self) -> Cloud:
-        """The same with depths sum w t / sum w; no view sees points that are not clear."""
-        alpha, centre = torch.where(self.clear, self.alpha, torch.nan), self.camera.c2w[:, 3]
-        return replace(self, points=centre + (self.points - centre) / alpha[:, None])
-
     @property
     def clear(self) -> Tensor:
         """[N] bool, which points have a reliable expected depth."""
         return self.alpha > CLEAR_ALPHA
 
-    def splat(self, camera: Camera, backend: str) -> tuple[Tensor, Tensor]:
-        """Find the point that each pixel of `camera` shows.
+    def expected(self) -> Cloud:
+        """The same with depths sum w t / sum w; no view sees points that are not clear."""
+        alpha, centre = torch.where(self.clear, self.alpha, torch.nan), self.camera.c2w[:, 3]
+        return replace(self, points=centre + (self.points - centre) / alpha[:, None])
 
-        Returns:
-            [H, W] int32 index of the point, -1 for none; and [N] z-depth of the points.
-        """
+    def splat(self, camera: Camera, backend: str) -> tuple[Tensor, Tensor]:
+        """The point that each pixel of `camera` shows, as [H, W] int32 indices, -1 for none; and
+        the z-depth [N] of all points."""
         pixels, depth = project(camera, self.points)  # Eq. 7 at low resolution, Eq. 9 at full
         size = camera.width, camera.height
         return splat(pixels + 0.5, depth, *size, backend=backend), depth  # Eq. 8, Eq. 10

@@ -1,16 +1,15 @@
-"""Settings that stage 2 trains for (`Model`), and settings chosen afterwards (`Rendering`)."""
+"""The settings of SteerNeRF: what is trained, how, and what is chosen afterwards."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
 from methods.kernels.composite import check_stop
+from methods.kernels.types import expect
 from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import Sampling, check_step
-
-SIZES = {"channels": (3, 256), "frames": (0, 64), "scale": (1, 64)}
-"""Minimum and maximum of K, L and s."""
 
 
 @dataclass(frozen=True)
@@ -25,34 +24,26 @@ class Model:
     feature_background: float  # what features beyond RGB are composited on
 
     def __post_init__(self) -> None:
-        for name, (least, most) in SIZES.items():
-            check_size(name, getattr(self, name), least, most)
+        expect(3 <= self.channels <= 256, "channels", "3 to 256", self.channels)
+        expect(0 <= self.frames <= 64, "frames", "0 to 64", self.frames)
+        expect(1 <= self.scale <= 64, "scale", "1 to 64", self.scale)
         check_step("step", self.step)
         check_stop(self.stop)
 
 
 @dataclass(frozen=True)
 class RangeReduction:
-    """Where along a ray to sample, given the depth D of the newest preceding frame (Section 3.2).
+    """Where along a ray to sample, by the depth D of the newest preceding frame (Section 3.2)."""
 
-    Attributes:
-        mode: "off": everywhere. "paper": within `epsilon` of the depth reprojected onto the pixel.
-        epsilon: margin on either side of the depth, scene units along z.
-        depth: which D is reprojected: "sum", the sum of w t as the release renders it, or
-            "expected", the same divided by the opacity. The two differ at silhouettes.
-    """
-
-    mode: Literal["off", "paper"]
-    epsilon: float
-    depth: Literal["sum", "expected"]
+    mode: Literal["off", "paper"]  # off: everywhere; paper: near the D reprojected onto the pixel
+    epsilon: float  # how near, in scene units along z
+    depth: Literal["sum", "expected"]  # D: sum w t, as in the release, or that / the opacity
 
     def __post_init__(self) -> None:
-        if not self.epsilon > 0:
-            raise ValueError(f"range.epsilon: expected more than 0, got {self.epsilon}")
+        expect(self.epsilon > 0, "range.epsilon", "more than 0", self.epsilon)
 
 
-EVERYWHERE = RangeReduction("off", epsilon=1.0, depth="sum")
-"""No range reduction; `epsilon` and `depth` say nothing."""
+EVERYWHERE = RangeReduction("off", epsilon=1.0, depth="sum")  # the last two say nothing
 
 
 @dataclass(frozen=True)
@@ -82,7 +73,68 @@ class Rendering:
         return Sampling(step=self.step * STEP, stop=self.stop if self.skip.hidden else 0.0)
 
 
-def check_size(name: str, got: int, least: int, most: int) -> None:
-    """Raise ValueError unless `got` lies between `least` and `most`."""
-    if not least <= got <= most:
-        raise ValueError(f"{name}: expected {least} to {most}, got {got}")
+@dataclass(frozen=True)
+class MotionOptions:
+    """The synthetic motions before a training view."""
+
+    degrees: tuple[float, float]  # range of the angular speed, in degrees per frame
+    length: int  # maximum number of frames that precede a view
+    least: int  # minimum number; fewer than L, and sometimes none, teach the cold start
+    pool: int  # examples kept at a time
+    uses: int  # patches cut from an example before it is replaced
+    longer: float  # probability that it is continued instead, there and back to its view
+
+    def __post_init__(self) -> None:
+        least, degrees = self.least, self.degrees
+        expect(0 <= degrees[0] <= degrees[1], "joint.motion.degrees", "a range from 0 on", degrees)
+        expect(0 <= least <= self.length, "joint.motion.least", "0 to joint.motion.length", least)
+        expect(self.pool >= 1, "joint.motion.pool", "1 or more", self.pool)
+        expect(self.uses >= 1, "joint.motion.uses", "1 or more", self.uses)
+        expect(0 <= self.longer < 1, "joint.motion.longer", "a share of less than 1", self.longer)
+
+
+@dataclass(frozen=True)
+class JointOptions:
+    """How stage 2 is trained; rates fall or wave along `methods.training.loop.cosine`."""
+
+    field: Literal["joint", "frozen"]  # frozen: as stage 1 left it (the paper's Table 5)
+    features: Literal["random", "constant"]  # initial features beyond RGB; constant: 1/2
+    rate: float  # initial learning rate of the 2D renderer
+    field_rate: float  # initial learning rate of the field
+    final_rate: float  # final learning rate of both
+    half_waves: int  # half waves of their schedule, an odd number
+    patch: int  # maximum side of a patch, in low-resolution pixels
+    patch_share: float  # the same as a share of the shorter side of the low-resolution frame
+    batch: int  # patches per step
+    jitter: bool  # whether the samples of each ray have a random phase
+    opacity_entropy: float  # weight of -o ln o of the rays' opacity o
+    grid_samples: int  # cells visited per update of the density grid; 0: it stays as it was
+    distilled_views: int  # maximum number of pictures of the stage 1 field to learn from as well
+    distilled_share: float  # share of the patches that come from these pictures
+    motion: MotionOptions  # the motion that precedes a training view
+
+    def __post_init__(self) -> None:
+        expect(self.rate > 0, "joint.rate", "more than 0", self.rate)
+        expect(self.field_rate > 0, "joint.field_rate", "more than 0", self.field_rate)
+        expect(self.final_rate > 0, "joint.final_rate", "more than 0", self.final_rate)
+        waves, visits, entropy = self.half_waves, self.grid_samples, self.opacity_entropy
+        expect(waves > 0 and waves % 2 == 1, "joint.half_waves", "an odd number", waves)
+        expect(self.patch >= 1, "joint.patch", "1 or more", self.patch)
+        expect(0 < self.patch_share <= 1, "joint.patch_share", "a share above 0", self.patch_share)
+        expect(self.batch >= 1, "joint.batch", "1 or more", self.batch)
+        expect(entropy >= 0, "joint.opacity_entropy", "0 or more", entropy)
+        expect(visits == 0 or visits >= 2, "joint.grid_samples", "0, or 2 or more", visits)
+        views, share = self.distilled_views, self.distilled_share
+        expect(views >= 0, "joint.distilled_views", "0 or more", views)
+        expect(0 <= share <= 1, "joint.distilled_share", "a share of 0 to 1", share)
+
+    def rendering(self, model: Model) -> Rendering:
+        """How frames are rendered in training: everywhere, which serves all later choices."""
+        return Rendering(model.step, model.stop, EVERYWHERE, Skips(empty=True, hidden=True))
+
+    def distilled(self, steps: int, frames: int) -> int:
+        """How many distilled views a training of `steps` steps can use. With no preceding `frames`
+        (L = 0), examples are never continued."""
+        longer = self.motion.longer if frames else 0.0
+        examples = self.motion.pool + (1 - longer) * steps * self.batch / self.motion.uses
+        return min(self.distilled_views, math.ceil(self.distilled_share * examples))

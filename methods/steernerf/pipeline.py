@@ -1,63 +1,63 @@
-"""One frame of SteerNeRF, from top to bottom, following Section 3 of the paper.
-
-| stage                | what it does                                            | equations |
-|----------------------|---------------------------------------------------------|-----------|
-| depth_reprojection   | a reprojected depth prior limits where rays are sampled | 7, 8      |
-| field                | features F and depth D at h x w = H/s x W/s             | 2 to 5    |
-| feature_reprojection | preceding features at H x W                             | 9, 10     |
-| renderer2d           | the 2D neural renderer draws the picture                | 11        |
-| finish               | F and D are stored as points, for later frames          | 6         |
-"""
+"""One frame of SteerNeRF, from top to bottom, following Section 3 of the paper."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench.cameras import place_camera
+from bench.cameras import crop_camera, place_camera, scale_camera
 from bench.types import Camera, Frame, NullProbe, Probe
+from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.types import Occupancy
-from methods.rendering.field import Field
 from methods.rendering.frame import FeatureFrame, everywhere, render_frame
 from methods.steernerf.buffer import Buffer, Cloud
 from methods.steernerf.options import Model, Rendering
-from methods.steernerf.renderer import Observation, Points, Renderer2d
-from methods.steernerf.view import View
+from methods.steernerf.unet import Observation, Points, Renderer2d
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera as the pipeline sees it: at both resolutions."""
+
+    full: Camera  # its picture padded to multiples of s; its intrinsics are K_h of Eq. 9
+    low: Camera  # the same view at 1/s of the resolution; K_l of Eq. 7
+    scale: int  # s
+
+    def crop(self, left: int, top: int, side: int) -> View:
+        """Crop to a square of `side` low-resolution pixels, the first at `left`, `top`."""
+        s = self.scale
+        full = crop_camera(self.full, left * s, top * s, side * s, side * s)
+        return View(full, crop_camera(self.low, left, top, side, side), s)
 
 
 class Pipeline:
-    """A `field` and a 2D `renderer` that together render frames, one after the other.
-
-    `occupancy` says where the field may hold matter, `background` [3] is that of the scene, `model`
-    is what both are trained for.
-
-    A subclass may override which preceding frames are used (`select`), what the 2D renderer is
-    shown (`observe`), what becomes of its output (`draw`), and what is kept for later frames
-    (`keep`, an object of the class `kept`, and `remember`).
-    """
+    """A `trained` field and a 2D `renderer`, both for `model`, that together render frames, one
+    after the other, on `background` [3]. A subclass may override each step of a frame: which
+    preceding frames are used (`select`), what the 2D renderer is shown (`observe`) and draws
+    (`draw`), and what later frames need of this one (`keep`, an object of the class `kept`)."""
 
     kept: type[Cloud] = Cloud
 
     def __init__(
-        self,
-        field: Field,
-        occupancy: Occupancy,
-        background: Tensor,
-        renderer: Renderer2d,
-        model: Model,
+        self, trained: TrainedField, background: Tensor, renderer: Renderer2d, model: Model
     ) -> None:
-        self.field, self.occupancy, self.renderer = field, occupancy, renderer
-        self.model, self.backend = model, field.backend
+        self.field, self.occupancy, self.renderer = trained.field, trained.occupancy, renderer
+        self.model, self.backend = model, trained.field.backend
         more = (0, model.channels - 3)
+        background = background.to(trained.field.device)
         self.background = functional.pad(background, more, value=model.feature_background)  # [K]
 
     def view(self, camera: Camera) -> View:
-        """The view of `camera`, on the device of the field."""
-        return View.of(place_camera(camera, self.background.device), self.model.scale)
+        """The view of `camera`, on the device of the field; low resolution is rounded up."""
+        s, camera = self.model.scale, place_camera(camera, self.background.device)
+        width, height = -(-camera.width // s), -(-camera.height // s)
+        full = replace(camera, width=width * s, height=height * s)
+        return View(full, scale_camera(full, width, height), s)
 
     @torch.no_grad()
     def render(self, camera: Camera, buffer: Buffer, rendering: Any, probe: Probe) -> Frame:
@@ -70,7 +70,11 @@ class Pipeline:
         picture = self.draw(shown, view, rendering, probe)  # I
         with probe.stage("finish"):
             buffer.appendleft(self.keep(frame, view, picture))
-            return _finished(camera, picture, frame, self.model.scale)
+            size = slice(0, camera.height), slice(0, camera.width)
+            # Depth and opacity are those of the nearest low-resolution pixel.
+            low = torch.stack((frame.depth, frame.alpha))
+            depth, alpha = low.repeat_interleave(view.scale, 2).repeat_interleave(view.scale, 1)
+            return Frame(picture[size], depth[size], alpha[size])
 
     @torch.no_grad()
     def remember(self, camera: Camera, buffer: Buffer, rendering: Any) -> None:
@@ -90,7 +94,7 @@ class Pipeline:
         self, view: View, preceding: Sequence[Cloud], rendering: Rendering, probe: Probe
     ) -> FeatureFrame:
         """Render features F and depth D at low resolution (Eq. 2 to 5). With range reduction, rays
-        are sampled only near the depth of the newest of the `preceding` frames."""
+        are sampled only near the depth of the newest of the `preceding` frames (Eq. 7, 8)."""
         how, reduction = rendering.sampling, rendering.range
         if preceding and reduction.mode == "paper":
             with probe.stage("depth_reprojection"):
@@ -103,9 +107,9 @@ class Pipeline:
             render = everywhere(self.field, where, probe, how)
             return render_frame(view.low, where, self.background, probe, render)
 
-    def reproject(self, cloud: Cloud, view: View) -> Points:
-        """Reproject the features of a preceding frame into the present view (Eq. 9, 10)."""
-        return Points(cloud.values, cloud.splat(view.full, self.backend)[0])
+    def reproject(self, preceding: Sequence[Cloud], view: View) -> Sequence[Points]:
+        """The features of the `preceding` frames that the present view shows (Eq. 9, 10)."""
+        return [Points(old.values, old.splat(view.full, self.backend)[0]) for old in preceding]
 
     def observe(
         self,
@@ -116,8 +120,7 @@ class Pipeline:
         probe: Probe,
     ) -> Any:
         """What the 2D renderer is shown: the present `frame` and the `preceding` features."""
-        points = [self.reproject(cloud, view) for cloud in preceding]  # Eq. 9, 10
-        return Observation(frame, points, self.backend)
+        return Observation(frame, self.reproject(preceding, view), self.backend)
 
     def draw(self, shown: Any, view: View, rendering: Any, probe: Probe) -> Tensor:
         """The picture I [H, W, 3] of what the 2D renderer is `shown` (Eq. 11)."""
@@ -125,20 +128,10 @@ class Pipeline:
             return self.renderer([shown], probe)[0].clamp_(0, 1)
 
     def keep(self, frame: FeatureFrame, view: View, picture: Tensor) -> Cloud:
-        """What later frames need of this one."""
+        """What later frames need of this one: its features and depths as points (Eq. 6)."""
         return Cloud.of(frame)
 
     def occupied(self, rendering: Rendering) -> Occupancy:
         """Where rays take samples."""
         cells = self.occupancy.cells
         return self.occupancy if rendering.skip.empty else Occupancy(torch.ones_like(cells))
-
-
-def _finished(camera: Camera, picture: Tensor, frame: FeatureFrame, scale: int) -> Frame:
-    """The frame for the harness, with depth and opacity of the nearest low-resolution pixel."""
-    size = slice(0, camera.height), slice(0, camera.width)
-    depth, alpha = (
-        image.repeat_interleave(scale, 1).repeat_interleave(scale, 0)[size]
-        for image in (frame.depth, frame.alpha)
-    )
-    return Frame(picture[size], depth, alpha)

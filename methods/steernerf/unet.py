@@ -1,18 +1,52 @@
-"""The 2D renderer of SteerNeRF's released code, a U-Net at full resolution."""
+"""What a 2D renderer is shown and how it draws, and that of the released code (Section 3.3)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.types import Probe
+from bench.types import NullProbe, Probe
 from methods.engines.network import Network
+from methods.kernels.types import expect
+from methods.rendering.frame import FeatureFrame
 from methods.steernerf.kernels.splat import gather
-from methods.steernerf.options import check_size
-from methods.steernerf.renderer import UNWATCHED, Observation, Renderer2d
+
+UNWATCHED = NullProbe()
+
+
+@dataclass(frozen=True)
+class Points:
+    """Features of points, and the point that each pixel shows."""
+
+    values: Tensor  # [P, C]
+    index: Tensor  # [...] int32, a row of `values`, -1 for none
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the 2D renderer is shown."""
+
+    frame: FeatureFrame  # the present features F, [h, w, K]
+    preceding: Sequence[Points]  # of preceding frames, newest first, indices [H, W]; at most L
+    backend: str  # of the kernels that a renderer calls
+
+
+class Renderer2d(nn.Module):
+    """Turns observations into pictures [B, H, W, 3] with a `network`, which an `engine` computes if
+    set (Eq. 11). A subclass has a method `forward(observations, probe)`, as that of `UNet`."""
+
+    network: Network
+    engine: Callable[..., tuple[Tensor, ...]] | None = None
+
+    def run(self, probe: Probe, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Compute the network's output."""
+        probe.count("products", self.network.products(*inputs))
+        with probe.stage("network"):
+            return (self.engine or self.network)(*inputs)
 
 
 class UNet(Renderer2d):
@@ -20,19 +54,16 @@ class UNet(Renderer2d):
 
     Its inputs are the features of all frames: those of the present frame at every s-th pixel, those
     of the preceding frames at the pixels where their points land, zero elsewhere. Its output is
-    added to the bilinearly enlarged RGB of the present frame. It has 2,115,587 parameters at L = 2,
-    K = 6 and width 64, and gives the outputs of the release (tests/data/steernerf_release.npz).
-
-    `channels`, `frames` and `scale` are K, L and s; `width` is the number of channels at full
-    resolution. Enlarging the base keeps every pixel in its place if `aligned`; the release uses
-    align_corners=True, which moves all pixels but the middle one.
+    added to the bilinearly enlarged RGB of the present frame, which keeps every pixel in its place
+    if `aligned`; the release uses align_corners=True, which moves all pixels but the middle one.
+    `channels`, `frames`, `scale` are K, L, s; `width` is the number of channels at full size.
     """
 
     def __init__(
         self, channels: int, frames: int, scale: int, *, width: int, aligned: bool
     ) -> None:
         super().__init__()
-        check_size("renderer.width", width, 1, 4096)
+        expect(1 <= width <= 4096, "renderer.width", "1 to 4096", width)
         self.channels, self.frames, self.scale, self.aligned = channels, frames, scale, aligned
         self.network = _Network(channels * (frames + 1), width)
 
@@ -40,25 +71,18 @@ class UNet(Renderer2d):
         """Draw all observations: pictures [B, H, W, 3]."""
         inputs = torch.stack([self._inputs(o) for o in observations])
         (correction,) = self.run(probe, inputs)  # Eq. 11
-        return self.base(observations) + correction.to(inputs).permute(0, 2, 3, 1)
-
-    def base(self, observations: Sequence[Observation]) -> Tensor:
-        """The pictures [B, H, W, 3] that the network corrects: the present RGB, enlarged."""
         rgb = torch.stack([o.frame.values[..., :3] for o in observations]).permute(0, 3, 1, 2)
-        enlarged = functional.interpolate(
-            rgb, scale_factor=self.scale, mode="bilinear", align_corners=not self.aligned
-        )
-        return enlarged.permute(0, 2, 3, 1)
+        base = functional.interpolate(rgb, None, self.scale, "bilinear", not self.aligned)
+        return base.permute(0, 2, 3, 1) + correction.to(inputs).permute(0, 2, 3, 1)
 
     def _inputs(self, observation: Observation) -> Tensor:
-        """[K (L + 1), H, W]: the RGB of all frames, then their other features."""
-        values = observation.frame.values
-        height, width = values.shape[0] * self.scale, values.shape[1] * self.scale
-        present = values.new_zeros(height, width, self.channels)
-        present[:: self.scale, :: self.scale] = values
-        frames = [present] + [
-            gather(p.values, p.index, backend=observation.backend) for p in observation.preceding
-        ]
+        """[K (L + 1), H, W]: the RGB of all frames, then their other features; zeros for preceding
+        frames that are missing after a cold start."""
+        values, s, backend = observation.frame.values, self.scale, observation.backend
+        present = values.new_zeros(values.shape[0] * s, values.shape[1] * s, self.channels)
+        present[::s, ::s] = values
+        points = observation.preceding
+        frames = [present, *(gather(p.values, p.index, backend=backend) for p in points)]
         frames += [torch.zeros_like(present)] * (self.frames + 1 - len(frames))
         rgb, rest = ([f[..., part] for f in frames] for part in (slice(0, 3), slice(3, None)))
         return torch.cat((*rgb, *rest), dim=-1).permute(2, 0, 1)
@@ -102,15 +126,10 @@ class _Network(Network):
         """Multiplications by weights: every kernel counts once per pixel at its resolution."""
         batch, _, height, width = inputs[0].shape
         pixels = batch * (-(-height // 4) * 4) * (-(-width // 4) * 4)
-        half = (self.at_half, self.merge_half, self.half_again, self.widen_half)
-        quarter = (self.narrow, self.at_quarter, self.widen_quarter)
-
-        def weights(*layers: nn.Module) -> int:
-            return sum(x.numel() for y in layers for x in y.parameters() if x.dim() > 1)
-
-        lower = weights(*half), weights(*quarter)
-        full = weights(self) - sum(lower)
-        return pixels * full + pixels // 4 * lower[0] + pixels // 16 * lower[1]
+        half = dict.fromkeys(("at_half", "merge_half", "half_again", "widen_half"), 4)
+        fewer = {**half, "narrow": 16, "at_quarter": 16, "widen_quarter": 16}
+        weights = ((name.split(".")[0], x) for name, x in self.named_parameters() if x.dim() > 1)
+        return sum(pixels // fewer.get(layer, 1) * x.numel() for layer, x in weights)
 
 
 class _Residual(nn.Module):
@@ -135,5 +154,4 @@ def _kaiming(layer: nn.Conv2d, scale: float) -> None:
     nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
     assert layer.bias is not None
     nn.init.zeros_(layer.bias)
-    with torch.no_grad():
-        layer.weight.mul_(scale)
+    layer.weight.data.mul_(scale)

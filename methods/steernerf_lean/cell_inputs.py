@@ -18,17 +18,11 @@ from methods.steernerf_lean.observation import LeanObservation
 
 @dataclass(frozen=True)
 class Layout:
-    """Which inputs a network reads.
+    """Which inputs a network reads."""
 
-    Attributes:
-        channels: K.
-        scale: s.
-        history: whether it reads the preceding picture.
-    """
-
-    channels: int
-    scale: int
-    history: bool
+    channels: int  # K
+    scale: int  # s
+    history: bool  # whether it reads the preceding picture
 
     @property
     def columns(self) -> dict[str, int]:
@@ -53,13 +47,11 @@ class Layout:
 class CellInputs:
     """The inputs of N cells.
 
-    Attributes:
-        base: [N, s^2, 3] present colours, bilinearly enlarged with a repeated border; the network
-            corrects them.
-        parts: by the names of `Layout.columns`: present colour [N, 3], opacity [N, 1] and rest
-            [N, K - 3]; of each pixel, colour [N, s^2, 3] and validity [N, s^2, 1] of the preceding
-            picture, and colour [N, s^2, 3], opacity [N, s^2, 1] and rest [N, s^2, K - 3] of the
-            surface. 0 where nothing is known.
+    `base` [N, s^2, 3] are the present colours, bilinearly enlarged with a repeated border; the
+    network corrects them. `parts` have the names of `Layout.columns`: present colour [N, 3],
+    opacity [N, 1] and rest [N, K - 3]; of each pixel, colour [N, s^2, 3] and validity [N, s^2, 1]
+    of the preceding picture, and colour [N, s^2, 3], opacity [N, s^2, 1] and rest [N, s^2, K - 3]
+    of the surface. 0 where nothing is known.
     """
 
     base: Tensor
@@ -80,12 +72,8 @@ class CellInputs:
 
     def drawn(self, output: Tensor, matrix: Tensor) -> Tensor:
         """Pixels [N, s^2, 3] = base + correction + share * preceding colour + matrix [opacity *
-        colour, opacity, rest of the surface].
-
-        Args:
-            output: [N, 3 s^2] corrections; with history followed by [N, s^2] logits of the shares.
-            matrix: [N, 3 (K + 1)], shared by the pixels of a cell.
-        """
+        colour, opacity, rest of the surface]. `output` are corrections [N, 3 s^2], with history
+        followed by logits of the shares [N, s^2]; `matrix` [N, 3 (K + 1)] is that of a cell."""
         parts, pixels = self.parts, self.base.shape[1]
         drawn = self.base + output[:, : 3 * pixels].view_as(self.base)
         if "history" in parts:
@@ -98,6 +86,7 @@ class CellInputs:
 
 
 def _inputs(o: LeanObservation, layout: Layout) -> CellInputs:
+    """The inputs of the cells of `o`."""
     less = o.frame.values - o.background
     base = _enlarged(less[..., :3], o.cells, layout.scale)
     present = less.flatten(0, 1).index_select(0, o.cells)
@@ -106,18 +95,14 @@ def _inputs(o: LeanObservation, layout: Layout) -> CellInputs:
     if layout.history and o.history is None:
         parts |= {"history": torch.zeros_like(base), "valid": torch.zeros_like(base[..., :1])}
     elif layout.history and o.history is not None:
-        valid = o.history.valid[..., None]
-        recent = (o.history.values - o.background[:3] - base) * valid
-        parts |= {"history": recent, "valid": valid}
-    return CellInputs(base, {**parts, **_surface(o, base)})
-
-
-def _surface(o: LeanObservation, base: Tensor) -> dict[str, Tensor]:
+        values, valid = o.history[0], o.history[1][..., None]
+        parts |= {"history": (values - o.background[:3] - base) * valid, "valid": valid}
     less = o.surface.values - functional.pad(o.background, (0, 1))
     rows, index = functional.pad(less, (0, 0, 1, 0)), o.surface.index  # -1 shows a row of 0
     seen = rows.index_select(0, index.flatten() + 1).view(*index.shape, rows.shape[1])
-    colour = seen[..., :3] - base * (index >= 0)[..., None]
-    return {"surface": colour, "surface opacity": seen[..., -1:], "surface rest": seen[..., 3:-1]}
+    parts["surface"] = seen[..., :3] - base * (index >= 0)[..., None]
+    parts |= {"surface opacity": seen[..., -1:], "surface rest": seen[..., 3:-1]}
+    return CellInputs(base, parts)
 
 
 def _enlarged(colours: Tensor, cells: Tensor, scale: int) -> Tensor:
@@ -134,10 +119,8 @@ def _enlarged(colours: Tensor, cells: Tensor, scale: int) -> Tensor:
 
 
 def _taps(scale: int) -> Tensor:
-    """Weights [27, 3 s^2] of the colours of the 3 x 3 samples in those of the s x s pixels.
-
-    One large product with a third of its weights not 0 is faster than a small one for each cell.
-    """
+    """Weights [27, 3 s^2] of the colours of the 3 x 3 samples in those of the s x s pixels: one
+    large product with a third of its weights not 0 is faster than a small one for each cell."""
     place = (torch.arange(scale) + 0.5) / scale - 0.5
     tent = (1 - (place - torch.tensor((-1.0, 0.0, 1.0))[:, None]).abs()).clamp(min=0)  # [3, s]
     return torch.kron(torch.kron(tent, tent), torch.eye(3))

@@ -1,8 +1,5 @@
-"""Cells: the s x s pixels of a picture that one low-resolution pixel covers.
-
-Only cells near matter are drawn. Cells are given by their row-major indices [N], their pixels as
-[N, s^2, ...], also row by row.
-"""
+"""Cells: the s x s pixels of a picture that one low-resolution pixel covers. Cells have row-major
+indices [N], their pixels are [N, s^2, ...], also row by row."""
 
 from __future__ import annotations
 
@@ -11,8 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-REACH = 1
-"""Distance from matter, in cells, within which cells are drawn; everything farther is empty."""
+REACH = 1  # distance from matter, in cells, within which cells are drawn; what is farther is empty
 
 
 def cells_near(seen: Tensor) -> Tensor:
@@ -57,11 +53,7 @@ def paint(
     cells: Sequence[Tensor], size: torch.Size, scale: int, pixels: Tensor, background: Tensor
 ) -> Tensor:
     """Draw pictures [B, h s, w s, C] of `pixels` [N, s^2, C], which belong to the `cells` of one
-    picture after the other, on `background` [C].
-
-    Args:
-        size: h, w.
-    """
+    picture after the other, on `background` [C]; `size` is h, w."""
     height, width = size
     row = background.repeat(width * scale)  # whole rows: three numbers at a time are slow
     canvas = row.repeat(len(cells) * height * scale, 1).unflatten(1, (width * scale, -1))

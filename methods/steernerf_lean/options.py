@@ -4,19 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from methods.kernels.types import expect
 from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import Sampling, check_step
-from methods.steernerf.options import Model, Rendering, Skips, check_size
-from methods.steernerf.training.options import JointOptions, check_options
-
-
-@dataclass(frozen=True)
-class LeanModel(Model):
-    """A model whose 2D renderer reads the preceding picture, if L = 1; L = 0: it does not."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_size("frames", self.frames, 0, 1)
+from methods.steernerf.options import EVERYWHERE, JointOptions, Model, Rendering, Skips
 
 
 @dataclass(frozen=True)
@@ -31,18 +22,15 @@ class LeanRendering(Rendering):
     """Further settings that are chosen after training."""
 
     skip: LeanSkips
-    overlap: (
-        float  # least share of the preceding frame that the present view sees, or it is dropped
-    )
+    overlap: float  # a preceding frame of which the present view sees less than this is dropped
     refined: float  # share of the cells that the field renders: those with the largest error
     refined_step: float  # ray-marching step in these cells, in diagonals of the cube / 1024
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_step("refined_step", self.refined_step)
-        for name in ("overlap", "refined"):
-            if not 0 <= (share := getattr(self, name)) <= 1:
-                raise ValueError(f"{name}: expected a share of 0 to 1, got {share}")
+        expect(0 <= self.overlap <= 1, "overlap", "a share of 0 to 1", self.overlap)
+        expect(0 <= self.refined <= 1, "refined", "a share of 0 to 1", self.refined)
 
     @property
     def refined_sampling(self) -> Sampling:
@@ -64,12 +52,15 @@ class LeanJointOptions(JointOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_step("joint.refined_step", self.refined_step)
-        check_options(
-            "joint",
-            self,
-            ("more than 0, or null", lambda x: x is None or x > 0, ("clip",)),
-            ("0 or more", lambda x: x >= 0, ("error_weight",)),
-            ("1 or more", lambda x: x >= 1, ("refined_rays",)),
-            ("a share of less than 1", lambda x: 0 <= x < 1, ("average",)),
-            ("a share of 0 to 1", lambda x: 0 <= x <= 1, ("refined",)),
-        )
+        clip, average = self.clip, self.average
+        expect(clip is None or clip > 0, "joint.clip", "more than 0, or null", clip)
+        expect(self.error_weight >= 0, "joint.error_weight", "0 or more", self.error_weight)
+        expect(self.refined_rays >= 1, "joint.refined_rays", "1 or more", self.refined_rays)
+        expect(0 <= average < 1, "joint.average", "a share of less than 1", average)
+        expect(0 <= self.refined <= 1, "joint.refined", "a share of 0 to 1", self.refined)
+
+    def rendering(self, model: Model) -> LeanRendering:
+        """How frames are rendered in training: everywhere, and refined as these options say."""
+        skip = LeanSkips(empty=True, hidden=True, background=True)
+        own = {"overlap": 0.0, "refined": self.refined, "refined_step": self.refined_step}
+        return LeanRendering(model.step, model.stop, EVERYWHERE, skip, **own)

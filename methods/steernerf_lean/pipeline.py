@@ -1,29 +1,37 @@
 """One frame of the lean SteerNeRF: the steps in which it differs from the paper's `Pipeline`.
 
-The 2D renderer is shown the preceding picture (`history`) and the field at the surface of each
-pixel (`surface`), but no features of preceding frames. The field itself then renders the cells with
-the largest estimated error (`refinement`).
+The 2D renderer is shown the preceding picture and the field at the surface of each pixel, but no
+features of preceding frames. The field then renders the cells with the largest estimated error.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from bench.types import Camera, NullProbe, Probe
+from bench.cameras import cast
+from bench.types import Camera, NullProbe, Probe, Rays
 from methods.rendering.frame import FeatureFrame, render_rays
 from methods.steernerf.buffer import Buffer, Cloud
-from methods.steernerf.pipeline import Pipeline
-from methods.steernerf.view import View
-from methods.steernerf_lean.cells import cells_near, put_pixels
-from methods.steernerf_lean.history import Kept, overlap
-from methods.steernerf_lean.kernels.warp import enlarge
-from methods.steernerf_lean.observation import LeanObservation
+from methods.steernerf.pipeline import Pipeline, View
+from methods.steernerf.unet import Points
+from methods.steernerf_lean.cells import cells_near, centres, put_pixels
+from methods.steernerf_lean.kernels.warp import enlarge, warp
+from methods.steernerf_lean.observation import Kept, LeanObservation, overlap, surface_points
 from methods.steernerf_lean.options import LeanRendering
-from methods.steernerf_lean.refinement import rays_of_cells, worst_cells
-from methods.steernerf_lean.surface import surface_points
+
+
+def worst_cells(error: Tensor, share: float) -> Tensor:
+    """Indices of the `share` of N cells with the largest estimated `error` [N]."""
+    return error.topk(math.ceil(share * len(error)), sorted=False).indices
+
+
+def rays_of_cells(cells: Tensor, view: View) -> Rays:
+    """Rays through all pixels of `cells` [n], cell by cell: n s^2 of them."""
+    return cast(view.full, centres(cells, view.low.width, view.scale).flatten(0, 1))
 
 
 class LeanPipeline(Pipeline):
@@ -45,6 +53,10 @@ class LeanPipeline(Pipeline):
                     buffer = ()
         return super().select(buffer, view, rendering, probe)
 
+    def reproject(self, preceding: Sequence[Cloud], view: View) -> Sequence[Points]:
+        """No features of preceding frames are shown."""
+        return ()
+
     def observe(
         self,
         frame: FeatureFrame,
@@ -54,21 +66,18 @@ class LeanPipeline(Pipeline):
         probe: Probe,
         cells: Tensor | None = None,
     ) -> LeanObservation:
-        """What the lean 2D renderer is shown.
-
-        Args:
-            cells: the cells to draw; None: `near` decides, and the host waits for a GPU.
-        """
+        """What the lean 2D renderer is shown of the `cells` [N] to draw; None: `near` decides, and
+        the host waits for a GPU."""
         if cells is None:
             cells = self.near(frame, rendering).flatten().nonzero().squeeze(1)
-        scale, backend = view.scale, self.backend
-        depth = enlarge(frame.depth.detach(), cells, scale, backend=backend)
+        depth = enlarge(frame.depth.detach(), cells, view.scale, backend=self.backend)
         with probe.stage("surface"):
-            surface = surface_points(self.field, depth, cells, view, scale, probe)
+            surface = surface_points(self.field, depth, cells, view, probe)
         history = None
         if preceding and isinstance(kept := preceding[0], Kept):
-            history = kept.warped(depth, cells, view, backend)
-        return LeanObservation(frame, self.background, cells, surface, history, backend)
+            into = depth, cells, view.full, view.scale
+            history = warp(kept.picture, kept.full, *into, backend=self.backend)
+        return LeanObservation(frame, self.background, cells, surface, history, self.backend)
 
     def near(self, frame: FeatureFrame, rendering: LeanRendering) -> Tensor:
         """Which cells are drawn, [h, w] bool: those near matter, or all."""
@@ -78,14 +87,13 @@ class LeanPipeline(Pipeline):
     def draw(
         self, shown: LeanObservation, view: View, rendering: LeanRendering, probe: Probe
     ) -> Tensor:
-        """The picture [H, W, 3], with the cells of the largest estimated error as rendered by the
-        field."""
+        """The picture [H, W, 3]; the field renders the cells of the largest estimated error."""
         with probe.stage("renderer2d"):
-            drawing = self.renderer([shown], probe)
-            picture = drawing.pictures[0].clamp_(0, 1)
+            pictures, error = self.renderer([shown], probe)
+            picture: Tensor = pictures[0].clamp_(0, 1)
         if rendering.refined:
             with probe.stage("refinement"):
-                cells = shown.cells[worst_cells(drawing.error, rendering.refined)]
+                cells = shown.cells[worst_cells(error, rendering.refined)]
                 colours = self.refined(cells, view, rendering, probe)
                 put_pixels(picture, cells, view.scale, colours)
         return picture

@@ -1,56 +1,55 @@
-"""Stage 2 of the lean SteerNeRF: the steps in which it differs from the paper's."""
+"""Stage 2 of the lean SteerNeRF: the steps in which it differs from the paper's, and how the 2D
+renderer gets its initial weights, on the fields of many scenes."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.types import NullProbe, Rays
+from bench.errors import explained
+from bench.types import Budget, Log, NullProbe, Rays, Scene, Split, SteerbenchError
+from methods.instant_ngp.stage1 import Setup, train_field
 from methods.rendering.batch import render_batch
 from methods.rendering.compaction import compacts, indices_where
-from methods.steernerf.options import EVERYWHERE
-from methods.steernerf.renderer import Points, Renderer2d
-from methods.steernerf.training.examples import Example
-from methods.steernerf.training.joint import JointTraining
-from methods.steernerf.training.patches import Batch, Patch, Patches, Shown
-from methods.steernerf.training.stage2 import Stage2
-from methods.steernerf.view import View
+from methods.steernerf.patches import Batch, Example, Patch, Patches
+from methods.steernerf.stage2 import JointTraining, Stage2
+from methods.steernerf.unet import Observation, Renderer2d
 from methods.steernerf_lean.cells import pixels_of
-from methods.steernerf_lean.observation import Drawing, LeanObservation
-from methods.steernerf_lean.options import LeanJointOptions, LeanRendering, LeanSkips
-from methods.steernerf_lean.pipeline import LeanPipeline
-from methods.steernerf_lean.refinement import rays_of_cells, worst_cells
-from methods.training import checkpoint
+from methods.steernerf_lean.lean_renderer import Drawing
+from methods.steernerf_lean.observation import LeanObservation
+from methods.steernerf_lean.options import LeanJointOptions, LeanRendering
+from methods.steernerf_lean.pipeline import LeanPipeline, rays_of_cells, worst_cells
+from methods.training import checkpoint, loop
 
-LEAST_ERROR = 1e-6
-"""Added to the mean squared error of a cell: below this, one error is as good as another."""
+LEAST_ERROR = 1e-6  # added to that of a cell: below this, one mean squared error is like another
 
 
 class LeanPatches(Patches):
     """Patches around content; the field learns from the present frame alone."""
 
     pipeline: LeanPipeline
+    rendering: LeanRendering
 
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
         self._content: dict[int, Tensor] = {}  # by the number of the view
 
-    def place(
-        self, example: Example, extents: tuple[int, int], size: tuple[int, int]
-    ) -> Sequence[int]:
+    def place(self, example: Example, side: int, size: tuple[int, int]) -> Sequence[int]:
         """Choose the first row and column of a patch that shows more than background."""
         if example.number not in self._content:
-            self._content[example.number] = self._cells(self.pool.views.pictures[example.number])
+            self._content[example.number] = self._cells(self.pictures[example.number])
         cells = self._content[example.number]
         chosen = cells[self.random(len(cells))].tolist()
         return [
-            min(max(centre - self.random(extent), 0), side - extent)
-            for centre, extent, side in zip(chosen, extents, size, strict=True)
+            min(max(centre - self.random(side), 0), extent - side)
+            for centre, extent in zip(chosen, size, strict=True)
         ]
 
     def _cells(self, picture: Tensor) -> Tensor:
@@ -68,19 +67,15 @@ class LeanPatches(Patches):
         cells[rows // scale, columns // scale] = True
         return cells.nonzero() if cells.any() else (~cells).nonzero()
 
-    def points(self, example: Example, view: View) -> Sequence[Points]:
-        """None: the 2D renderer is shown no features of preceding frames."""
-        return ()
-
     def observations(
-        self, patches: Sequence[Patch], shown: Sequence[Shown]
+        self, patches: Sequence[Patch], shown: Sequence[Observation]
     ) -> Sequence[LeanObservation]:
         """What the 2D renderer is shown of `patches`; the host waits once for the cells of all."""
         pipeline, how, probe = self.pipeline, self.rendering, NullProbe()
-        near = indices_where([pipeline.near(frame, how).flatten() for frame, _ in shown])
+        near = indices_where([pipeline.near(o.frame, how).flatten() for o in shown])
         return [
-            pipeline.observe(frame, patch.example.buffer, patch.view, how, probe, cells)
-            for patch, (frame, _), cells in zip(patches, shown, near, strict=True)
+            pipeline.observe(o.frame, patch.example.buffer, patch.view, how, probe, cells)
+            for patch, o, cells in zip(patches, shown, near, strict=True)
         ]
 
 
@@ -89,6 +84,7 @@ class LeanTraining(JointTraining):
     is the running mean of the renderer's weights."""
 
     options: LeanJointOptions
+    patches: LeanPatches
 
     def __init__(self, renderer: Renderer2d, *rest: Any) -> None:
         super().__init__(renderer, *rest)
@@ -115,7 +111,7 @@ class LeanTraining(JointTraining):
         and scaled to the batch: it keeps the field accurate at full resolution."""
         if not (self.trained and self.options.refined):
             return 0.0
-        pipeline, rendering, rays, truth = self.patches.pipeline, self.patches.rendering, [], []
+        pipeline, rays, truth = self.patches.pipeline, [], []
         errors = drawn.error.detach().split([len(o.cells) for o in batch.observations])
         for o, view, picture, error in zip(
             batch.observations, batch.views, batch.truth, errors, strict=True
@@ -132,7 +128,7 @@ class LeanTraining(JointTraining):
             self.trained.field,
             every.take(some),
             pipeline.occupancy,
-            rendering.refined_sampling,
+            self.patches.rendering.refined_sampling,
             background=pipeline.background,
             hidden=not compacts(wanted.device),
         )
@@ -144,27 +140,43 @@ class LeanTraining(JointTraining):
         if self.options.clip is not None:
             nn.utils.clip_grad_norm_(self.renderer.parameters(), self.options.clip)
         super().update()
-        self._average()
-
-    @torch.no_grad()
-    def _average(self) -> None:
         # At first over fewer steps: the earliest weights are not worth keeping, the first not at
         # all. (torch's AveragedModel would make the host wait for a GPU.)
         early = (1 + self.step) / (10 + self.step) if self.step else 0.0
-        mean: list[Tensor] = list(self.outcome.parameters())
-        new: list[Tensor] = list(self.renderer.parameters())
+        mean, new = ([p.data for p in x.parameters()] for x in (self.outcome, self.renderer))
         torch._foreach_lerp_(mean, new, 1 - min(self.options.average, early))
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
         """Also the weights themselves."""
         tensors, figures = super().state()
-        learning = {f"learning.{name}": x for name, x in self.renderer.state_dict().items()}
-        return tensors | learning, figures
+        return tensors | self.renderer.state_dict(prefix="learning."), figures
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
         """Restore what `result` and `state` returned."""
         super().restore(tensors, figures)
         self.renderer.load_state_dict(checkpoint.part(tensors, "learning."))
+
+
+class AnyOf(Patches):
+    """Draws each batch of patches from one of `sources`, which their `generator` chooses."""
+
+    def __init__(self, sources: Sequence[Patches]) -> None:
+        self.sources = sources
+        self.options, self.generator = sources[0].options, sources[0].generator
+
+    def draw(self, count: int) -> Batch:
+        """Draw `count` patches, all from the same source."""
+        return self.sources[self.random(len(self.sources))].draw(count)
+
+    def state(self) -> dict[str, Tensor]:
+        """What the next patches of all sources depend on."""
+        states = (source.state() for source in self.sources)
+        return {f"{n}.{name}": x for n, state in enumerate(states) for name, x in state.items()}
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Restore what `state` returned."""
+        for number, source in enumerate(self.sources):
+            source.restore(checkpoint.part(tensors, f"{number}."))
 
 
 class LeanStage2(Stage2):
@@ -173,21 +185,33 @@ class LeanStage2(Stage2):
     joint: LeanJointOptions
     pipeline, patches, training = LeanPipeline, LeanPatches, LeanTraining
 
-    def make(self) -> Renderer2d:
-        """Make an untrained 2D renderer; it reads the preceding picture if L = 1."""
-        model = self.model
-        return self.renderer(model.channels, model.scale, history=model.frames > 0)
+    def pretrain(
+        self, setup: Setup, scenes: Sequence[Scene], budget: Budget, output: Path, log: Log
+    ) -> None:
+        """Fit a field to each of `scenes`, train one renderer on all of them, write it to `output`.
 
-    @property
-    def rendering(self) -> LeanRendering:
-        """How frames are rendered during training: everywhere, and refined as `joint` says."""
-        model, joint = self.model, self.joint
-        return LeanRendering(
-            model.step,
-            model.stop,
-            EVERYWHERE,
-            LeanSkips(empty=True, hidden=True, background=True),
-            overlap=0.0,
-            refined=joint.refined,
-            refined_step=joint.refined_step,
-        )
+        The fields are frozen: what a renderer learns must hold for fields it has never seen. Raises
+        SteerbenchError unless K is 3: further features mean something different in every scene.
+        """
+        joint, channels = replace(self.joint, field="frozen"), self.model.channels
+        if channels != 3:
+            wanted = "a renderer for many scenes reads colours alone: expected channels (K) of 3"
+            raise SteerbenchError(f"{wanted}, got {channels}")
+        with explained(output.parent):
+            output.parent.mkdir(parents=True, exist_ok=True)
+        renderer, generator = self.make(setup), torch.Generator().manual_seed(setup.seed)
+        sources = []
+        for number, scene in enumerate(scenes, 1):
+            log.info(f"scene {number} of {len(scenes)}: {scene.name}")
+            trained = train_field(setup, scene, budget, log)
+            pipeline = self.pipeline(trained, scene.background, renderer, self.model)
+            sources.append(self.patches(pipeline, scene, Split([], [], []), joint, generator))
+        training = self.training(renderer, AnyOf(sources), budget.renderer_steps, None)
+        for source in sources:
+            source.pipeline.renderer = training.outcome
+        key = {"fields": [setup.key(scene, budget) for scene in scenes], **self.key(budget)}
+        finished = log.stage_dir("pretrained", key) / "renderer.safetensors"
+        loop.train(training, finished, "training a renderer for many scenes", log)
+        halves = {name: x.half() for name, x in training.outcome.network.state_dict().items()}
+        checkpoint.write(output, halves, {"scenes": len(scenes), "steps": training.steps})
+        log.info(f"written: {output}")

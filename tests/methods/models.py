@@ -14,12 +14,18 @@ from methods.kernels.encode import HashGrid
 from methods.kernels.types import Occupancy
 from methods.rendering.occupancy import DensityGrid
 from methods.rendering.sampling import Sampling
-from methods.steernerf.options import EVERYWHERE, Model, Rendering, Skips
+from methods.steernerf.options import (
+    EVERYWHERE,
+    JointOptions,
+    Model,
+    MotionOptions,
+    Rendering,
+    Skips,
+)
 from methods.steernerf.pipeline import Pipeline
-from methods.steernerf.training.options import JointOptions, MotionOptions
 from methods.steernerf.unet import UNet
 from methods.steernerf_lean.lean_renderer import LeanRenderer
-from methods.steernerf_lean.options import LeanJointOptions, LeanModel, LeanRendering, LeanSkips
+from methods.steernerf_lean.options import LeanJointOptions, LeanRendering, LeanSkips
 from methods.steernerf_lean.pipeline import LeanPipeline
 
 SMALL_GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=16)
@@ -72,9 +78,9 @@ def small_joint(**others: Any) -> JointOptions:
     return replace(JOINT, **others)
 
 
-def lean_model(**others: Any) -> LeanModel:
+def lean_model(**others: Any) -> Model:
     """K = 4, L = 1, s = 4, long steps; `others` replace fields."""
-    return replace(LeanModel(**vars(MODEL) | {"frames": 1}), **others)
+    return replace(MODEL, **{"frames": 1} | others)
 
 
 def lean_rendering(**others: Any) -> LeanRendering:
@@ -122,12 +128,10 @@ def misty_field(precision: str = "bf16", backend: str = "auto", channels: int = 
     return field
 
 
-def lean_renderer(model: LeanModel, *, width: int = 8) -> LeanRenderer:
+def lean_renderer(model: Model, *, width: int = 8) -> LeanRenderer:
     """An untrained lean 2D renderer of one block for `model`."""
-    history = model.frames > 0
-    return LeanRenderer(
-        model.channels, model.scale, history=history, width=width, blocks=1, init="scratch"
-    )
+    size = model.channels, model.frames, model.scale
+    return LeanRenderer(*size, width=width, blocks=1, init="scratch")
 
 
 def new_pipeline(model: Model = MODEL) -> Pipeline:
@@ -135,12 +139,12 @@ def new_pipeline(model: Model = MODEL) -> Pipeline:
     torch.manual_seed(0)
     field = misty_field(channels=model.channels)
     unet = UNet(model.channels, model.frames, model.scale, width=4, aligned=False)
-    return Pipeline(field, shell(), torch.ones(3), unet, model)
+    return Pipeline(trained_field(field), torch.ones(3), unet, model)
 
 
-def lean_pipeline(model: LeanModel | None = None) -> LeanPipeline:
+def lean_pipeline(model: Model | None = None) -> LeanPipeline:
     """A misty field and an untrained lean 2D renderer on white; always the same weights."""
     torch.manual_seed(0)
     model = model or lean_model()
     field = misty_field(channels=model.channels)
-    return LeanPipeline(field, shell(), torch.ones(3), lean_renderer(model), model)
+    return LeanPipeline(trained_field(field), torch.ones(3), lean_renderer(model), model)

@@ -11,10 +11,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from methods.rendering.frame import FeatureFrame
-from methods.steernerf.renderer import Observation, Points, Renderer2d
+from methods.steernerf.unet import Observation, Points, Renderer2d
 from methods.steernerf_lean.cells import cells_near
 from methods.steernerf_lean.lean_renderer import LeanRenderer
-from methods.steernerf_lean.observation import Detail, LeanObservation
+from methods.steernerf_lean.observation import LeanObservation
 from tests.methods.conftest import look_at_the_middle
 
 CAMERA = look_at_the_middle(0.0, 0.0)  # no renderer looks at it
@@ -60,7 +60,7 @@ def observe(
         BACKGROUND[:channels],
         cells,
         Points(at_surface.values, index.flatten(0, 1)[cells]),
-        Detail(picture.flatten(0, 1)[cells], valid.flatten(0, 1)[cells]) if history else None,
+        (picture.flatten(0, 1)[cells], valid.flatten(0, 1)[cells]) if history else None,
         "auto",
     )
 
@@ -136,7 +136,9 @@ def doubled(observation: AnyObservation) -> AnyObservation:
             return part.double() if part.is_floating_point() else part
         if isinstance(part, list):
             return [twice(one) for one in part]
-        if isinstance(part, FeatureFrame | Points | Detail | LeanObservation | Observation):
+        if isinstance(part, tuple):
+            return tuple(map(twice, part))
+        if isinstance(part, FeatureFrame | Points | LeanObservation | Observation):
             return replace(part, **{name: twice(x) for name, x in vars(part).items()})
         return part
 
@@ -161,7 +163,7 @@ def cut(observation: LeanObservation, rows: slice, columns: slice) -> LeanObserv
             alpha=alpha,
         ),
         cells=cells,
-        history=history and Detail(inside(history.values), inside(history.valid)),
+        history=history and (inside(history[0]), inside(history[1])),
         surface=replace(surface, index=inside(surface.index, -1)),
     )
 
@@ -188,9 +190,8 @@ def new_renderer(
     channels: int = 6, scale: int = 4, *, history: bool = True, width: int = 16, blocks: int = 2
 ) -> LeanRenderer:
     """An untrained lean renderer."""
-    return LeanRenderer(
-        channels, scale, history=history, width=width, blocks=blocks, init="scratch"
-    )
+    size = channels, int(history), scale
+    return LeanRenderer(*size, width=width, blocks=blocks, init="scratch")
 
 
 def to_picture(blocks: Tensor, scale: int) -> Tensor:
@@ -215,9 +216,8 @@ def at_surface(observation: LeanObservation, scale: int) -> tuple[Tensor, Tensor
 def before(observation: LeanObservation, scale: int) -> tuple[Tensor, Tensor]:
     """[H, W, 3] and [H, W, 1]: the preceding picture, and where it is known."""
     assert observation.history is not None
-    values = everywhere(observation.history.values, observation)
-    valid = everywhere(observation.history.valid[..., None], observation)
-    return to_picture(values, scale), to_picture(valid, scale)
+    values, valid = (everywhere(part, observation) for part in observation.history)
+    return to_picture(values, scale), to_picture(valid[..., None], scale)
 
 
 def enlarged(observation: LeanObservation, scale: int) -> Tensor:

@@ -47,7 +47,7 @@ from methods.rendering.occupancy import EVERY, STEP
 from methods.steernerf.method import SteerNerf
 from methods.steernerf.options import RangeReduction
 from methods.steernerf.pipeline import Pipeline
-from methods.steernerf.training.joint import JointTraining
+from methods.steernerf.stage2 import JointTraining
 from methods.steernerf.unet import UNet
 from methods.steernerf_lean import training as lean_training
 from methods.steernerf_lean.lean_renderer import LeanRenderer

@@ -1,4 +1,5 @@
-"""Preceding frames: what is kept of them, and which pixels of another view show their points."""
+"""Preceding frames: what is kept of them, which pixels of another view show their points, and range
+reduction, on solids whose surface is known."""
 
 from __future__ import annotations
 
@@ -11,12 +12,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.cameras import pixel_grid, project, scale_camera, unproject
+from bench.cameras import project, scale_camera, unproject
 from bench.types import Camera
-from methods.rendering.frame import FeatureFrame
+from methods.kernels.types import Occupancy
+from methods.rendering.frame import FeatureFrame, everywhere, render_frame
+from methods.rendering.occupancy import STEP
+from methods.rendering.sampling import Sampling
 from methods.steernerf.buffer import CLEAR_ALPHA, Cloud
 from methods.steernerf.kernels.splat import gather
-from tests.methods.conftest import look_at_the_middle
+from methods.steernerf.options import RangeReduction
+from tests.methods.conftest import Work, look_at_the_middle
+from tests.methods.solids import Solid, ball, wall
 
 RELEASE = np.load(Path(__file__).parents[2] / "data" / "steernerf_release.npz")
 """Two frames of 10 x 12 pixels, brought into a third of 40 x 48 by the released code."""
@@ -38,14 +44,6 @@ def low_camera(scale: int) -> Camera:
     camera = look_at_the_middle(0.1, 0.3)
     full = replace(camera, cx=4.25 * scale, cy=2.5 * scale, width=8 * scale, height=6 * scale)
     return scale_camera(replace(full, fx=9.0 * scale, fy=10.0 * scale), 8, 6)
-
-
-def test_a_point_is_where_the_corner_of_its_pixel_sees_it() -> None:
-    low = low_camera(4)
-    frame = frame_of(low)
-    cloud = Cloud.of(frame)
-    assert torch.equal(cloud.values, frame.values.view(48, 4))
-    assert torch.equal(cloud.points, unproject(low, pixel_grid(8, 6) - 0.5, frame.depth.flatten()))
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -126,3 +124,62 @@ def test_of_two_points_in_a_pixel_the_last_is_shown(backend: str) -> None:
     assert (index[3, 4].item(), index[1, 1].item()) == (1, 3)
     assert (index >= 0).sum() == 2
     torch.testing.assert_close(seen, depth)
+
+
+EVERYWHERE = Occupancy(torch.ones(32, 32, 32, dtype=torch.bool))
+EPSILON = 0.03
+SIZE = 16
+
+
+def along_x() -> Camera:
+    """Looks along x from x = -1.1; sees nothing but walls, up to x = 0.8."""
+    c2w = torch.tensor([[0.0, 0, 1, -1.1], [-1, 0, 0, 0.5], [0, -1, 0, 0.5]])
+    lens = {"cx": SIZE / 2, "cy": SIZE / 2, "fx": 40.0, "fy": 40.0}
+    return replace(look_at_the_middle(0.0, 0.3), c2w=c2w, width=SIZE, height=SIZE, **lens)
+
+
+def render(field: Solid, interval: Tensor | None = None) -> tuple[FeatureFrame, int]:
+    """The frame, in the interval [h, w, 2] or everywhere, and how many samples it took."""
+    probe, how = Work(), Sampling(step=4 * STEP)
+    if interval is not None:
+        how = how.within(interval.view(-1, 2))
+    by = everywhere(field, EVERYWHERE, probe, how)
+    return render_frame(along_x(), EVERYWHERE, torch.ones(4), probe, by), probe.done["samples"]
+
+
+def interval_of(frame: FeatureFrame) -> Tensor:
+    """Of a camera that stays where it is."""
+    return Cloud.of(frame).expected().interval(along_x(), EPSILON, "cpu")
+
+
+def test_a_surface_is_found_inside_the_interval_alone() -> None:
+    whole, samples = render(Solid(wall(0.3)))
+    interval = interval_of(whole)
+    assert interval.isfinite().all()
+    # Where the surface stayed it is found, all of it, with fewer samples.
+    same, fewer = render(Solid(wall(0.3)), interval)
+    torch.testing.assert_close(same.values, whole.values, rtol=0, atol=1e-5)
+    assert fewer < 0.5 * samples
+    # Where it moved, nothing is made up for what is missing.
+    moved, _ = render(Solid(wall(0.7)), interval)
+    assert not moved.alpha.any()
+    assert (moved.values == 1).all()  # the background
+
+
+def test_the_interval_is_that_of_the_pixel_alone_and_everything_where_nothing_is_known() -> None:
+    frame, _ = render(Solid(ball()))
+    interval = interval_of(frame)
+    seen = frame.alpha > CLEAR_ALPHA
+    assert torch.equal(interval[..., 1].isfinite(), seen)
+    assert 0 < seen.sum() < SIZE**2
+    assert (interval[~seen][:, 0] == 0).all()
+    middle = interval[seen].mean(dim=-1)
+    torch.testing.assert_close(middle, frame.depth[seen], rtol=0, atol=1e-5)
+    width = interval[seen].diff(dim=-1).squeeze(-1)
+    torch.testing.assert_close(width, torch.full_like(width, 2 * EPSILON), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("epsilon", [0.0, -1.0, math.nan])
+def test_an_interval_has_a_width(epsilon: float) -> None:
+    with pytest.raises(ValueError, match=r"range\.epsilon: expected more than 0, got"):
+        RangeReduction("paper", epsilon, "sum")

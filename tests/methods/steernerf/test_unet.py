@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 from torch.utils.flop_counter import FlopCounterMode
 
 from methods.steernerf.unet import UNet
@@ -62,15 +61,6 @@ def test_its_first_weights_are_drawn_as_those_of_the_release() -> None:
         assert (residual or shuffled) == (not layer.bias.any())
 
 
-@pytest.mark.parametrize("width", [16, 32])
-def test_a_width_scales_all_channels(width: int) -> None:
-    inputs = torch.zeros(1, 18, 8, 8)
-    whole, narrow = (unet(6, 2, 4, width=w).network.products(inputs) for w in (64, width))
-    ends = 9 * 64 * (18 + 3)  # of the first and the last layer, which scale with the width alone
-    share = width / 64
-    assert narrow == share**2 * (whole - 64 * ends) + share * 64 * ends
-
-
 @pytest.mark.parametrize(("frames", "count"), [(0, 2_108_675), (1, 2_112_131), (2, 2_115_587)])
 def test_it_has_the_number_of_parameters_of_the_release(frames: int, count: int) -> None:
     renderer = unet(6, frames, 4)
@@ -91,14 +81,14 @@ def test_any_features_frames_and_sizes_are_taken(
         for seed in range(2)
     ]
     for batch in (observations[:1], observations):
-        pictures, base = renderer(batch), renderer.base(batch)
-        assert pictures.shape == base.shape == (len(batch), height * scale, width * scale, 3)
+        pictures = renderer(batch)
+        assert pictures.shape == (len(batch), height * scale, width * scale, 3)
         assert pictures.isfinite().all()
 
 
-@pytest.mark.parametrize(("height", "width"), [(8, 12), (9, 6)])
-def test_its_products_are_those_that_torch_counts(height: int, width: int) -> None:
-    network = unet(6, 2, 4).network
+@pytest.mark.parametrize(("height", "width", "channels"), [(8, 12, 64), (9, 6, 16)])
+def test_its_products_are_those_that_torch_counts(height: int, width: int, channels: int) -> None:
+    network = unet(6, 2, 4, channels).network
     inputs = torch.zeros(2, 18, height, width)
     with FlopCounterMode(display=False) as counter:
         network(inputs)
@@ -139,11 +129,15 @@ def test_gradients_reach_every_parameter_and_the_features_of_all_frames() -> Non
 
 @pytest.mark.parametrize("aligned", [False, True])
 def test_the_base_puts_the_corners_on_corners_or_centres(aligned: bool) -> None:
+    """Without an output of the network, the picture is the base."""
     height, width, scale = 4, 6, 4
     observation = observe_paper(height, width, frames=0)
     row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     observation.frame.values[..., 0], observation.frame.values[..., 1] = row / 8, column / 8
-    base = unet(6, 0, scale, aligned=aligned).base([observation])
+    renderer = unet(6, 0, scale, aligned=aligned)
+    for layer in renderer.network.last.parameters():
+        nn.init.zeros_(layer)
+    base = renderer([observation])
     for channel, size in ((0, height), (1, width)):
         pixel = torch.arange(size * scale)
         if aligned:
@@ -152,15 +146,3 @@ def test_the_base_puts_the_corners_on_corners_or_centres(aligned: bool) -> None:
             place = pixel * (size - 1) / (size * scale - 1)
         ramp = base[0, :, 0, 0] if channel == 0 else base[0, 0, :, 1]
         torch.testing.assert_close(ramp, place / 8, rtol=0, atol=1e-6)
-
-
-def test_without_an_output_of_the_network_the_picture_is_the_base() -> None:
-    renderer = unet(6, 2, 4, aligned=True)
-    for layer in renderer.network.last.parameters():
-        torch.nn.init.zeros_(layer)
-    observation = observe_paper()
-    base = renderer.base([observation])
-    assert torch.equal(renderer([observation]), base)
-    rgb = observation.frame.values[..., :3].permute(2, 0, 1)[None]
-    want = functional.interpolate(rgb, scale_factor=4, mode="bilinear", align_corners=False)
-    assert torch.equal(base, want.permute(0, 2, 3, 1))

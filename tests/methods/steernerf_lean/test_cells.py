@@ -5,15 +5,7 @@ from __future__ import annotations
 import torch
 
 from bench.cameras import pixel_grid
-from methods.steernerf_lean.cells import (
-    REACH,
-    cells_near,
-    centres,
-    number,
-    paint,
-    pixels_of,
-    put_pixels,
-)
+from methods.steernerf_lean.cells import REACH, cells_near, centres, paint, pixels_of
 
 SCALE = 3
 HEIGHT, WIDTH = 4, 5
@@ -50,16 +42,6 @@ def test_pixels_of_a_cell_are_those_at_their_centres() -> None:
     assert rows == {tuple(centre) for centre in pixel_grid(WIDTH * SCALE, HEIGHT * SCALE).tolist()}
 
 
-def test_pixels_that_are_put_are_those_that_are_taken() -> None:
-    image, some = picture(), SOME[:3]
-    new = -1 - torch.arange(3 * SCALE**2 * 2).view(3, SCALE**2, 2)
-    changed = image.clone()
-    put_pixels(changed, some, SCALE, new)
-    assert torch.equal(pixels_of(changed, some, SCALE), new)
-    others = torch.tensor([n for n in range(HEIGHT * WIDTH) if n not in some.tolist()])
-    assert torch.equal(pixels_of(changed, others, SCALE), pixels_of(image, others, SCALE))
-
-
 def test_pictures_are_painted_cell_by_cell() -> None:
     size, background = torch.Size((HEIGHT, WIDTH)), torch.tensor([-1, -2])
     cells = [torch.tensor([3, 8]), torch.tensor([], dtype=torch.long), torch.tensor([19])]
@@ -70,8 +52,3 @@ def test_pictures_are_painted_cell_by_cell() -> None:
     assert torch.equal(pixels_of(painted[2], cells[2], SCALE), pixels[2:])
     is_background = (painted == background).all(dim=-1)
     assert is_background.sum(dim=(1, 2)).tolist() == [180 - 18, 180, 180 - 9]
-
-
-def test_cells_of_several_pictures_are_counted_through() -> None:
-    cells = [torch.tensor([3]), torch.tensor([0, 19])]
-    assert number(cells, torch.Size((HEIGHT, WIDTH))).tolist() == [3, 20, 39]

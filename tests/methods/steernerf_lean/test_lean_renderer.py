@@ -1,22 +1,29 @@
-"""The lean 2D renderer: against a dense network, what it takes from each input, how far it sees."""
+"""The lean 2D renderer: against a dense network, what it takes from each input, how far it sees,
+and how it starts from the weights of another."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.nn import functional
 from torch.utils.flop_counter import FlopCounterMode
 
-from methods.steernerf_lean.cell_inputs import CellInputs
-from methods.steernerf_lean.cell_network import LEAK
+from methods.steernerf_lean import lean_renderer
 from methods.steernerf_lean.cells import REACH
-from methods.steernerf_lean.lean_renderer import LeanRenderer
-from methods.steernerf_lean.observation import Detail, LeanObservation
+from methods.steernerf_lean.lean_renderer import (
+    LEAK,
+    PRETRAINED,
+    PRETRAINED_LAYOUT,
+    LeanRenderer,
+)
+from methods.steernerf_lean.observation import LeanObservation
 from tests.methods.observations import (
-    BACKGROUND,
     FLOAT32_ERROR,
     ROUNDING,
     at_surface,
@@ -124,7 +131,7 @@ def test_cells_are_drawn_as_by_a_dense_network(
 def test_a_picture_and_a_surface_that_are_missing_show_nothing() -> None:
     renderer, warm = shaken(new_renderer()), observe()
     assert warm.history is not None
-    unknown = Detail(warm.history.values, torch.zeros_like(warm.history.valid))
+    unknown = warm.history[0], torch.zeros_like(warm.history[1])
     cold = renderer([replace(warm, history=None)]).pictures
     assert torch.equal(renderer([replace(warm, history=unknown)]).pictures, cold)
     assert (renderer([warm]).pictures - cold).abs().max() > 1e-3
@@ -143,12 +150,6 @@ def test_an_index_that_names_no_point_of_the_surface_is_refused(wrong: int) -> N
         new_renderer()([observation])
 
 
-def test_a_renderer_without_history_ignores_the_preceding_picture() -> None:
-    observation = observe()
-    renderer, without = shaken(new_renderer(history=False)), replace(observation, history=None)
-    assert torch.equal(renderer([observation]).pictures, renderer([without]).pictures)
-
-
 @pytest.mark.parametrize("history", [False, True])
 def test_gradients_reach_every_parameter_and_the_features_of_all_that_is_shown(
     history: bool,
@@ -165,23 +166,6 @@ def test_gradients_reach_every_parameter_and_the_features_of_all_that_is_shown(
     for tensor in features:
         assert tensor.grad is not None
         assert tensor.grad.any(dim=0).all()  # every channel, RGB and others
-
-
-def test_gradients_of_inputs_and_pixels_are_finite_differences() -> None:
-    observation, layout = doubled(observe(2, 3, channels=4, scale=2)), new_renderer(4, 2).layout
-    output, matrix = torch.rand(6, 16, dtype=torch.float64), torch.rand(6, 15, dtype=torch.float64)
-
-    def computed(values: Tensor, surface: Tensor, *outputs: Tensor) -> tuple[Tensor, ...]:
-        shown = replace(
-            observation,
-            frame=replace(observation.frame, values=values),
-            surface=replace(observation.surface, values=surface),
-        )
-        inputs = CellInputs.of([shown], layout)
-        return inputs.rows(), inputs.drawn(*outputs)
-
-    learned = [*features_of(observation), output, matrix]
-    assert torch.autograd.gradcheck(computed, [x.requires_grad_() for x in learned])
 
 
 @pytest.mark.parametrize("scale", [1, 2, 3, 4])
@@ -217,19 +201,6 @@ def test_the_surface_covers_the_base_as_far_as_it_is_opaque() -> None:
     covered = base + values[..., -1:] * (values[..., :3] - base)
     want = torch.where(known[..., None] > 0, covered, base)
     assert 0.5 < known.mean() < 0.8
-    torch.testing.assert_close(renderer([observation]).pictures[0], want, rtol=0, atol=BLENDING)
-
-
-@pytest.mark.parametrize("column", [3, 4, 6])
-def test_a_matrix_reads_opacity_and_other_features_less_the_background(column: int) -> None:
-    """Of K = 6: the opacity is behind the colours, then come the others."""
-    scale, renderer, observation = 4, new_renderer(history=False), observe()
-    with torch.no_grad():
-        renderer.network.read.bias.view(3, -1)[1, column] = 1.0  # into green
-    values, known = at_surface(observation, scale)
-    read = values[..., -1] if column == 3 else values[..., column - 1] - BACKGROUND[column - 1]
-    want = enlarged(observation, scale)
-    want[..., 1] += known * read
     torch.testing.assert_close(renderer([observation]).pictures[0], want, rtol=0, atol=BLENDING)
 
 
@@ -296,3 +267,82 @@ def test_half_precision_changes_the_network_and_nothing_else() -> None:
     assert torch.equal(still[0], enlarged(observation, 4))
     # A correction below 1, of sums of which each term is off by 1/256.
     assert 0 < (half - renderer([observation]).pictures).abs().max() < 0.1
+
+
+def pretrained() -> LeanRenderer:
+    """What the weights that come with the package were trained as, but smaller."""
+    return shaken(new_renderer(3, 4), seed=1)
+
+
+def widened(observation: LeanObservation) -> LeanObservation:
+    """Six features, of which the last three are everywhere what they are in the background."""
+
+    def wide(values: Tensor) -> Tensor:
+        return functional.pad(values, (0, 3), value=0.5)
+
+    surface = observation.surface  # whose last value, the opacity, stays the last
+    values = torch.cat((wide(surface.values[:, :-1]), surface.values[:, -1:]), dim=1)
+    return replace(
+        observation,
+        frame=replace(observation.frame, values=wide(observation.frame.values)),
+        background=wide(observation.background),
+        surface=replace(surface, values=values),
+    )
+
+
+@pytest.mark.parametrize("channels", [3, 6])
+@pytest.mark.parametrize("history", [False, True])
+def test_a_renderer_starts_as_the_pretrained_one_draws(channels: int, history: bool) -> None:
+    """Of what both know: the same picture, whatever else it may be shown later."""
+    start, renderer = pretrained(), new_renderer(channels, history=history)
+    renderer._start_from(start.network.state_dict())
+    known = doubled(observe(channels=3, history=history))
+    want = start.double()([known]).pictures
+    got = renderer.double()([widened(known) if channels == 6 else known]).pictures
+    torch.testing.assert_close(got, want, rtol=0, atol=ROUNDING)
+
+
+def test_the_weights_of_what_the_pretrained_one_never_saw_stay() -> None:
+    renderer = new_renderer(4)
+    before = {name: x.clone() for name, x in renderer.network.state_dict().items()}
+    renderer._start_from(pretrained().network.state_dict())
+    stayed = {name: x == before[name] for name, x in renderer.network.state_dict().items()}
+    columns = renderer.layout.split(stayed["enter.weight"].all(dim=0))
+    assert columns["rest"].all()
+    assert columns["surface rest"].all()
+    assert not any(part.any() for name, part in columns.items() if not name.endswith("rest"))
+    cell = [False, False, False, False, True]  # the colour, the opacity, a feature
+    assert stayed["read.weight"].all(dim=1).tolist() == 3 * cell
+    assert stayed["read.bias"].tolist() == 3 * cell
+    for name in ("leave.weight", "leave.bias", "trunk.0.spread"):
+        assert not stayed[name].any(), name
+
+
+def test_pretrained_weights_are_read_from_their_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    halves = {name: x.half() for name, x in pretrained().network.state_dict().items()}
+    save_file(halves, tmp_path / "lean.safetensors")
+    monkeypatch.setattr(lean_renderer, "PRETRAINED", tmp_path / "lean.safetensors")
+    renderer = LeanRenderer(3, 1, 4, width=16, blocks=2, init="pretrained")
+    for name, weight in renderer.network.state_dict().items():
+        assert torch.equal(weight, halves[name].float()), name
+
+
+def test_the_weights_of_the_package_have_the_inputs_that_are_read() -> None:
+    assert load_file(PRETRAINED)["enter.weight"].shape[1] == PRETRAINED_LAYOUT.width
+
+
+@pytest.mark.parametrize("other", [{"width": 8}, {"blocks": 1}, {"blocks": 3}, {"scale": 2}])
+def test_pretrained_weights_of_another_shape_are_refused(other: dict[str, Any]) -> None:
+    with pytest.raises(
+        ValueError, match=r"renderer\.init=pretrained: .* use renderer\.init=scratch"
+    ):
+        new_renderer(3, **other)._start_from(pretrained().network.state_dict())
+
+
+def test_weights_that_were_pretrained_with_other_inputs_are_refused() -> None:
+    """Their columns would be taken for others."""
+    without = new_renderer(3, history=False)
+    with pytest.raises(ValueError, match=r"renderer\.init=pretrained: .* 68"):
+        new_renderer(3)._start_from(without.network.state_dict())

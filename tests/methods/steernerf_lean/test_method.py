@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -11,10 +11,9 @@ import torch
 
 from bench.types import Budget, Log, NullProbe, Scene
 from methods.engines.torch_engine import TorchEngine
-from methods.steernerf.options import RangeReduction
 from methods.steernerf_lean.lean_renderer import LeanRenderer
 from methods.steernerf_lean.method import SteerNerfLean
-from methods.steernerf_lean.options import LeanJointOptions, LeanRendering, LeanSkips
+from methods.steernerf_lean.options import LeanSkips
 from tests.methods.models import lean_joint, lean_model, lean_pipeline, lean_rendering, small_motion
 from tests.methods.trainings import GRID, QUICK
 
@@ -50,38 +49,14 @@ def test_a_rendering_may_be_exchanged_between_frames(
     assert not torch.equal(drawn, refined)
 
 
-TURNED: dict[str, Any] = {
-    "step": 1.5,
-    "stop": 1e-1,
-    "range": RangeReduction("paper", 0.1, "expected"),
-    "overlap": 0.5,
-    "refined": 0.25,
-    "refined_step": 2.0,
-    "skip": LeanSkips(empty=True, hidden=True, background=False),
-}
-"""Another value of every field of a rendering."""
-
-
-@pytest.mark.parametrize("name", [field.name for field in fields(LeanRendering)])
-def test_no_field_of_a_rendering_is_in_the_key_of_a_training(name: str) -> None:
-    usual, other = new_method(), new_method(**{name: TURNED[name]})
-    assert usual.rendering != other.rendering
-    assert usual.stage2.key(BUDGET) == other.stage2.key(BUDGET)
-
-
-@pytest.mark.parametrize("name", ["error_weight", "refined", "refined_step", "clip", "average"])
-def test_every_option_of_its_own_is_in_the_key(name: str) -> None:
-    stage2 = new_method().stage2
-    assert isinstance(stage2.joint, LeanJointOptions)
-    joint = replace(stage2.joint, **{name: getattr(stage2.joint, name) / 2})
-    assert replace(stage2, joint=joint).key(BUDGET) != stage2.key(BUDGET)
-
-
-def test_training_renders_everywhere_and_refines_as_its_options_say() -> None:
-    rendering = new_method(refined=0.9, overlap=0.9).stage2.rendering
-    assert (rendering.step, rendering.refined, rendering.refined_step) == (4.0, 0.2, 2.0)
-    assert (rendering.range.mode, rendering.overlap) == ("off", 0.0)
-    assert rendering.skip == LeanSkips(empty=True, hidden=True, background=True)
+def test_a_training_depends_on_its_options_and_on_nothing_that_is_chosen_afterwards() -> None:
+    usual, skip = new_method().stage2, LeanSkips(empty=True, hidden=True, background=False)
+    other = new_method(overlap=0.5, refined=0.25, refined_step=2.0, skip=skip).stage2
+    assert other.key(BUDGET) == usual.key(BUDGET)
+    as_trained = lean_rendering(step=4.0, refined=0.2, refined_step=2.0)
+    assert other.joint.rendering(other.model) == as_trained
+    joint = replace(usual.joint, average=0.5)
+    assert replace(usual, joint=joint).key(BUDGET) != usual.key(BUDGET)
 
 
 def test_of_a_frame_for_the_engine_only_its_own_inputs_are_recorded(

@@ -16,10 +16,9 @@ from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import Sampling
 from methods.steernerf.buffer import Buffer, Cloud
 from methods.steernerf.options import RangeReduction
-from methods.steernerf.view import View
 from methods.steernerf_lean import pipeline as lean
 from methods.steernerf_lean.cells import cells_near, pixels_of
-from methods.steernerf_lean.refinement import worst_cells
+from methods.steernerf_lean.pipeline import worst_cells
 from tests.methods.conftest import Work, look_at_the_middle
 from tests.methods.models import lean_model, lean_pipeline, lean_rendering
 from tests.methods.observations import shaken
@@ -43,12 +42,16 @@ def test_where_every_cell_is_refined_the_picture_is_that_of_the_field() -> None:
     # The same rays among others: products of bfloat16 may be added up in another order.
     torch.testing.assert_close(pixels_of(shown, drawn, 4), want, rtol=0, atol=1e-3)
     assert torch.equal(buffer[0].picture, shown)  # and that is what is remembered
+    remembered = Buffer(maxlen=1)
+    pipeline.remember(CAMERA, remembered, rendering)
+    assert torch.equal(remembered[0].picture, shown)
 
 
 def test_the_cells_with_the_largest_estimated_error_are_refined() -> None:
     """A share of them, rounded up; the others stay as they were drawn."""
     share = 0.1
-    pipeline, probe, view = lean_pipeline(), NullProbe(), View.of(CAMERA, 4)
+    pipeline, probe = lean_pipeline(), NullProbe()
+    view = pipeline.view(CAMERA)
     shaken(pipeline.renderer)
     pictures = [
         pipeline.render(CAMERA, Buffer(maxlen=1), replace(USUAL, refined=part), probe).rgb
@@ -109,17 +112,9 @@ def test_the_time_to_see_what_frames_share_is_that_of_a_stage(monkeypatch) -> No
     assert [frame.stages_ns["other"] for frame in clock.frames] == [0, 0, 0]
 
 
-def test_a_frame_is_remembered_with_its_picture() -> None:
-    pipeline, rendered, remembered = lean_pipeline(), Buffer(maxlen=1), Buffer(maxlen=1)
-    picture = pipeline.render(CAMERA, rendered, USUAL, NullProbe()).rgb
-    pipeline.remember(CAMERA, remembered, USUAL)
-    for (kept,) in (rendered, remembered):
-        assert torch.equal(kept.picture, picture)
-
-
 def test_settings_that_make_no_frame_are_refused() -> None:
     with pytest.raises(ValueError, match="frames: expected 0 to 1, got 2"):
-        lean_model(frames=2)
+        lean_pipeline(lean_model(frames=2))
     with pytest.raises(ValueError, match=r"refined_step: expected a length of more than 0"):
         lean_rendering(refined_step=0.0)
     with pytest.raises(ValueError, match=r"refined: expected a share of 0 to 1, got 1\.5"):

@@ -1,4 +1,5 @@
-"""Stage 2 of the lean method: its losses, its patches, the mean of its weights."""
+"""Stage 2 of the lean method: its losses, its patches, the mean of its weights; a renderer for any
+scene, trained on several."""
 
 from __future__ import annotations
 
@@ -9,47 +10,55 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import load_file
 from torch import Tensor
 
-from bench.types import NullProbe, Scene
-from methods.steernerf.training.examples import TrainingViews
-from methods.steernerf.training.patches import Batch
+from bench.console import ConsoleLog
+from bench.types import Budget, Log, NullProbe, Scene, Split, SteerbenchError
+from methods.steernerf.patches import Batch
+from methods.steernerf.stage2 import JointTraining
+from methods.steernerf_lean import lean_renderer as renderers
 from methods.steernerf_lean.cells import pixels_of
 from methods.steernerf_lean.lean_renderer import LeanRenderer
-from methods.steernerf_lean.training import LEAST_ERROR, LeanStage2, LeanTraining
-from methods.training import loop
+from methods.steernerf_lean.pipeline import LeanPipeline
+from methods.steernerf_lean.training import (
+    LEAST_ERROR,
+    AnyOf,
+    LeanPatches,
+    LeanStage2,
+    LeanTraining,
+)
+from methods.training import checkpoint
 from tests.methods.models import (
     lean_joint,
     lean_model,
     lean_renderer,
     misty_field,
-    shell,
     small_motion,
     trained_field,
 )
 from tests.methods.observations import shaken
+from tests.methods.trainings import TEACHER, goes_on_after_a_kill
 
 MOTION = small_motion(pool=3, uses=4, length=2)
 OPTIONS = lean_joint(patch=4, motion=MOTION, refined=0.0)
-RENDERER = partial(LeanRenderer, width=8, blocks=1, init="scratch")
+RENDERER = partial(LeanRenderer, width=8, blocks=1, init="pretrained")
+BUDGET = Budget("test", steps=40, samples=1024, renderer_steps=8)
 
 
 def new_training(scene: Scene, options=OPTIONS, frames: int = 1, steps: int = 12) -> LeanTraining:
     torch.manual_seed(0)
-    model, field = lean_model(frames=frames), misty_field()
-    renderer, generator = lean_renderer(model), torch.Generator().manual_seed(1)
-    stage2 = LeanStage2(model, RENDERER, options)
-    pipeline = stage2.pipeline(field, shell(), scene.background, renderer, model)
-    patches = stage2.patches_of(pipeline, TrainingViews.of(scene), True, generator)
-    training = LeanTraining(renderer, patches, options, steps, generator, trained_field(field))
+    model, trained = lean_model(frames=frames), trained_field(misty_field())
+    pipeline = LeanPipeline(trained, scene.background, lean_renderer(model), model)
+    generator = torch.Generator().manual_seed(1)
+    patches = LeanPatches(pipeline, scene, Split([], [], []), options, generator)
+    training = LeanTraining(pipeline.renderer, patches, steps, trained)
     pipeline.renderer = training.outcome
     return training
 
 
-def refinement_loss(training: LeanTraining, batch: Batch) -> Tensor:
-    loss = training.refinement_loss(training.renderer(batch.observations), batch)
-    assert isinstance(loss, Tensor)
-    return loss
+def refinement_loss(training: LeanTraining, batch: Batch) -> Tensor | float:
+    return training.refinement_loss(training.renderer(batch.observations), batch)
 
 
 def test_the_field_learns_from_the_pixels_it_is_to_refine(ball_scene: Scene) -> None:
@@ -90,9 +99,9 @@ def test_the_estimated_error_learns_the_log_of_the_error(ball_scene: Scene) -> N
         for picture, truth, o in zip(drawing.pictures, batch.truth, batch.observations, strict=True)
     ]
     right = (torch.cat(made) + LEAST_ERROR).log()
-    at_best = training.error_loss(replace(drawing, error=right), batch)
+    at_best = training.error_loss(drawing._replace(error=right), batch)
     assert at_best < 1e-12  # the logarithm is rounded
-    off = training.error_loss(replace(drawing, error=right + 2), batch)
+    off = training.error_loss(drawing._replace(error=right + 2), batch)
     torch.testing.assert_close(off, torch.tensor(4 * OPTIONS.error_weight), rtol=1e-5, atol=0)
 
 
@@ -122,23 +131,14 @@ def test_a_killed_training_ends_as_if_it_had_never_stopped(
 ) -> None:
     """The weights, their mean, and the preceding pictures."""
     options = replace(OPTIONS, refined=0.25, motion=small_motion(pool=2, uses=3, longer=0.5))
-    whole, again = (new_training(ball_scene, options) for _ in range(2))
-    for _ in range(4):
-        whole.advance()
-    loop.save(whole, tmp_path / "checkpoint.safetensors")
-    loop.resume(again, tmp_path / "checkpoint.safetensors")
-    for training in (whole, again):
-        for _ in range(4):
-            training.advance()
-    for name, tensor in (whole.result() | whole.state()[0]).items():
-        assert torch.equal(tensor, (again.result() | again.state()[0])[name]), name
+    goes_on_after_a_kill(lambda: new_training(ball_scene, options, steps=8), 4, tmp_path)
 
 
 def test_a_patch_lies_around_content(ball_scene: Scene) -> None:
     """Of a side of 2: the corner of a picture has none."""
     options = replace(OPTIONS, patch=2, motion=replace(MOTION, uses=100))
     source = new_training(ball_scene, options).patches
-    patches = [source.cut(source.pool.draw()) for _ in range(100)]
+    patches = [source.cut(source.example()) for _ in range(100)]
     assert not any((patch.truth == 1).all() for patch in patches)
     assert len({(patch.view.low.cx, patch.view.low.cy) for patch in patches}) > 15
 
@@ -158,3 +158,80 @@ def test_wrong_options_are_named() -> None:
         lean_joint(average=1.0)
     with pytest.raises(ValueError, match=r"^joint\.clip: expected more than 0, or null, got 0"):
         lean_joint(clip=0.0)
+
+
+def train(scenes: list[Scene], output: Path, log: Log, channels: int = 3) -> dict[str, Tensor]:
+    model = lean_model(channels=channels, step=4.0)
+    joint = lean_joint(patch=4, motion=small_motion(pool=2, length=2))
+    stage2 = LeanStage2(model, partial(RENDERER, init="scratch"), joint)
+    stage2.pretrain(TEACHER, scenes, BUDGET, output, log)
+    return load_file(output)
+
+
+@pytest.mark.slow
+def test_the_weights_of_several_scenes_are_what_a_renderer_starts_from(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    on_black = replace(ball_scene, name="on black", background=torch.zeros(3), digest="on black")
+    output = tmp_path / "new folder" / "lean.safetensors"
+    written = train([ball_scene, on_black], output, quiet_log)
+    assert checkpoint.read(output)[1] == {"scenes": 2, "steps": BUDGET.renderer_steps}
+    assert {weight.dtype for weight in written.values()} == {torch.float16}
+    log = ConsoleLog(tmp_path / "again", quiet=True)  # where nothing is found again
+    again = train([ball_scene, on_black], tmp_path / "again.safetensors", log)
+    assert all(torch.equal(weight, again[name]) for name, weight in written.items())
+    for name in ("enter.weight", "leave.weight", "read.weight", "read.bias"):
+        assert written[name].isfinite().all(), name
+        assert written[name].any(), name  # the last three were 0 before the training
+    monkeypatch.setattr(renderers, "PRETRAINED", output)
+    started = RENDERER(3, 1, 4)
+    assert started.network.state_dict().keys() == written.keys()
+    for name, weight in started.network.state_dict().items():
+        assert torch.equal(weight, written[name].float()), name
+    for channels, frames in ((6, 1), (3, 0), (4, 0)):
+        other = RENDERER(channels, frames, 4)
+        assert torch.equal(other.network.trunk[0].spread, started.network.trunk[0].spread)
+
+
+def test_features_that_mean_something_else_in_every_scene_are_refused(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log
+) -> None:
+    with pytest.raises(SteerbenchError, match=r"channels \(K\) of 3, got 4"):
+        train([ball_scene], tmp_path / "lean.safetensors", quiet_log, channels=4)
+    assert not list(tmp_path.rglob("*.safetensors"))  # nothing was trained before
+
+
+def test_a_renderer_that_was_trained_on_the_same_scenes_is_found_again(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = train([ball_scene], tmp_path / "first.safetensors", quiet_log)
+    monkeypatch.delattr(JointTraining, "advance")
+    again = train([ball_scene], tmp_path / "again.safetensors", quiet_log)
+    for name, weight in first.items():
+        assert torch.equal(again[name], weight), name
+    with pytest.raises(AttributeError, match="advance"):  # with other scenes, another training
+        train([ball_scene, ball_scene], tmp_path / "other.safetensors", quiet_log)
+
+
+class Source:
+    """Patches of which all that is known is the source they are from."""
+
+    def __init__(self, number: int, generator: torch.Generator) -> None:
+        self.number, self.options, self.generator = number, OPTIONS, generator
+
+    def draw(self, count: int) -> Batch:
+        return Batch([], [], torch.full((count,), self.number), torch.zeros(0))
+
+
+def test_a_batch_is_of_one_source_and_every_source_has_its_turn() -> None:
+    def drawn(seed: int) -> list[int]:
+        generator = torch.Generator().manual_seed(seed)
+        patches = AnyOf([Source(number, generator) for number in range(3)])
+        batches = [patches.draw(2).truth.tolist() for _ in range(300)]
+        assert all(first == second for first, second in batches)
+        return [first for first, _ in batches]
+
+    numbers = drawn(0)
+    for number in range(3):
+        assert numbers.count(number) == pytest.approx(100, abs=41)  # 5 standard deviations
+    assert numbers == drawn(0) != drawn(1)

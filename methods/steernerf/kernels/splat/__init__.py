@@ -18,45 +18,22 @@ def splat(
 ) -> Tensor:
     """Find which of N points each pixel of a width x height picture shows: [height, width] int32.
 
-    An entry is the index of the last point that lands there, whatever its depth, -1 for none: in
+    The points have continuous coordinates (u, v) `pixels` [N, 2] and a z-depth `depth` [N]. An
+    entry is the index of the last point that lands there, whatever its depth, -1 for none: in
     SteerNeRF's release points overwrite each other. Only points inside the picture with a finite
     positive depth count. Not differentiable; for features use `gather`.
-
-    Args:
-        pixels: [N, 2] continuous coordinates (u, v), in pixels.
-        depth: [N] z-depth.
-        width, height: pixels of the picture, 1 or more.
-
-    Raises:
-        ValueError: wrong shape or size; backend "cpu": not float32.
     """
     check_shape("pixels", pixels, None, 2)
     check_shape("depth", depth, len(pixels))
-    if width < 1 or height < 1:
-        raise ValueError(f"width, height: expected 1 or more, got {width} x {height}")
     chosen = implementation(__name__, backend, pixels.device)
     return chosen.splat(pixels.detach(), depth.detach(), width, height)
 
 
 def gather(values: Tensor, index: Tensor, *, backend: str = "auto") -> Tensor:
-    """Rows of `values` [N, C] at `index` [...] int32, zeros where it is -1: [..., C].
-
-    Differentiable in `values`; the gradient of a row is the sum over all pixels that show it.
-
-    Raises:
-        ValueError: `index` is not int32 or out of range; backend "cpu": `values` is not float32.
-    """
+    """Rows of `values` [N, C] at `index` [...] int32, as from `splat`, zeros where it is -1:
+    [..., C]. Differentiable in `values`; the gradient of a row is the sum over all pixels that
+    show it."""
     check_shape("values", values, None, None)
-    if index.dtype != torch.int32:
-        raise ValueError(f"index: expected int32, got {index.dtype}")
-    # Checked only on a CPU; for a GPU the host would have to wait.
-    if index.numel() and index.device.type == "cpu":
-        least, most = (int(bound) for bound in index.aminmax())
-        if least < -1 or most >= len(values):
-            raise ValueError(
-                f"index: expected -1 to {len(values) - 1} for {len(values)} rows of values, "
-                f"got {least} to {most}"
-            )
     chosen = implementation(__name__, backend, values.device)
     rows = _Gather.apply(values.contiguous(), index.contiguous().view(-1), chosen)
     return rows.view(*index.shape, values.shape[1])

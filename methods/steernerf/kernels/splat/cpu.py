@@ -10,37 +10,30 @@ import torch
 from numba import get_num_threads, njit, prange
 from torch import Tensor
 
-from methods.kernels.cpu import i32
+from methods.kernels.cpu import arrays, check_float32, i32
 
 
 def splat(pixels: Tensor, depth: Tensor, width: int, height: int) -> Tensor:
     """The last point in each pixel."""
-    _check_float32(pixels=pixels, depth=depth)
+    check_float32(pixels, depth)
     index = torch.empty(height, width, dtype=torch.int32)
-    u_v, z = pixels.contiguous().numpy(), depth.contiguous().numpy()
-    _splat(u_v, z, index.numpy(), get_num_threads())
+    _splat(*arrays(pixels, depth, index), get_num_threads())
     return index
 
 
 def gather(values: Tensor, index: Tensor) -> Tensor:
     """The rows [P, C] of the points that pixels show."""
-    _check_float32(values=values)
+    check_float32(values)
     rows = torch.zeros(len(index), values.shape[1])
-    _gather(values.numpy(), index.numpy(), rows.numpy())
+    _gather(*arrays(values, index, rows))
     return rows
 
 
 def scatter(rows: Tensor, index: Tensor, points: int) -> Tensor:
     """Sums [points, C] of the `rows` of the pixels that show each point."""
     sums = torch.zeros(points, rows.shape[1])
-    _scatter(rows.numpy(), index.numpy(), sums.numpy())
+    _scatter(*arrays(rows, index, sums))
     return sums
-
-
-def _check_float32(**tensors: Tensor) -> None:
-    for name, x in tensors.items():
-        if x.dtype != torch.float32:
-            raise ValueError(f"backend 'cpu' splats float32, got {name} {x.dtype}: use 'reference'")
 
 
 @njit(cache=True, parallel=True)

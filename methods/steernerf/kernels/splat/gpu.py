@@ -1,7 +1,5 @@
-"""Splatting with Triton: one lane per point; points compete for their pixel with atomics.
-
-A maximum does not depend on the order of the atomics, so that the result is repeatable.
-"""
+"""Splatting with Triton: one lane per point; points compete for their pixel with atomics. A maximum
+does not depend on their order, so that the result is repeatable."""
 
 from __future__ import annotations
 
@@ -47,8 +45,7 @@ def _move(kernel: triton.JITFunction, values: Tensor, index: Tensor, rows: Tenso
 
 @triton.jit
 def _splat(pixels, depth, points, width, height, index, BLOCK: tl.constexpr):
-    """Compared as floats, where comparisons with NaN are false; converting huge or non-finite
-    values to integers is undefined."""
+    """Compared as floats, as on a CPU."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     u = tl.load(pixels + 2 * i, mask=i < points, other=-1.0)
     v = tl.load(pixels + 2 * i + 1, mask=i < points, other=-1.0)

@@ -17,12 +17,9 @@ TAPS = 9
 
 
 def neighbours_of(cells: Tensor, count: int | None = None) -> Tensor:
-    """Indices of the cells around each cell: [N, 9] int32, -1 for none.
-
-    Args:
-        cells: [B, h, w] bool mask; cells are numbered from 0, row by row, picture by picture.
-        count: N, the number of cells; None: it is counted, which waits for a GPU.
-    """
+    """Indices of the cells around each of the `cells` [B, h, w] bool: [N, 9] int32, -1 for none.
+    Cells are numbered from 0, row by row, picture by picture; N is `count`, or None: it is counted,
+    which waits for a GPU."""
     check_shape("cells", cells, None, None, None)
     batch, height, width = cells.shape
     number = torch.full((batch, height + 2, width + 2), -1, dtype=torch.int32, device=cells.device)
@@ -38,12 +35,8 @@ def neighbours_of(cells: Tensor, count: int | None = None) -> Tensor:
 
 
 def depthwise(x: Tensor, neighbours: Tensor, weight: Tensor, *, backend: str = "auto") -> Tensor:
-    """Convolve the cells `x` [N, C]; differentiable in `x` and `weight`.
-
-    Args:
-        neighbours: [N, 9] int32 of `neighbours_of`; the relation must be symmetric.
-        weight: [9, C].
-    """
+    """Convolve the cells `x` [N, C] with `weight` [9, C]; differentiable in both. `neighbours` [N,
+    9] int32 are those of `neighbours_of`; the relation must be symmetric."""
     check_shape("x", x, None, None)
     check_shape("neighbours", neighbours, len(x), TAPS)
     check_shape("weight", weight, TAPS, x.shape[1])

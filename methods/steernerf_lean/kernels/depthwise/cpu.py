@@ -7,7 +7,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from methods.kernels.cpu import f32
+from methods.kernels.cpu import arrays, check_float32, f32
 from methods.steernerf_lean.kernels.depthwise import TAPS
 
 CHUNKS = 16
@@ -16,30 +16,26 @@ CHUNKS = 16
 
 def depthwise(x: Tensor, neighbours: Tensor, weight: Tensor) -> Tensor:
     """As the reference, of float32."""
-    if not x.dtype == weight.dtype == torch.float32:
-        raise ValueError("backend 'cpu' convolves float32 only: use backend='reference'")
-    return _Depthwise.apply(x, neighbours, weight)
+    check_float32(x, weight)
+    return _Depthwise.apply(x.contiguous(), neighbours.contiguous(), weight.contiguous())
 
 
 class _Depthwise(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x, neighbours, weight):
-        x, neighbours, weight = x.contiguous(), neighbours.contiguous(), weight.contiguous()
         ctx.save_for_backward(x, neighbours, weight)
         out = torch.empty_like(x)
-        _convolve(*(part.detach().numpy() for part in (x, neighbours, weight)), out.numpy())
+        _convolve(*arrays(x, neighbours, weight, out))
         return out
 
     @staticmethod
     def backward(ctx, grad):
-        x, neighbours, weight = (part.detach() for part in ctx.saved_tensors)
-        grad = grad.contiguous()
+        x, neighbours, weight = ctx.saved_tensors
+        grad_x, parts = torch.empty_like(x), torch.zeros(CHUNKS, *weight.shape)
         # n is the k-th neighbour of m exactly if m is the (8 - k)-th of n: so the gradient is the
         # same convolution with reversed weights.
-        grad_x = torch.empty_like(x)
-        _convolve(grad.numpy(), neighbours.numpy(), weight.flip(0).numpy(), grad_x.numpy())
-        parts = torch.zeros(CHUNKS, *weight.shape)
-        _correlate(x.numpy(), neighbours.numpy(), grad.numpy(), parts.numpy())
+        _convolve(*arrays(grad, neighbours, weight.flip(0), grad_x))
+        _correlate(*arrays(x, neighbours, grad, parts))
         return grad_x, None, parts.sum(dim=0)
 
 

@@ -1,13 +1,9 @@
 """Backward warping: looks up the preceding picture at the points that the current picture shows.
 
-A pixel of the current picture takes its depth from the low-resolution depths around it, is
-unprojected to a point, and shows the colour of the preceding picture at that point, interpolated
-bilinearly. Its depth is the bilinear mean over those of the four nearest low-resolution pixels that
-have a depth at most `TOLERANCE` behind the nearest of the four, because the front surface hides
-what is behind it.
-
-The s x s pixels of a low-resolution pixel, its cell, are stored together. Only the given cells are
-warped.
+A pixel of the current picture is unprojected to a point, and shows the colour of the preceding
+picture there, interpolated bilinearly. Its depth is the bilinear mean over those of the four
+nearest low-resolution pixels that have a depth at most `TOLERANCE` behind the nearest of the four:
+the front surface hides what is behind it. Only the given cells are warped.
 """
 
 from __future__ import annotations
@@ -23,13 +19,8 @@ TOLERANCE = 0.02
 
 
 def enlarge(depth: Tensor, cells: Tensor, scale: int, *, backend: str = "auto") -> Tensor:
-    """Upsample depth to the s x s pixels of some cells, row by row: [N, s^2], inf for none.
-
-    Args:
-        depth: [h, w] z-depth at low resolution, not finite where there is none.
-        cells: [N] int64 low-resolution pixels, numbered row by row.
-        scale: s.
-    """
+    """Upsample the low-resolution z-depth `depth` [h, w], not finite where there is none, to the s
+    x s pixels of `cells` [N] int64, row by row: [N, s^2], inf for none."""
     check_shape("depth", depth, None, None)
     check_shape("cells", cells, None)
     return implementation(__name__, backend, depth.device).enlarge(depth, cells, scale)
@@ -45,41 +36,24 @@ def warp(
     *,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
-    """Warp `picture` [H, W, C], seen by `source`, into some cells of the view of `camera`.
+    """Warp `picture` [H, W, C], seen by `source`, into some cells of the view of `camera`, whose
+    size is a multiple of s; not differentiable.
 
-    Not differentiable.
-
-    Args:
-        depth: [N, s^2] z-depth of the pixels of `cells`, as from `enlarge`; a pixel is valid only
-            if its depth is positive and finite.
-        cells: [N] int64 cells of s x s pixels, numbered row by row.
-        camera: the current view; its size is a multiple of s.
-        scale: s.
-
-    Returns:
-        values [N, s^2, C], zero where invalid, and validity [N, s^2] in {0, 1}.
-
-    Raises:
-        ValueError: a size is wrong.
+    `depth` [N, s^2] is the z-depth of the pixels of `cells` [N] int64, as from `enlarge`; a pixel
+    is valid only if its depth is positive and finite. Returns values [N, s^2, C], zero where
+    invalid, and validity [N, s^2] in {0, 1}.
     """
     check_shape("picture", picture, source.height, source.width, None)
     check_shape("cells", cells, None)
     check_shape("depth", depth, len(cells), scale**2)
-    if camera.width % scale or camera.height % scale:
-        raise ValueError(
-            f"camera: expected cells of {scale} x {scale} pixels, got {camera.width} x "
-            f"{camera.height} pixels"
-        )
     return implementation(__name__, backend, picture.device).warp(
         picture, depth, cells, camera.width // scale, scale, source_from_camera(source, camera)
     )
 
 
 def source_from_camera(source: Camera, camera: Camera) -> tuple[Tensor, Tensor]:
-    """M [3, 3], m [3]: homogeneous source pixel = z M (u, v, 1) + m.
-
-    In float64, on the device of the cameras, to which intrinsics are copied without waiting.
-    """
+    """M [3, 3], m [3]: homogeneous source pixel = z M (u, v, 1) + m, in float64, on the device of
+    the cameras, to which intrinsics are copied without waiting."""
     to, of = source.c2w.double(), camera.c2w.double()
     rotation = to[:, :3].T @ of[:, :3]
     offset = to[:, :3].T @ (of[:, 3] - to[:, 3])

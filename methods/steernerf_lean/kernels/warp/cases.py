@@ -28,48 +28,36 @@ MEAN_ROUNDINGS = 8
 and its product, three sums, those of the weights, and the quotient, unless they cancel."""
 
 ROUNDINGS = MEAN_ROUNDINGS + 9
-"""The same number from the inputs to numerator and denominator of a coordinate: those of the mean
-depth, two for a matrix entry, six for the sum of products, and one that stands for their quotient
-and its difference to the centre of a pixel."""
+"""The same number up to numerator and denominator of a coordinate: two more for a matrix entry, six
+for the sum of products, one for their quotient and its difference to the centre of a pixel."""
 
 Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A depth map [height, width] of a wavy wall at a depth of 2, and what it is warped with.
-
-    Attributes:
-        turn, move: rotation vector of the source, in radians, and its offset.
-        holes: whether some pixels have no depth.
-        edge: how much farther away the right half of the depth map and one row are.
-        channels: channels of the picture.
-        every: only every n-th cell; 0: none.
-    """
+    """A depth map [height, width] of a wavy wall at a depth of 2, and what it is warped with."""
 
     width: int = 24
     height: int = 17
     scale: int = 4
-    turn: Vector = (0.0, 0.0, 0.0)
-    move: Vector = (0.0, 0.0, 0.0)
-    holes: bool = False
-    edge: float = 0.0
-    channels: int = 3
-    every: int = 1
+    turn: Vector = (0.0, 0.0, 0.0)  # rotation vector of the source, in radians
+    move: Vector = (0.0, 0.0, 0.0)  # its offset
+    holes: bool = False  # whether some pixels have no depth
+    edge: float = 0.0  # how much farther away the right half of the depth map and one row are
+    channels: int = 3  # of the picture
+    every: int = 1  # only every n-th cell; 0: none
 
 
 FRAME = "200 x 200 to 800 x 800"
 
 KINDS = {
     "one pixel": Kind(1, 1, 1),
-    "one of one": Kind(9, 7, 1),
-    "one channel": Kind(9, 7, move=(0.02, 0.01, 0.0), channels=1),
+    "one channel": Kind(9, 7, 1, move=(0.02, 0.01, 0.0), channels=1),
     "seven channels": Kind(9, 7, 3, move=(0.02, 0.01, 0.0), channels=7),
     "turned": Kind(turn=(0.05, -0.04, 0.02), move=(-0.05, 0.1, 0.05)),
     "rolled": Kind(turn=(0.0, 0.0, 0.5 * math.pi)),
-    "holes": Kind(move=(0.03, 0.0, 0.1), holes=True),
-    "edges": Kind(move=(0.03, 0.0, 0.1), edge=0.5),
-    "edges and holes": Kind(edge=0.5, holes=True),
+    "edges and holes": Kind(move=(0.03, 0.0, 0.1), edge=0.5, holes=True),
     "holes, NaN, 1e20 and 2": Kind(edge=1e20, holes=True),
     "leaving the picture": Kind(turn=(0.0, 0.2, 0.0)),
     "behind the source": Kind(turn=(0.0, math.pi, 0.0)),
@@ -133,12 +121,12 @@ def _given(kind: Kind) -> Given:
     """The inputs; of each pixel, whether rounding leaves its validity as it is, and by how much the
     places that two backends look up may differ."""
     source, camera = _cameras(kind)
-    cells = torch.arange(kind.width * kind.height)
+    depth, cells = _depth(kind), torch.arange(kind.width * kind.height)
     cells = cells[:: kind.every] if kind.every else cells[:0]
     shape = camera.height, camera.width, kind.channels
     picture = torch.rand(shape, generator=torch.Generator().manual_seed(kind.width + kind.scale))
 
-    fine = enlarge(_depth(kind).double(), cells, kind.scale, backend="reference")
+    fine = enlarge(depth.double(), cells, kind.scale, backend="reference")
     matrix, offset = source_from_camera(source, camera)
     pixel = functional.pad(centres(cells, kind.width, kind.scale).double(), (0, 1), value=1.0)
     z = fine.nan_to_num(posinf=0)[..., None]
@@ -151,7 +139,7 @@ def _given(kind: Kind) -> Given:
     known = fine.isfinite()
     return {
         **{"picture": picture, "source": source, "camera": camera},
-        **{"depth": _depth(kind), "cells": cells, "scale": kind.scale},
+        **{"depth": depth, "cells": cells, "scale": kind.scale},
         "sure": (sure | ~known).float(),
         "fine": z.squeeze(-1),
         "off": torch.where(sure & known, off.sum(dim=-1), 0),

@@ -8,15 +8,15 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from methods.kernels.cpu import f32
+from methods.kernels.cpu import arrays, check_float32, f32
 from methods.steernerf_lean.kernels.warp import TOLERANCE
 
 
 def enlarge(depth: Tensor, cells: Tensor, scale: int) -> Tensor:
     """As the reference, of float32."""
-    _check_float32(depth)
+    check_float32(depth)
     out = torch.empty(len(cells), scale**2)
-    _enlarge(depth.contiguous().numpy(), cells.numpy(), scale, f32(TOLERANCE), out.numpy())
+    _enlarge(*arrays(depth, cells), scale, f32(TOLERANCE), out.numpy())
     return out
 
 
@@ -29,18 +29,11 @@ def warp(
     projection: tuple[Tensor, Tensor],
 ) -> tuple[Tensor, Tensor]:
     """As the reference, of float32."""
-    _check_float32(picture, depth)
+    check_float32(picture, depth)
     values, valid = torch.empty(*depth.shape, picture.shape[2]), torch.empty(depth.shape)
-    given = (picture.contiguous(), depth.contiguous(), cells)
-    matrix, offset = (x.float().numpy() for x in projection)
-    view = width, scale, matrix, offset
-    _warp(*(x.numpy() for x in given), *view, values.numpy(), valid.numpy())
+    camera = (x.float() for x in projection)
+    _warp(*arrays(picture, depth, cells), width, scale, *arrays(*camera, values, valid))
     return values, valid
-
-
-def _check_float32(*tensors: Tensor) -> None:
-    if wrong := {x.dtype for x in tensors} - {torch.float32}:
-        raise ValueError(f"backend 'cpu' warps float32, got {wrong.pop()}: use backend='reference'")
 
 
 @njit(cache=True, parallel=True)

@@ -73,14 +73,10 @@ def warp(
 
 
 def whole(blocks: Tensor, scale: int) -> Tensor:
-    """[h, w, s^2, C] put back to a picture [h s, w s, C], a pixel at a time."""
+    """[h, w, s^2, C] put back to a picture [h s, w s, C]."""
     height, width, _, channels = blocks.shape
-    picture = torch.full((height * scale, width * scale, channels), math.nan)
-    for row in range(height * scale):
-        for column in range(width * scale):
-            sub = row % scale * scale + column % scale
-            picture[row, column] = blocks[row // scale, column // scale, sub]
-    return picture
+    parts = blocks.view(height, width, scale, scale, channels).transpose(1, 2)
+    return parts.reshape(height * scale, width * scale, channels)
 
 
 def plain_depth(depth: list[list[float]], x: float, y: float) -> float:
@@ -201,66 +197,30 @@ def test_some_cells_are_those_of_the_whole(backend: str) -> None:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("scale", [1, 3, 4])
-def test_a_camera_that_rests_sees_the_picture_again(scale: int, backend: str) -> None:
-    camera = straight(6 * scale, 5 * scale)
-    picture = noise(5 * scale, 6 * scale)
-    values, valid = warp(picture, camera, torch.full((5, 6), 2.0), camera, scale, backend=backend)
-    assert torch.equal(whole(values, scale), picture)
-    assert (valid == 1).all()
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_a_plane_moves_by_focal_length_times_offset_over_depth(backend: str) -> None:
     camera, depth = straight(24, 16), torch.full((4, 6), 2.0)
     picture = noise(16, 24)
     # The camera has moved from the source: 32 * 0.1875 / 2 = 3 pixels right, 32 * 0.125 / 2 = 2 up.
     source = moved(camera, -0.1875, 0.125, 0.0)
-    values, valid = (part for part in warp(picture, source, depth, camera, 4, backend=backend))
-    values, valid = whole(values, 4), whole(valid[..., None], 4)[..., 0]
-    assert torch.equal(values[2:, :-3], picture[:-2, 3:])
-    assert (valid[2:, :-3] == 1).all()
-    assert not valid[:2].any()
-    assert not valid[:, -3:].any()
-    assert not values[:2].any()
-    assert not values[:, -3:].any()
+    values, valid = warp(picture, source, depth, camera, 4, backend=backend)
+    want, seen = torch.zeros_like(picture), torch.zeros(16, 24)
+    want[2:, :-3], seen[2:, :-3] = picture[:-2, 3:], 1
+    assert torch.equal(whole(values, 4), want)
+    assert torch.equal(whole(valid[..., None], 4)[..., 0], seen)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_depth_is_taken_in_the_middle_of_its_cell(backend: str) -> None:
-    camera = straight(24, 16)
-    depth = torch.full((4, 6), math.inf)
-    depth[2, 3] = 2.0
-    picture = torch.ones(16, 24, 1)
-    _, valid = warp(picture, camera, depth, camera, 4, backend=backend)
-    row, column = whole(valid[..., None], 4)[..., 0].nonzero().unbind(dim=1)
-    # All pixels less than 4 away from the sample at (14, 10).
-    for places, centre in ((column, 14), (row, 10)):
-        near = [i for i in range(24) if abs(i + 0.5 - centre) < 4]
-        assert places.unique().tolist() == near
-    assert len(row) == 64
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize(
-    ("depth", "offset", "facing"),
-    [
-        *((depth, 0.0, 1.0) for depth in (math.inf, -math.inf, math.nan, 0.0)),
-        *((depth, -3.0, 1.0) for depth in (0.0, -1.0)),  # which the source sees from behind
-        (2.0, 3.0, 1.0),
-        (2.0, 0.0, -1.0),
-    ],
-)
-def test_without_a_depth_and_behind_the_source_nothing_is_known(
-    depth: float, offset: float, facing: float, backend: str
-) -> None:
+def test_without_a_depth_and_behind_the_source_nothing_is_known(backend: str) -> None:
     camera = straight(12, 8)
-    source = moved(camera, 0.0, 0.0, offset)
-    source = replace(source, c2w=source.c2w * torch.tensor([facing, 1.0, facing, 1.0]))
-    z = torch.full((2, 3), depth)
-    values, valid = warp(noise(8, 12), source, z, camera, 4, backend=backend)
-    assert not values.any()
-    assert not valid.any()
+    unknown = [(depth, 0.0, 1.0) for depth in (math.inf, -math.inf, math.nan, 0.0)]
+    from_behind = [(0.0, -3.0, 1.0), (-1.0, -3.0, 1.0)]  # which the source sees
+    for depth, offset, facing in (*unknown, *from_behind, (2.0, 3.0, 1.0), (2.0, 0.0, -1.0)):
+        source = moved(camera, 0.0, 0.0, offset)
+        source = replace(source, c2w=source.c2w * torch.tensor([facing, 1.0, facing, 1.0]))
+        z = torch.full((2, 3), depth)
+        values, valid = warp(noise(8, 12), source, z, camera, 4, backend=backend)
+        assert not values.any()
+        assert not valid.any()
 
 
 def test_the_reference_keeps_the_digits_of_float64() -> None:
@@ -291,11 +251,9 @@ def test_wrong_arguments_are_named() -> None:
         warp_cells(picture[:, 1:], camera, depth, cells, camera, 4)
     with pytest.raises(ValueError, match=r"depth: expected shape \[6, 16\], got \[96\]"):
         warp_cells(picture, camera, depth.flatten(), cells, camera, 4)
-    with pytest.raises(ValueError, match=r"camera: expected cells of 4 x 4 pixels, got 12 x 9"):
-        warp_cells(picture, camera, depth, cells, replace(camera, height=9), 4)
-    with pytest.raises(ValueError, match="warps float32"):
+    with pytest.raises(ValueError, match="computes with float32"):
         warp_cells(picture.double(), camera, depth, cells, camera, 4, backend="cpu")
     with pytest.raises(ValueError, match=r"depth: expected shape \[any, any\], got \[96\]"):
         enlarge_cells(depth.flatten(), cells, 4)
-    with pytest.raises(ValueError, match="warps float32"):
+    with pytest.raises(ValueError, match="computes with float32"):
         enlarge_cells(depth.double(), cells, 4, backend="cpu")

@@ -1,0 +1,200 @@
+"""Stage 2: the 2D renderer and the field, trained together on patches (Section 3.4)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property, partial
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from bench.provenance import digest, libraries
+from bench.types import Budget, Log, Scene
+from methods.instant_ngp.stage1 import Setup, TrainedField
+from methods.instant_ngp.training import FieldOptimiser, restore_field
+from methods.kernels import multiplies_bf16
+from methods.kernels.types import expect
+from methods.rendering.batch import opacity_entropy
+from methods.rendering.occupancy import EVERY
+from methods.steernerf.options import JointOptions, Model
+from methods.steernerf.patches import Batch, Patches, distilled_views
+from methods.steernerf.pipeline import Pipeline
+from methods.steernerf.unet import Renderer2d
+from methods.training import checkpoint, loop
+
+MARKS = (0.125, 0.25, 0.5)
+"""Shares of the steps after which the weights are saved as well: an ablation becomes a curve."""
+
+
+class JointTraining:
+    """Stage 2 as a `loop.Training`: trains `renderer` in place, on patches from `patches`, and the
+    field `trained`, unless that is None: then it is frozen. `outcome` is the 2D renderer that
+    results. A subclass may override `judge`, `update` and `outcome`."""
+
+    advice = "Try smaller learning rates (method.joint.rate, method.joint.field_rate)."
+    asked: loop.Asked | None = None
+
+    def __init__(
+        self, renderer: Renderer2d, patches: Patches, steps: int, trained: TrainedField | None
+    ) -> None:
+        self.renderer = self.outcome = renderer
+        self.patches, self.options, self.generator = patches, patches.options, patches.generator
+        self.step, self.steps, self.seconds = 0, steps, 0.0
+        self.trained = trained
+        if trained is not None:
+            self.field_optimiser = FieldOptimiser(trained.field)
+            seed = self.generator.initial_seed()
+            self._visits = torch.Generator(trained.field.device).manual_seed(seed)
+
+    @cached_property
+    def optimiser(self) -> torch.optim.Adam:
+        """Adam for the renderer; created when first needed, like that of the field."""
+        return torch.optim.Adam(self.renderer.parameters(), lr=self.options.rate, fused=True)
+
+    def advance(self) -> dict[str, float]:
+        """Take one step; return the mean squared error of the pictures, as `loop.look` does, which
+        raises SteerbenchError if it is not finite. The density grid follows the field."""
+        if self.trained and self.options.grid_samples and self.step % EVERY == 0:
+            grid = self.trained.grid
+            grid.update(self.trained.field, self._visits, self.options.grid_samples)
+            self.patches.pipeline.occupancy = grid.occupancy
+        batch = self.patches.draw(self.options.batch)
+        kind = batch.truth.device.type
+        with torch.autocast(kind, torch.bfloat16, enabled=multiplies_bf16(kind)):
+            drawn = self.renderer(batch.observations)
+        pictures, more = self.judge(drawn, batch)
+        loss = functional.mse_loss(pictures, batch.truth)
+        (loss + more).backward()
+        errors = loop.look(self, {"": loss}, {"loss": loss, "picture": pictures})
+        self.update()
+        self.step += 1
+        return errors
+
+    def judge(self, drawn: Any, batch: Batch) -> tuple[Tensor, Tensor | float]:
+        """The pictures that the renderer has `drawn`, and the loss besides their squared error."""
+        if self.trained and len(batch.opacity):
+            return drawn, self.options.opacity_entropy * opacity_entropy(batch.opacity)
+        return drawn, 0.0
+
+    def update(self) -> None:
+        """Update the weights."""
+        loop.step_at(self.optimiser, self.rate_now(self.options.rate))
+        if self.trained:
+            self.field_optimiser.step(self.rate_now(self.options.field_rate))
+
+    def rate_now(self, first: float) -> float:
+        """The learning rate of the next step, for one that starts at `first`."""
+        final, waves = self.options.final_rate / first, self.options.half_waves
+        return first * loop.cosine(self.step / self.steps, final, waves)
+
+    def watched(self) -> dict[str, Tensor]:
+        """The parameters of the renderer, and of a field that learns."""
+        field = self.trained.field.named_parameters("field") if self.trained else ()
+        return dict([*self.renderer.named_parameters("renderer"), *field])
+
+    def result(self) -> dict[str, Tensor]:
+        """Renderer, and field and density grid if they learn."""
+        result = self.outcome.state_dict(prefix="outcome.")
+        if self.trained:
+            result |= self.trained.field.state_dict(prefix="field.")
+            result["grid.density"] = self.trained.grid.density
+        return result
+
+    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+        """Restore what `result` returned."""
+        self.outcome.load_state_dict(checkpoint.part(tensors, "outcome."))
+        if self.trained:
+            restore_field(self.trained.field, self.trained.grid, tensors)
+            self.patches.pipeline.occupancy = self.trained.grid.occupancy
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
+        """Optimisers, random numbers, and the examples that patches are cut from."""
+        tensors = checkpoint.optimiser_tensors(self.optimiser, "renderer_adam.")
+        tensors |= {f"patches.{name}": x for name, x in self.patches.state().items()}
+        tensors["generator"] = self.generator.get_state()
+        if self.trained:
+            tensors |= {"visits": self._visits.get_state(), **self.field_optimiser.tensors()}
+        return tensors, {}
+
+    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
+        """Restore what `result` and `state` returned."""
+        self.restore_result(tensors)
+        checkpoint.restore_optimiser(self.optimiser, tensors, "renderer_adam.")
+        self.patches.restore(checkpoint.part(tensors, "patches."))
+        self.generator.set_state(tensors["generator"].cpu())
+        if self.trained:
+            self.field_optimiser.restore(tensors)
+            self._visits.set_state(tensors["visits"].cpu())
+
+
+@dataclass(frozen=True)
+class Stage2:
+    """What is trained in stage 2, and how. A variant of the method has other classes of the
+    pipeline, of its patches and of the training."""
+
+    model: Model  # the settings it is trained for
+    renderer: Callable[..., Renderer2d]  # makes the 2D renderer for K, L and s
+    joint: JointOptions  # how it is trained
+    after: float = 1.0  # share of the steps whose weights are used, 1 or one of `MARKS`
+
+    pipeline: ClassVar[type[Pipeline]] = Pipeline
+    patches: ClassVar[type[Patches]] = Patches
+    training: ClassVar[type[JointTraining]] = JointTraining
+
+    def __post_init__(self) -> None:
+        marks = ", ".join(map(str, MARKS))
+        expect(self.after in (*MARKS, 1), "after", f"{marks} or 1", self.after)
+
+    def key(self, budget: Budget) -> dict[str, object]:
+        """Everything that the training depends on, besides the field of stage 1."""
+        make: Any = self.renderer
+        kind, settings = (make.func, make.keywords) if isinstance(make, partial) else (make, {})
+        return {
+            "renderer_steps": budget.renderer_steps,
+            "model": asdict(self.model),
+            "renderer": {"kind": f"{kind.__module__}.{kind.__qualname__}", **settings},
+            "joint": asdict(self.joint),
+            "stage2": digest(type(self), kind),
+            "stage2_libraries": libraries(type(self), kind),
+        }
+
+    def make(self, setup: Setup) -> Renderer2d:
+        """Make the untrained 2D renderer of the seed and the device of `setup`."""
+        torch.manual_seed(setup.seed)
+        made: Any = self.renderer(self.model.channels, self.model.frames, self.model.scale)
+        return made.to(setup.device, memory_format=torch.channels_last)
+
+
+def train_stage2(
+    trained: TrainedField, setup: Setup, stage2: Stage2, scene: Scene, budget: Budget, log: Log
+) -> tuple[Pipeline, dict[str, object], float]:
+    """Train `stage2` on the field that `setup` made for `scene`, or load the result of the same
+    training. The field is widened to K features and changed in place. Returns the pipeline, the
+    key of its weights, and the seconds of stage 2 spent on them."""
+    model, joint, steps = stage2.model, stage2.joint, budget.renderer_steps
+    key = {**setup.key(scene, budget), **stage2.key(budget)}
+    folder = log.stage_dir("steernerf", key)
+    finished = folder / "steernerf.safetensors"
+    count = 0 if finished.exists() else joint.distilled(steps, model.frames)
+    distilled, distilled_s = distilled_views(setup, trained, scene, budget, count, log)
+    random = torch.Generator().manual_seed(setup.seed) if joint.features == "random" else None
+    trained.field.widen(model.channels, random)
+
+    renderer, generator = stage2.make(setup), torch.Generator().manual_seed(setup.seed)
+    pipeline = stage2.pipeline(trained, scene.background, renderer, model)
+    patches = stage2.patches(pipeline, scene, distilled, joint, generator)
+    training = stage2.training(renderer, patches, steps, trained if patches.learning else None)
+    pipeline.renderer, training.seconds = training.outcome, distilled_s
+
+    marks = {folder / f"after-{share}.safetensors": math.ceil(share * steps) for share in MARKS}
+    loop.train(training, finished, "training the 2D renderer", log, marks)
+    if stage2.after < 1:
+        loop.load(training, folder / f"after-{stage2.after}.safetensors")
+        key["after"] = stage2.after
+    trained.field.requires_grad_(False).gradients = None
+    pipeline.renderer.requires_grad_(False)
+    return pipeline, key, training.seconds

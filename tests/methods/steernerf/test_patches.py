@@ -1,0 +1,276 @@
+"""What stage 2 learns from: distilled views, examples and how long they are used, patches."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from bench.cameras import pack_camera
+from bench.console import ConsoleLog
+from bench.types import Budget, Camera, NullProbe, Scene, Split
+from methods.instant_ngp.stage1 import Setup, TrainedField
+from methods.rendering.frame import everywhere, render_frame
+from methods.steernerf import patches
+from methods.steernerf.options import MotionOptions
+from methods.steernerf.patches import Patches, distilled_views
+from methods.steernerf_lean.training import LeanPatches
+from methods.training import checkpoint
+from tests.methods.conftest import SIZE, ball
+from tests.methods.models import (
+    SMALL_GRID,
+    lean_joint,
+    lean_pipeline,
+    misty_field,
+    new_pipeline,
+    small_joint,
+    small_model,
+    small_motion,
+    trained_field,
+)
+from tests.methods.trainings import QUICK
+
+COUNT = 3
+BUDGET = Budget("test", steps=1, samples=1)
+TARGET = torch.full((3,), 0.5)
+
+
+@pytest.fixture(scope="module")
+def trained() -> TrainedField:
+    """In place of a trained field, one in which there is something to see."""
+    return trained_field(misty_field(channels=3))
+
+
+def views_of(
+    trained: TrainedField, scene: Scene, root: Path, seed: int = 0, count: int = COUNT
+) -> Split:
+    """Distilled views, with `root` as the folder of all results."""
+    setup = Setup.resolved(SMALL_GRID, QUICK, "bf16", "auto", "cpu", seed)
+    log = ConsoleLog(root, quiet=True)
+    return distilled_views(setup, trained, scene, BUDGET, count, log)[0]
+
+
+def same(first: Split, second: Split) -> bool:
+    """Whether poses, intrinsics and pictures are equal to the last bit."""
+    cameras = zip(first.cameras, second.cameras, strict=True)
+    pictures = zip(first.images, second.images, strict=True)
+    return all(torch.equal(pack_camera(a), pack_camera(b)) for a, b in cameras) and all(
+        torch.equal(a, b) for a, b in pictures
+    )
+
+
+def test_a_distilled_view_is_what_the_field_shows_among_the_training_cameras(
+    trained: TrainedField, ball_scene: Scene, tmp_path: Path
+) -> None:
+    """At full resolution, and on none of them."""
+    centres = torch.stack([camera.c2w[:, 3] for camera in ball_scene.splits["train"].cameras])
+    views = views_of(trained, ball_scene, tmp_path)
+    assert len(views) == COUNT
+    for camera, picture in zip(views.cameras, views.images, strict=True):
+        assert (camera.width, camera.height) == (SIZE, SIZE)
+        assert picture.shape == (SIZE, SIZE, 3)
+        assert picture.dtype == torch.uint8
+        away = (camera.c2w[:, 3] - centres).norm(dim=1)
+        assert 1e-3 < away.min() < 1.6  # the distance of all cameras from the ball
+        field, occupancy, probe = trained.field, trained.occupancy, NullProbe()
+        render = everywhere(field, occupancy, probe, trained.sampling)
+        frame = render_frame(camera, occupancy, ball_scene.background, probe, render)
+        assert (frame.alpha > 0.1).float().mean() > 0.1
+        shown = 255 * frame.values
+        assert (picture.float() - shown).abs().max() <= 0.5 + 1e-4  # rounded, in float32
+
+
+def test_distilled_views_are_found_again_without_rendering(
+    trained: TrainedField, ball_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = views_of(trained, ball_scene, tmp_path)
+    assert views_of(trained, ball_scene, tmp_path, count=0).cameras == []
+    assert len(views_of(trained, ball_scene, tmp_path, count=1)) == 1  # other views
+    monkeypatch.delattr(patches, "render_frame")
+    assert same(views_of(trained, ball_scene, tmp_path), first)
+    with pytest.raises(NameError, match="render_frame"):
+        views_of(trained, ball_scene, tmp_path / "elsewhere")
+    left = (tmp_path / "elsewhere" / "stages").glob("*/*")
+    assert [path.name for path in left] == ["lock"]
+    # The seed alone decides which they are.
+    monkeypatch.undo()
+    assert same(views_of(trained, ball_scene, tmp_path / "again"), first)
+    other = views_of(trained, ball_scene, tmp_path, seed=1)
+    pairs = zip(first.cameras, other.cameras, strict=True)
+    assert not any(torch.equal(a.c2w, b.c2w) for a, b in pairs)
+
+
+def new_patches(
+    scene: Scene, motion: MotionOptions, share: float = 0.0, frames: int = 2, **joint: Any
+) -> Patches:
+    """The second half of the pictures of `scene` stands for distilled views."""
+    split = scene.splits["train"]
+    halves = [
+        replace(split, cameras=split.cameras[part], images=split.images[part], names=())
+        for part in (slice(12), slice(12, None))
+    ]
+    scene = replace(scene, splits={"train": halves[0]})
+    options = small_joint(distilled_share=share, motion=motion, **joint)
+    pipeline, generator = new_pipeline(small_model(frames=frames)), torch.Generator().manual_seed(0)
+    return Patches(pipeline, scene, halves[1], options, generator)
+
+
+def test_an_example_is_replaced_after_its_uses(ball_scene: Scene) -> None:
+    source = new_patches(ball_scene, small_motion(pool=1, uses=3))
+    drawn = [source.example() for _ in range(7)]
+    assert [example is drawn[0] for example in drawn] == [True] * 3 + [False] * 4
+    assert drawn[3] is drawn[5]
+    assert drawn[3] is not drawn[6]
+
+
+def test_the_pool_holds_no_more_than_it_is_to(ball_scene: Scene) -> None:
+    source = new_patches(ball_scene, small_motion(pool=3, uses=100, length=1))
+    assert len({id(source.example()) for _ in range(40)}) == 3
+
+
+@pytest.mark.parametrize(("share", "distilled"), [(0.0, 0), (1.0, 20)])
+def test_the_share_of_distilled_views_is_kept(
+    ball_scene: Scene, share: float, distilled: int
+) -> None:
+    source = new_patches(ball_scene, small_motion(pool=1, uses=1, length=0), share)
+    drawn = [source.example() for _ in range(20)]
+    assert sum(example.number >= 12 for example in drawn) == distilled
+
+
+@pytest.mark.parametrize(
+    ("motion", "lengths"), [({"length": 3}, {0, 1, 2}), ({"length": 2, "least": 2}, {2})]
+)
+def test_cold_and_steady_starts_both_occur_if_they_may(
+    ball_scene: Scene, motion: dict[str, int], lengths: set[int]
+) -> None:
+    source = new_patches(ball_scene, small_motion(pool=1, uses=1, **motion))
+    assert {len(source.example().buffer) for _ in range(24)} == lengths  # L = 2
+
+
+def test_the_newest_preceding_frame_is_a_step_away(ball_scene: Scene) -> None:
+    motion = small_motion(degrees=(2.0, 2.0), pool=1, uses=1, length=3, longer=0.0)
+    source = new_patches(ball_scene, motion)
+    for example in (source.example() for _ in range(12)):
+        away = source.cameras[example.number].c2w[:, 3] - TARGET
+        for age, cloud in enumerate(example.buffer, 1):
+            then = cloud.camera.c2w[:, 3] - TARGET
+            turn = torch.rad2deg(torch.acos(torch.cosine_similarity(away, then, dim=0)))
+            assert turn.item() == pytest.approx(2.0 * age, rel=0.05)  # the bend makes it shorter
+
+
+def test_an_example_goes_on_there_and_back_to_its_view(
+    ball_scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And leaves what was drawn before as it was."""
+    motion = small_motion(degrees=(2.0, 2.0), pool=1, uses=1, length=4, longer=0.999)
+    source = new_patches(ball_scene, motion)
+    drawn, rendered = [source.example()], []
+    buffers = [list(drawn[0].buffer)]
+    remember = source.pipeline.remember
+
+    def watched(camera: Camera, *rest: Any) -> None:
+        rendered[-1].append(camera)
+        remember(camera, *rest)
+
+    monkeypatch.setattr(source.pipeline, "remember", watched)
+    for _ in range(11):
+        rendered.append([])
+        drawn.append(source.example())
+        buffers.append(list(drawn[-1].buffer))
+    assert [list(example.buffer) for example in drawn] == buffers
+    assert len({example.number for example in drawn}) == 1
+    centre = source.cameras[drawn[0].number].c2w[:, 3]
+    for done, after in zip(rendered, drawn[1:], strict=True):
+        frames = len(done)
+        assert frames in (1, 2, 4)  # the view, and if the camera leaves it, out and back
+        moved = (after.buffer[0].camera.c2w[:, 3] - centre).norm().item()
+        step = 2 * (centre - TARGET).norm().item() * math.sin(math.radians(1.0))
+        assert moved == pytest.approx(0.0 if frames == 1 else step, rel=0.02, abs=1e-6)
+
+
+@pytest.mark.parametrize("lean", [False, True])
+def test_examples_that_were_kept_in_a_file_go_on_as_they_would_have(
+    ball_scene: Scene, tmp_path: Path, lean: bool
+) -> None:
+    motion = small_motion(pool=3, uses=2, longer=0.5)
+
+    def new() -> Patches:
+        generator, none = torch.Generator().manual_seed(0), Split([], [], [])
+        if lean:
+            return LeanPatches(
+                lean_pipeline(), ball_scene, none, lean_joint(motion=motion), generator
+            )
+        return new_patches(ball_scene, motion, share=0.5)
+
+    source, other = new(), new()
+    for _ in range(12):
+        source.example()
+    checkpoint.write(tmp_path / "pool.safetensors", source.state(), {})
+    other.restore(checkpoint.read(tmp_path / "pool.safetensors")[0])
+    other.generator.set_state(source.generator.get_state())
+    for _ in range(12):
+        one, another = source.example(), other.example()
+        assert replace(one, buffer=None) == replace(another, buffer=None)
+    kept, found = source.state(), other.state()
+    assert kept.keys() == found.keys()
+    assert all(torch.equal(kept[name], found[name]) for name in kept)
+    assert any(name.endswith(".picture") for name in kept) == lean
+
+
+MOTION = small_motion(pool=3, uses=100, length=2)
+
+
+@pytest.mark.parametrize(("share", "side"), [(1.0, 6), (0.75, 6), (0.5, 4), (0.01, 1)])
+def test_a_patch_has_its_side_and_at_most_its_share_of_the_frame(
+    ball_scene: Scene, share: float, side: int
+) -> None:
+    """Of a frame of 8 x 8 low-resolution pixels."""
+    source = new_patches(ball_scene, MOTION, patch=6, patch_share=share)
+    low = source.cut(source.example()).view.low
+    assert (low.width, low.height) == (side, side)
+
+
+def test_a_patch_lies_anywhere(ball_scene: Scene) -> None:
+    """Of a side of 2: the corner of a picture shows background alone."""
+    source = new_patches(ball_scene, MOTION, patch=2)
+    cuts = [source.cut(source.example()) for _ in range(200)]
+    corners = {(round(patch.view.low.cx, 3), round(patch.view.low.cy, 3)) for patch in cuts}
+    assert len(corners) > 40  # of 7 x 7, one of which 200 draws miss in the mean
+    assert any((patch.truth == 1).all() for patch in cuts)
+
+
+def test_rays_of_patches_are_jittered_if_they_are_to(ball_scene: Scene) -> None:
+    """The same patch twice: other samples, and so other opacities, only with jitter."""
+    for jitter in (False, True):
+        source = new_patches(ball_scene, MOTION, patch=4, jitter=jitter)
+        patch = source.cut(source.example())
+        one, other = (source.render([patch]).opacity for _ in range(2))
+        assert torch.equal(one, other) == (not jitter)
+
+
+def test_a_patch_shows_what_the_picture_shows_there(ball_scene: Scene) -> None:
+    """The true colour of a pixel of the ball is its normal: also that of the patch's own camera."""
+    source = new_patches(ball_scene, MOTION, patch=4)
+    patch = source.cut(source.example())
+    cut = patch.view.full
+    assert patch.truth.shape == (cut.height, cut.width, 3)
+    expected = ball(cut).float() / 255
+    expected = expected[..., :3] * expected[..., 3:] + 1 - expected[..., 3:]
+    assert (patch.truth - expected).abs().max() <= 1 / 255  # the colour of a ray, rounded twice
+
+
+def test_beyond_the_border_of_a_picture_its_last_row_and_column_go_on(ball_scene: Scene) -> None:
+    """Of a picture of 18 x 19 pixels, cut through the ball, the last cells are not all there."""
+    split = ball_scene.splits["train"]
+    cameras = [replace(camera, width=18, height=19) for camera in split.cameras]
+    images = [image[:19, :18] for image in split.images]
+    scene = replace(ball_scene, splits={"train": replace(split, cameras=cameras, images=images)})
+    truth = new_patches(scene, MOTION, patch=SIZE).draw(1).truth[0]
+    assert truth.shape == (20, 20, 3)
+    assert truth[:, 17].std() > 0  # not of background alone
+    assert torch.equal(truth[:, 18:], truth[:, 17:18].expand(-1, 2, -1))
+    assert torch.equal(truth[19], truth[18])

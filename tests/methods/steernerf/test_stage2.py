@@ -1,0 +1,219 @@
+"""Stage 2: the gradient of the whole chain, what is trained, killed trainings, the guard."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from bench.types import Log, Scene, Split, SteerbenchError
+from methods.instant_ngp.field import HashField
+from methods.steernerf.options import JointOptions
+from methods.steernerf.patches import Patches
+from methods.steernerf.pipeline import Pipeline
+from methods.steernerf.stage2 import JointTraining
+from methods.steernerf.unet import UNet
+from methods.training import loop
+from tests.methods.models import (
+    misty_field,
+    small_joint,
+    small_model,
+    small_motion,
+    trained_field,
+)
+from tests.methods.trainings import killed
+
+MOTION = small_motion(pool=3, uses=4, length=2)
+OPTIONS = small_joint(patch=4, batch=2, motion=MOTION)
+
+
+def new_training(
+    scene: Scene,
+    options: JointOptions = OPTIONS,
+    field: HashField | None = None,
+    frames: int = 2,
+    steps: int = 12,
+) -> JointTraining:
+    torch.manual_seed(0)
+    model = small_model(frames=frames)
+    trained = trained_field(field or misty_field(channels=model.channels))
+    renderer: Any = UNet(model.channels, frames, model.scale, width=8, aligned=False)
+    renderer = renderer.to(memory_format=torch.channels_last)
+    pipeline = Pipeline(trained, scene.background, renderer, model)
+    generator = torch.Generator().manual_seed(1)
+    patches = Patches(pipeline, scene, Split([], [], []), options, generator)
+    return JointTraining(renderer, patches, steps, trained if patches.learning else None)
+
+
+def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
+    ball_scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In float64, along a random direction of all parameters, against a central difference.
+
+    Table, networks and renderer are differentiated through compositing, the splatted features of
+    two preceding frames, and the 2D renderer; depths, and so places, are constants.
+    """
+    field = misty_field("fp32", "reference").double()
+    options = replace(OPTIONS, motion=replace(MOTION, pool=4, least=2))
+    training = new_training(ball_scene, options, field.float())
+    renderer, pipeline = training.renderer, training.patches.pipeline
+    patches = [training.patches.cut(training.patches.example()) for _ in range(8)]
+    shown = [p for p in patches if all((old.index >= 0).any() for old in p.points)][:2]
+    assert [len(patch.points) for patch in shown] == [2, 2]
+    field.double(), renderer.double()
+    pipeline.background = torch.ones(4, dtype=torch.float64)
+    field.gradients = None
+    monkeypatch.setattr(torch, "zeros", partial(torch.zeros, dtype=torch.float64))  # of a canvas
+    patches = [
+        replace(p, points=[replace(old, values=old.values.double()) for old in p.points])
+        for p in shown
+    ]
+    truth = torch.stack([patch.truth for patch in patches])
+
+    def loss() -> Tensor:
+        batch = training.patches.render(patches)
+        error = (renderer(batch.observations) - truth).square().mean()
+        return error + 1e-2 * batch.opacity.square().mean()
+
+    parameters = [field.table, *field.layers.values(), *renderer.parameters()]
+    gradient = torch.autograd.grad(loss(), parameters)
+    assert all(g.abs().max() > 0 for g in gradient)
+    generator = torch.Generator().manual_seed(0)
+    for group in (parameters[:1], parameters[1:6], parameters[6:]):
+        slope, step = 0.0, 1e-8  # so short that it hardly ever crosses the kink of a ReLU
+        directions = [torch.randn(p.shape, generator=generator).double() for p in group]
+        for p, d in zip(group, directions, strict=True):
+            place = next(i for i, q in enumerate(parameters) if q is p)
+            slope += (gradient[place] * d).sum().item()
+        values = []
+        with torch.no_grad():
+            for sign in (1, -2):
+                for p, d in zip(group, directions, strict=True):
+                    p += sign * step * d
+                values.append(loss().item())
+            for p, d in zip(group, directions, strict=True):
+                p += step * d
+        assert (values[0] - values[1]) / (2 * step) == pytest.approx(slope, rel=1e-4)
+
+
+@pytest.mark.parametrize("field", ["joint", "frozen"])
+def test_the_renderer_learns_and_the_field_unless_it_is_frozen(
+    ball_scene: Scene, field: str
+) -> None:
+    learned = misty_field()
+    training = new_training(ball_scene, replace(OPTIONS, field=field), learned)
+    parts = dict(training.renderer.state_dict(prefix="renderer."))
+    parts |= {name: x for name, x in learned.state_dict().items() if x.is_floating_point()}
+    before = {name: x.clone() for name, x in parts.items()}
+    for _ in range(3):
+        training.advance()
+    changed = {name for name, x in parts.items() if not torch.equal(x, before[name])}
+    of_field = {"table", "layers.density_out", "layers.feature_out"}
+    assert {name for name in parts if name.startswith("renderer.")} <= changed
+    assert of_field <= changed if field == "joint" else changed.isdisjoint(learned.state_dict())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("frames", [0, 2])
+def test_the_error_falls(ball_scene: Scene, frames: int) -> None:
+    """On patches that are kept: one patch is much harder than another."""
+    options = replace(OPTIONS, rate=1e-2, field_rate=1e-2)
+    training = new_training(ball_scene, options, frames=frames, steps=120)
+    kept = [training.patches.cut(training.patches.example()) for _ in range(32)]
+
+    @torch.no_grad()
+    def error() -> float:
+        batch = training.patches.render(kept)
+        return (training.outcome(batch.observations) - batch.truth).square().mean().item()
+
+    before = error()
+    for _ in range(120):
+        training.advance()
+    assert error() < 0.8 * before
+
+
+def test_both_learning_rates_of_the_release_fall_twice_to_the_same(ball_scene: Scene) -> None:
+    """From 3e-3 and 1e-4 to 5e-5, back, and to 5e-5 again: each in a third of the steps."""
+    options = replace(OPTIONS, rate=1e-4, field_rate=3e-3, final_rate=5e-5, half_waves=3)
+    training = new_training(ball_scene, options, steps=30)
+    for first in (1e-4, 3e-3):
+        rates = []
+        for training.step in range(31):
+            rates.append(training.rate_now(first))
+        assert [rates[n] for n in (0, 10, 20, 30)] == pytest.approx([first, 5e-5, first, 5e-5])
+        assert rates[15] == pytest.approx((first + 5e-5) / 2)
+    training.step = 10
+    training.advance()
+    assert training.optimiser.param_groups[0]["lr"] == pytest.approx(5e-5)
+    with pytest.raises(ValueError, match=r"^joint\.half_waves: expected an odd number, got 2$"):
+        replace(OPTIONS, half_waves=2)
+
+
+def test_the_density_grid_follows_the_field_if_it_is_to(ball_scene: Scene) -> None:
+    """The field of the test is dense everywhere, the grid knows of a shell alone: half of the
+    visits are to any cell."""
+    for visits in (0, 512):
+        training = new_training(ball_scene, replace(OPTIONS, grid_samples=visits))
+        before = training.trained.grid.density.clone()
+        training.advance()
+        changed = not torch.equal(training.trained.grid.density, before)
+        assert changed == (visits > 0)
+        kept = training.result()["grid.density"]
+        assert torch.equal(kept, training.trained.grid.density)
+        assert training.patches.pipeline.occupancy is (
+            training.trained.grid.occupancy if visits else training.patches.pipeline.occupancy
+        )
+
+
+def test_weights_on_the_way_are_kept(ball_scene: Scene, tmp_path: Path, quiet_log: Log) -> None:
+    """And put back by `load`, with the seconds that they took."""
+    training, marks = new_training(ball_scene, steps=4), {tmp_path / "half.safetensors": 2}
+    loop.train(training, tmp_path / "whole.safetensors", "training", quiet_log, marks)
+    half = new_training(ball_scene, steps=4)
+    for _ in range(2):
+        half.advance()
+    found = new_training(ball_scene, steps=4)
+    loop.load(found, tmp_path / "half.safetensors")
+    assert 0 < found.seconds < training.seconds
+    for name, tensor in half.result().items():
+        assert torch.equal(tensor, found.result()[name]), name
+
+
+def test_a_killed_training_ends_as_if_it_had_never_stopped(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The examples go on, too: there and back, or are replaced when they are used up. Kernels of
+    the U-Net are channels last, and files keep no order; a fused optimiser reads both as they
+    lie."""
+    options = replace(OPTIONS, motion=small_motion(pool=2, uses=3, longer=0.5))
+    whole, half, again, found = (new_training(ball_scene, options, steps=8) for _ in range(4))
+    for _ in range(8):
+        whole.advance()
+    finished = tmp_path / "steernerf.safetensors"
+    with killed(JointTraining, 5):
+        loop.train(half, finished, "training", quiet_log)
+    loop.train(again, finished, "training", quiet_log)
+    assert {path.name for path in tmp_path.iterdir()} == {"steernerf.safetensors", "lock"}
+    monkeypatch.delattr(JointTraining, "advance")
+    loop.train(found, finished, "training", quiet_log)
+    assert found.seconds == again.seconds
+    for name, tensor in whole.result().items():
+        assert torch.equal(tensor, again.result()[name]), name
+        assert torch.equal(tensor, found.result()[name]), name
+    for name, tensor in whole.state()[0].items():
+        assert torch.equal(tensor, again.state()[0][name]), name
+
+
+def test_a_loss_that_is_no_number_stops_and_names_what_is_not_finite(ball_scene: Scene) -> None:
+    training = new_training(ball_scene)
+    with torch.no_grad():
+        training.renderer.network.last.bias[0] = torch.nan
+    with pytest.raises(
+        SteerbenchError, match=r"step 0: not finite: .*renderer\.network\.last\.bias.*rate"
+    ):
+        training.advance()
