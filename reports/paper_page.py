@@ -17,7 +17,7 @@ from reports import figures
 from reports.images import frame_section, kept_frames
 from reports.outliers import Outlier, outlier_table
 from reports.paper_tables import SHARES, Lines, PaperTable, section
-from reports.parts import Part, Plot
+from reports.parts import Part, Picture
 from reports.publish import publish
 from reports.runs import Run
 
@@ -33,12 +33,8 @@ def write_paper_page(
 ) -> Path:
     """Write `folder/report.md` with its pictures, and the same as `report.html`; return the former.
 
-    Args:
-        tables: in the order of the page.
-        lines: the measured lines of the tables, as far as there are any.
-        found: outliers, including runs that the page does not show.
-        folder: created if missing.
-        missing: why scenes of the data set are left out, by name.
+    The page shows `tables` in this order, with the `lines` that were measured, and the outliers
+    `found` among their runs. `missing` says why scenes of the data set are left out, by name.
 
     Raises:
         SteerbenchError: `folder` cannot be written to.
@@ -64,28 +60,25 @@ def write_paper_page(
 
 def _plot(plot: Mapping[str, Any], tables: Sequence[PaperTable], lines: Lines) -> Iterator[Part]:
     """A plot with heading and caption, if any of its lines was measured."""
-    stem, title = plot["file"], plot["title"]
+    some: Sequence[Any]
     if "metric" in plot:
         listed = {line.label for table in tables for block in table.blocks for line in block.lines}
-        shown = [
+        some = [
             replace(line, label=label.format(line.label))
             for table, label in plot["tables"].items()
             for line in lines.get(table, ())
             if line.runs and line.label in listed  # but not a point of a curve
         ]
-        axis = plot["metric"], plot["unit"], plot["axis"]
-        drawn = figures.quality_plot(shown, *axis, stem, title)
-        some = bool(shown)
-    elif "curves" in plot:
-        curves = [curve for table in tables for curve in _curves(table, lines)]
-        drawn = Plot(stem, title, partial(figures.quality_over_training, curves))
-        some = bool(curves)
+        drawn = figures.quality_plot(some, plot["metric"])
     else:
-        runs = _chosen(plot["lines"], lines, one_scene=plot.get("one_scene", False))
-        drawn = Plot(stem, title, partial(getattr(figures, plot["draw"]), runs))
-        some = bool(runs)
+        if "lines" in plot:
+            some = _chosen(plot["lines"], lines, one_scene=plot.get("one_scene", False))
+        else:
+            some = [curve for table in tables for curve in _curves(table, lines)]
+        draw = partial(getattr(figures, plot["draw"]), some)
+        drawn = Picture(plot["file"], plot["title"], draw)
     if some:
-        yield from (f"## {title}", drawn, plot["caption"].strip())
+        yield from (f"## {plot['title']}", drawn, plot["caption"].strip())
 
 
 def _curves(table: PaperTable, lines: Lines) -> Iterator[figures.Curve]:
@@ -119,9 +112,7 @@ def _images(images: Mapping[str, Any], lines: Lines) -> Iterator[Part]:
         yield from frame_section(runs, frames[len(frames) // 2], stem)
 
 
-def _chosen(
-    wanted: Mapping[str, Sequence[str]], lines: Lines, one_scene: bool = False
-) -> list[Run]:
+def _chosen(wanted: Mapping[str, Sequence[str]], lines: Lines, one_scene: bool) -> list[Run]:
     """The first run of each measured line in `wanted`, which lists lines by label for each table.
 
     A run is the mean over all scenes, or with `one_scene` that of the first scene.

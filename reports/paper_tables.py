@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
 
-from reports.comparison import conditions_of, marked, metric_format
-from reports.page import missing_figures
-from reports.runs import Repeated, Run
-from reports.scenes import scene_table
-from reports.tables import Table
-from reports.trends import Trend, differences, trend_table
+from reports.comparison import conditions_of, marked, metric_format, written
+from reports.runs import Repeated, Run, missing_figures
+from reports.tables import NOT_AVAILABLE, Table
+from reports.trends import Trend, differences, signed, trend_table
 
 METHOD = "method"
 AFTER, SHARES = "method.after", (0.125, 0.25, 0.5)
@@ -26,7 +24,6 @@ OF_CURVES = {"protocol.name": "psnr", "protocol.lpips": "[]"}
 ABSENT = "–"
 """Stands for a figure that the paper does not give or that cannot be measured here."""
 
-
 Lines = Mapping[str, Sequence[Repeated]]
 """The measured lines of each table, by table name."""
 
@@ -35,11 +32,9 @@ Lines = Mapping[str, Sequence[Repeated]]
 class Line:
     """A line of a table.
 
-    Attributes:
-        label: its name.
-        job: the settings that measure it, beside those of all lines. Without a `method` it is a
-            line of the paper's method.
-        published: the paper's figures by metric, in bytes, ms and dB as in our rows.
+    `job` has the settings that measure it, beside those of all lines; without a `method` it is a
+    line of the paper's method. The paper's figures, by metric, are in bytes, ms and dB as in our
+    rows.
     """
 
     label: str
@@ -49,14 +44,11 @@ class Line:
 
 @dataclass(frozen=True)
 class PaperTable:
-    """A table of the paper.
+    """A table of the paper; `metrics` are its columns, `lines` are in the paper's order.
 
     Attributes:
         name: the name of the experiment that measures it.
-        title: what it shows.
         published_on: scenes, size and machine of the paper's figures.
-        metrics: its columns.
-        lines: in the paper's order.
         notes: what a reader should know before comparing.
         trends: what the paper concludes from it.
         beyond: a method beyond the paper, shown with the same lines as the paper's method, or None.
@@ -130,6 +122,10 @@ class PaperTable:
         first, *further = self.blocks
         return [first, *(x for x in further if any(line.label in measured for line in x.lines))]
 
+    def measured(self, known: Mapping[str, Repeated]) -> list[Repeated]:
+        """Its lines of `known`, by label; those that are not there have no runs."""
+        return [known.get(line.label, Repeated(line.label, ())) for line in self.lines]
+
 
 def paper_tables(folder: Path) -> list[PaperTable]:
     """The tables that the experiments in `folder` declare, in the paper's order."""
@@ -140,64 +136,27 @@ def paper_tables(folder: Path) -> list[PaperTable]:
 def _table(path: Path) -> PaperTable:
     """What an experiment declares below `table`; what its lines leave out follows from its grid.
 
-    The method beyond the paper is the one that the grid has besides that of the experiment and
-    those that lines name.
+    Without jobs of their own, there is a line for each value of the grid. The method beyond the
+    paper is the one that the grid has besides that of the experiment and those that lines name.
     """
     experiment: Any = OmegaConf.to_container(OmegaConf.load(path))
     content = experiment["table"]
     params = experiment["hydra"]["sweeper"]["params"]
     grid = {name: str(values).split(",") for name, values in params.items()}
     _, *further = grid.pop(METHOD, [""])
-    label = content.pop("label", "{}")
-    lines = list(_lines(content.pop("lines"), content["metrics"], label, grid))
-    trends = [Trend(metric, labels) for metric, labels in content.pop("rising").items()]
-    named = {line.job.get(METHOD) for line in lines}
-    beyond = next((method for method in further if method not in named), None)
-    return PaperTable(path.stem, lines=lines, trends=trends, beyond=beyond, **content)
-
-
-def _lines(
-    declared: Sequence[Mapping[str, Any]],
-    metrics: Sequence[str],
-    label: str,
-    grid: Mapping[str, Sequence[str]],
-) -> Iterator[Line]:
-    """The lines of a table. Without jobs of their own, there is one for each value of the grid."""
+    declared, label = content.pop("lines"), content.pop("label", "{}")
     jobs = [line["job"] for line in declared if "job" in line] or [
         {name: value} for name, values in grid.items() for value in values
     ]
+    lines = []
     for line, job in zip(declared, jobs, strict=True):
-        published = zip(metrics, line.get("published", ()), strict="published" in line)
-        figures = {metric: figure for metric, figure in published if figure is not None}
-        yield Line(line.get("label") or label.format(*job.values()), job, figures)
-
-
-def with_published(table: PaperTable, measured: Mapping[str, Repeated]) -> Table:
-    """A table of measured figures, the paper's figures and their differences.
-
-    Among measured figures under the same conditions, the best of a column is bold and, of at least
-    three, the second best is italic.
-
-    Args:
-        table: a table of the paper.
-        measured: lines by label; some may be missing.
-    """
-    lines = [measured.get(line.label, Repeated(line.label, ())) for line in table.lines]
-    beside = any(line.published for line in table.lines)
-    columns = []
-    for metric in table.metrics:
-        texts = [text or ABSENT for text in marked(lines, metric, ("**%s**", "*%s*"))]
-        if beside:
-            texts = [
-                _beside(text, found.mean(metric), line.published.get(metric), metric)
-                for text, found, line in zip(texts, lines, table.lines, strict=True)
-            ]
-        columns.append(texts)
-    names = [": ".join((line.label, *line.gaps)) for line in lines]
-    labels = (metric_format(metric)[0] for metric in table.metrics)
-    heads = ("measured / paper / difference" if beside else "measured", *labels)
-    cells = tuple(zip(names, *columns, strict=True))
-    return Table(table.title, heads, cells, sources=tuple(line.keys for line in lines))
+        paper = zip(content["metrics"], line.get("published", ()), strict="published" in line)
+        figures = {metric: figure for metric, figure in paper if figure is not None}
+        lines.append(Line(line.get("label") or label.format(*job.values()), job, figures))
+    trends = [Trend(metric, labels) for metric, labels in content.pop("rising").items()]
+    named = {job.get(METHOD) for job in jobs}
+    beyond = next((method for method in further if method not in named), None)
+    return PaperTable(path.stem, lines=lines, trends=trends, beyond=beyond, **content)
 
 
 def section(table: PaperTable, lines: Sequence[Repeated]) -> list[str | Table]:
@@ -209,8 +168,7 @@ def section(table: PaperTable, lines: Sequence[Repeated]) -> list[str | Table]:
         parts.append(f"## {table.number}: {table.title}" if first else f"### {block.title}")
         parts += _block(block, measured, f"Paper: {table.published_on}." if first else "")
     if table.scenes and len({scene for line in lines for scene in line.by_scene}) > 1:
-        each = scene_table(table.scenes, lines)
-        parts += [f"### {each.title}", each]
+        parts += ["### Each scene", _scenes(table.scenes, lines)]
     return parts
 
 
@@ -219,7 +177,7 @@ def _block(
 ) -> list[str | Table]:
     """Conditions of the measured and the published figures, then the figures, trends, notes."""
     figures = {line.label: line.published for line in table.lines}
-    runs = [run for label in figures if label in measured for run in measured[label].runs]
+    runs = [run for line in table.measured(measured) for run in line.runs]
     where = f"Measured: {conditions_of(runs)}, {_origin(runs)}." if runs else ""
     grown = [each for trend in table.trends for each in differences(trend, measured, figures)]
     trends = trend_table(grown) if grown else ""
@@ -240,6 +198,46 @@ def _origin(runs: Sequence[Run]) -> str:
     return ", ".join(f"{name} {' / '.join(dict.fromkeys(of))}" for name, of in origin.items())
 
 
+def with_published(table: PaperTable, measured: Mapping[str, Repeated]) -> Table:
+    """A table of measured figures (lines by label), the paper's figures and their differences.
+
+    Among measured figures under the same conditions, the best of a column is bold and, of at least
+    three, the second best is italic.
+    """
+    lines = table.measured(measured)
+    beside = any(line.published for line in table.lines)
+    columns = []
+    for metric in table.metrics:
+        texts = [text or ABSENT for text in marked(lines, metric, ("**%s**", "*%s*"))]
+        if beside:
+            texts = [
+                _beside(text, found.mean(metric), line.published.get(metric), metric)
+                for text, found, line in zip(texts, lines, table.lines, strict=True)
+            ]
+        columns.append(texts)
+    names = [": ".join((line.label, *line.gaps)) for line in lines]
+    labels = (metric_format(metric)[0] for metric in table.metrics)
+    heads = ("measured / paper / difference" if beside else "measured", *labels)
+    cells = tuple(zip(names, *columns, strict=True))
+    return Table(table.title, heads, cells, sources=tuple(line.keys for line in lines))
+
+
+def _scenes(metrics: Sequence[str], lines: Sequence[Repeated]) -> Table:
+    """Means over seeds, one line per scene and line."""
+    shown = [
+        (f"{scene}: {line.label}", Repeated(line.label, line.by_scene[scene]))
+        for scene in sorted({scene for line in lines for scene in line.by_scene})
+        for line in lines
+        if scene in line.by_scene
+    ]
+    cells = tuple(
+        (name, *(written(of_scene, metric) or NOT_AVAILABLE for metric in metrics))
+        for name, of_scene in shown
+    )
+    heads = ("measured", *(metric_format(metric)[0] for metric in metrics))
+    return Table("Each scene", heads, cells, sources=tuple(of_scene.keys for _, of_scene in shown))
+
+
 def _beside(text: str, measured: float | None, published: float | None, metric: str) -> str:
     """A cell: the measured figure (as `text`), the published one and their difference."""
     if measured is None and published is None:
@@ -247,6 +245,5 @@ def _beside(text: str, measured: float | None, published: float | None, metric: 
     _, write = metric_format(metric)
     texts = [text, ABSENT if published is None else write(published)]
     if measured is not None and published is not None and not math.isnan(measured):
-        sign = "-" if measured < published else "+"
-        texts.append(f"{sign}{write(abs(measured - published))}")
+        texts.append(signed(measured - published, write))
     return " / ".join(texts)

@@ -12,21 +12,6 @@ from reports.tables import Table
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A drawing.
-
-    Attributes:
-        stem: prefix of its file name.
-        shows: alternative text: what it shows, in words.
-        draw: writes it to a path, in the format given by the ending.
-    """
-
-    stem: str
-    shows: str
-    draw: Callable[[Path], object]
-
-
-@dataclass(frozen=True)
 class Mark:
     """A mark in a plot: its name and figures in words, and the keys of the runs behind it."""
 
@@ -35,9 +20,16 @@ class Mark:
 
 
 @dataclass(frozen=True)
-class Plot(Picture):
-    """A drawing by matplotlib; `marks` are keyed by the `gid` that `draw` gives their artists."""
+class Picture:
+    """A drawing: the prefix of its file name, and what it shows, in words.
 
+    `draw` writes it to a path, in the format given by the ending. In a plot by matplotlib, `marks`
+    are keyed by the `gid` that `draw` gives their artists.
+    """
+
+    stem: str
+    shows: str
+    draw: Callable[[Path], object]
     marks: Mapping[str, Mark] = field(default_factory=dict)
 
 
@@ -51,31 +43,22 @@ class View:
 
 
 @dataclass(frozen=True)
-class Detail:
-    """The part of a frame to enlarge: left, top, right, bottom, and why this part was chosen."""
-
-    box: tuple[int, int, int, int]
-    where: str
-
-
-@dataclass(frozen=True)
 class Frame:
     """A frame of several runs, for comparison.
 
-    Attributes:
-        name: scene, view and number.
-        stem: prefix of its file names.
-        truth: uint8 [H, W, 3].
-        errors: what the error maps show.
+    `name` is that of the scene, view and number; `stem` begins the names of its files; `truth` is
+    uint8 [H, W, 3]. The part `box` (left, top, right, bottom) is enlarged; `where` says why this
+    part was chosen, and `errors` what the error maps show.
     """
 
     name: str
     stem: str
     truth: np.ndarray
     views: Sequence[View]
-    detail: Detail
+    box: tuple[int, int, int, int]
+    where: str
     errors: str
 
 
-Part = str | Table | Plot | Frame
+Part = str | Table | Picture | Frame
 """A part that is a string is Markdown."""

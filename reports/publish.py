@@ -16,7 +16,7 @@ from bench.errors import explained
 from bench.sharing import whole
 from reports.html import html_page
 from reports.images import still_images
-from reports.parts import Frame, Part, Picture, Plot
+from reports.parts import Frame, Part, Picture
 from reports.runs import Run
 from reports.tables import Table
 
@@ -27,15 +27,9 @@ PICTURE = re.compile(r".+-[0-9a-f]{12}\.png")
 def publish(parts: Sequence[Part], folder: Path, runs: Sequence[Run] = ()) -> Path:
     """Write `parts` as `report.md` and `report.html`, each atomically; return the former.
 
-    Pictures of an earlier page are kept until that page is replaced.
-
-    Args:
-        parts: the page from top to bottom; it begins with its title as a heading.
-        folder: created if missing.
-        runs: the runs behind the figures; the HTML page shows their provenance.
-
-    Raises:
-        SteerbenchError: `folder` cannot be written to.
+    The first part begins with the title of the page as a heading. `runs` are those behind the
+    figures; the HTML page shows their provenance. Pictures of an earlier page are kept until that
+    page is replaced. Raises SteerbenchError if `folder` cannot be written to.
     """
     with explained(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -52,18 +46,18 @@ def publish(parts: Sequence[Part], folder: Path, runs: Sequence[Run] = ()) -> Pa
 
 def markdown(parts: Sequence[Part], folder: Path) -> str:
     """`parts` in GitHub's Markdown; writes their pictures below `folder`."""
-    return "\n\n".join(_markdown(part, folder) for part in parts)
-
-
-def _markdown(part: Part, folder: Path) -> str:
-    match part:
-        case Table():
-            return part.markdown()
-        case Frame():
-            return "\n\n".join(_shown(picture, folder) for picture in still_images(part))
-        case Plot():
-            return _shown(part, folder)
-    return part
+    texts: list[str] = []
+    for part in parts:
+        match part:
+            case Table():
+                texts.append(part.markdown())
+            case Frame():
+                texts += [_shown(picture, folder) for picture in still_images(part)]
+            case Picture():
+                texts.append(_shown(part, folder))
+            case _:
+                texts.append(part)
+    return "\n\n".join(texts)
 
 
 def _shown(picture: Picture, folder: Path) -> str:

@@ -17,13 +17,10 @@ from reports.tables import QUALITY, Table
 
 @dataclass(frozen=True)
 class Limit:
-    """How much worse a metric may become.
+    """How much worse a metric may become: `absolute` in its unit, `relative` to the old figure.
 
-    Attributes:
-        better: 1 where more is better, -1 where less is.
-        absolute: in the unit of the metric.
-        relative: share of the old figure.
-        here: it depends on the machine and is compared on the same one only.
+    `better` is 1 where more is better, -1 where less is. A metric of which `here` is true depends
+    on the machine and is compared on the same one only.
     """
 
     better: int
@@ -50,15 +47,12 @@ LIMITS: Mapping[str, Limit] = {
 
 @dataclass(frozen=True)
 class Figures:
-    """The figures of a run that later runs are compared with.
+    """The figures of a run that later runs are compared with: its headline `values`, by metric.
 
-    Attributes:
-        values: of its headline, by metric.
-        frames: the figures that the headline averages, by metric and by number and name of the
-            frame, in the order of the path. Qualities have steady frames with ground truth, other
-            metrics all steady frames.
-        machine: names of its processor and graphics processors.
-        views: equal for the same frames of the same scene under one protocol.
+    `frames` has the figures that the headline averages, by metric and by number and name of the
+    frame, in the order of the path: of qualities the steady frames with ground truth, of other
+    metrics all steady frames. `machine` names its processors. `views` is equal for the same frames
+    of the same scene under one protocol.
     """
 
     values: Mapping[str, float]
@@ -69,23 +63,20 @@ class Figures:
     @classmethod
     def of(cls, run: Run, limits: Mapping[str, Limit] = LIMITS) -> Figures:
         """The figures of `run` that have a limit."""
-        values = {
-            metric: run.values[metric]
-            for metric in limits
-            if not math.isnan(run.values.get(metric, math.nan))
-        }
+        every = {metric: run.values.get(metric, math.nan) for metric in limits}
+        values = {metric: value for metric, value in every.items() if not math.isnan(value)}
         steady = run.frames[run.frames["phase"] == STEADY]
         steady = steady if len(steady) else run.frames
-        scored = steady.dropna(subset=["psnr"])
         frames = {}
         for metric in values:
-            if metric in run.frames and metric != "peak_bytes":  # older runs have that column
-                averaged = scored if metric in QUALITY else steady
-                if metric == "flicker":  # the first frame of a path has none
-                    averaged = averaged.dropna(subset=[metric])
-                names = averaged["frame"].astype(str) + ": " + averaged["name"].fillna("")
-                if averaged[metric].notna().all():
-                    frames[metric] = dict(zip(names, averaged[metric].astype(float), strict=True))
+            if metric not in steady or metric == "peak_bytes":  # older runs have that column
+                continue
+            averaged = steady.dropna(subset=["psnr"]) if metric in QUALITY else steady
+            if metric == "flicker":  # the first frame of a path has none
+                averaged = averaged.dropna(subset=[metric])
+            names = averaged["frame"].astype(str) + ": " + averaged["name"].fillna("")
+            if averaged[metric].notna().all():
+                frames[metric] = dict(zip(names, averaged[metric].astype(float), strict=True))
         machine = run.record["machine"]
         views = ", ".join(map(str, (*run.views, run.facts["protocol"])))
         return cls(values, frames, ", ".join((machine["cpu"], *machine["gpus"])), views)
@@ -93,16 +84,12 @@ class Figures:
 
 @dataclass(frozen=True)
 class Change:
-    """The change of one metric.
+    """The change of one metric from `old` to `new`, which is nan if the new run lacks it.
 
-    Attributes:
-        old, new: `new` is nan if the new run lacks the metric.
-        by: new less old; the mean over the frames that both runs have, where frames are known, and
-            over the seeds.
-        interval: 95 % interval of that mean, over the seeds; with one seed over its frames; None
-            where only two figures are known.
-        verdict: "worse" by more than its limit and not by chance, "missing" if it or a frame is
-            gone, else "".
+    `by` is new less old: the mean over the frames that both runs have, where frames are known, and
+    over the seeds. `interval` is the 95 % interval of that mean, over the seeds, with one seed over
+    its frames; None where only two figures are known. The `verdict` is "worse" (by more than its
+    limit and not by chance), "missing" (it or a frame is gone) or "".
     """
 
     metric: str
@@ -157,13 +144,12 @@ def _change(metric: str, limit: Limit, pairs: Sequence[tuple[Figures, Figures]])
         moved = [(-limit.better * each).max() / len(each) for each in frames if len(each) > 1]
         broken = not limit.here and max(moved, default=0) / len(pairs) > allowed
         certain = broken or -limit.better * by - half > 0
-    worse = certain and -limit.better * by > allowed
-    gone = math.isnan(after) or any(
+    verdict = "worse" if certain and -limit.better * by > allowed else ""
+    if math.isnan(after) or any(
         one.frames.get(metric, {}).keys() - other.frames.get(metric, {}) for one, other in pairs
-    )
-    return Change(
-        metric, before, after, by, interval, "missing" if gone else "worse" if worse else ""
-    )
+    ):
+        verdict = "missing"
+    return Change(metric, before, after, by, interval, verdict)
 
 
 def _frames_apart(metric: str, old: Figures, new: Figures) -> np.ndarray:
@@ -179,16 +165,10 @@ def _apart(old: float, new: float) -> float:
 
 def change_table(title: str, found: Sequence[Change]) -> Table:
     """The changes `found`, a line each."""
-    lines = (
-        (
-            change.metric,
-            f"{change.old:.6g}",
-            f"{change.new:.6g}",
-            f"{change.by:+.4g}",
-            " – ".join(f"{end:+.4g}" for end in change.interval or ()),
-            change.verdict,
-        )
-        for change in found
-    )
+    lines = []
+    for change in found:
+        interval = " – ".join(f"{end:+.4g}" for end in change.interval or ())
+        figures = (f"{change.old:.6g}", f"{change.new:.6g}", f"{change.by:+.4g}", interval)
+        lines.append((change.metric, *figures, change.verdict))
     columns = ("metric", "was", "is", "change", "95 % interval", "")
     return Table(title, columns, tuple(lines))

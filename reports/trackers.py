@@ -18,9 +18,6 @@ from PIL import Image
 from bench.errors import SteerbenchError, Unavailable, install_command
 from reports.runs import Run
 
-PROJECT = "steerbench"
-"""The name of the project or experiment in a tracker."""
-
 FACTS = ("method", "scene", "resolution", "trajectory", "budget", "protocol", "seed", "device")
 """Columns of the rows that say what was measured."""
 
@@ -31,7 +28,7 @@ def to_wandb(run: Run, outputs: Path) -> None:
 
     facts = settings(run)
     begun = wandb.init(
-        project=PROJECT, id=run.key, name=run.label, config=facts, dir=outputs, resume="allow"
+        project="steerbench", id=run.key, name=run.label, config=facts, dir=outputs, resume="allow"
     )
     with begun as sent:
         for frame, figures in series(run):
@@ -60,10 +57,7 @@ def to_tensorboard(run: Run, outputs: Path) -> None:
                 writer.add_image(name, np.asarray(image.convert("RGB")), dataformats="HWC")
 
 
-TRACKERS: dict[str, Callable[[Run, Path], None]] = {
-    "wandb": to_wandb,
-    "tensorboard": to_tensorboard,
-}
+TRACKERS = {"wandb": to_wandb, "tensorboard": to_tensorboard}
 """What sends a run from the store in the folder `outputs`, by the tracker's name and package."""
 
 

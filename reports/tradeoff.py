@@ -15,7 +15,7 @@ from bench.errors import explained
 from bench.provenance import commit, machine
 from bench.sharing import whole
 from reports.figures import frontier_plot
-from reports.parts import Part, Plot
+from reports.parts import Part, Picture
 from reports.publish import publish
 from reports.tables import Table, decimal, spread
 
@@ -58,9 +58,8 @@ def setting_table(rows: Sequence[Row]) -> Table:
     )
     bold = frozenset((line, 0) for line, text in enumerate(lines) if text[-1] == ON_FRONTIER)
     where = ", ".join(str(rows[0][name]) for name in ("scene", "trajectory", "resolution"))
-    return Table(
-        f"Settings: run time against error of a frame, {where}", SETTINGS, lines, bold=bold
-    )
+    title = f"Settings: run time against error of a frame, {where}"
+    return Table(title, SETTINGS, lines, bold=bold)
 
 
 def write_tradeoff(
@@ -68,35 +67,27 @@ def write_tradeoff(
 ) -> Path:
     """Write `folder/report.md` and `report.html`, with the plot and all rows as CSV beside them.
 
-    Returns the path of report.md.
-
-    Args:
-        experiments: rows of kernels, for `experiment_table`.
-        settings: rows of methods, for `setting_table` and `frontier_plot`; if empty, both are left
-            out.
-        command: the command line.
+    `experiments` are rows of kernels; `settings` are rows of methods, and may be missing. Returns
+    the path of report.md.
 
     Raises:
         SteerbenchError: `folder` cannot be written to.
     """
     tables = [experiment_table(experiments)]
+    made = f"```sh\n{command}\n```\n\nCommit {commit()}, {machine()['cpu']}."
+    parts: list[Part] = ["# Run time against error", made]
+    if settings:
+        shows = "Error of a frame against its time, one point a setting"
+        parts.append(Picture("frontier", shows, partial(frontier_plot, settings)))
+        tables.insert(0, setting_table(settings))
+    parts += [part for table in tables for part in (f"## {table.title}", table)]
     with explained(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        _write_csv(experiments, folder / "kernels.csv")
-        made = f"```sh\n{command}\n```\n\nCommit {commit()}, {machine()['cpu']}."
-        parts: list[Part] = ["# Run time against error", made]
-        if settings:
-            _write_csv(settings, folder / "settings.csv")
-            shows = "Error of a frame against its time, one point a setting"
-            parts.append(Plot("frontier", shows, partial(frontier_plot, settings)))
-            tables.insert(0, setting_table(settings))
-    parts += [part for table in tables for part in (f"## {table.title}", table)]
+        for name, rows in (("kernels", experiments), ("settings", settings)):
+            if rows:
+                with whole(folder / f"{name}.csv") as new:
+                    pd.DataFrame(rows).to_csv(new, index=False)
     return publish(parts, folder)
-
-
-def _write_csv(rows: Sequence[Row], path: Path) -> None:
-    with whole(path) as new:
-        pd.DataFrame(rows).to_csv(new, index=False)
 
 
 def _setting(value: float | str) -> str:

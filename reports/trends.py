@@ -20,8 +20,6 @@ SMALLER = "smaller than in the paper"
 SEEN, REVERSED = "agrees, by one seed", "opposite, by one seed"
 """Verdicts from the frames of one seed; another training may reverse them."""
 
-COMPUTED = "computed, not sampled"
-
 
 @dataclass(frozen=True)
 class Trend:
@@ -35,12 +33,9 @@ class Trend:
 class Difference:
     """The growth of a metric from one line of a trend to the next.
 
-    Attributes:
-        paper: the difference in the paper; nan if the paper does not give both figures.
-        by: the mean difference here.
-        half: half its 95 % interval; nan if unknown.
-        over: the samples that `by` averages, in words.
-        proves: whether the interval accounts for differences between trainings.
+    `paper` is that in the paper (nan if the paper does not give both figures), `by` the mean here,
+    over what `over` says, and `half` half its 95 % interval (nan if unknown). `proves` says whether
+    the interval accounts for differences between trainings.
     """
 
     metric: str
@@ -66,11 +61,9 @@ class Difference:
 def differences(
     trend: Trend, lines: Mapping[str, Repeated], published: Mapping[str, Mapping[str, float]]
 ) -> Iterator[Difference]:
-    """Every difference of `trend` between two measured lines.
+    """Every difference of `trend` between two measured `lines`, by label.
 
-    Args:
-        lines: the measured lines, by label.
-        published: the paper's figures, by label and metric.
+    `published` has the paper's figures by label and metric.
     """
     for smaller, larger in pairwise(trend.rising):
         one, other = lines.get(smaller), lines.get(larger)
@@ -87,7 +80,7 @@ def _growth(one: Repeated, other: Repeated, metric: str) -> tuple[float, float, 
 
     With several seeds, a pair has the same seed; with one seed, a pair is the same frame.
     """
-    anywhere = not (metric in LIMITS and LIMITS[metric].here)
+    here = metric in LIMITS and LIMITS[metric].here
     pairs = [
         (run, twin)
         for run in one.runs
@@ -95,14 +88,14 @@ def _growth(one: Repeated, other: Repeated, metric: str) -> tuple[float, float, 
         if run.facts["seed"] == twin.facts["seed"]
         and metric in run.values
         and metric in twin.values
-        and (anywhere or run.computer == twin.computer)
+        and (not here or run.computer == twin.computer)
     ]
     if not pairs:
         return None
     by_seed = np.array([twin.values[metric] - run.values[metric] for run, twin in pairs])
     by = float(by_seed.mean())
     if metric.startswith("size_bytes"):
-        return by, 0.0, COMPUTED, True
+        return by, 0.0, "computed, not sampled", True
     if len(pairs) > 1:
         return by, half_interval(by_seed), f"{len(pairs)} seeds", True
     frames, others = (Figures.of(run).frames.get(metric, {}) for run in pairs[0])
@@ -115,21 +108,17 @@ def _growth(one: Repeated, other: Repeated, metric: str) -> tuple[float, float, 
 
 def trend_table(differences: Sequence[Difference]) -> Table:
     """A table of `differences`, one line each."""
+    lines = []
+    for each in differences:
+        label, write = metric_format(each.metric)
+        half = f" ± {write(each.half)}" if each.half > 0 else ""
+        name = f"{label.rstrip(' ↑↓')}: {each.smaller} < {each.larger}"
+        paper = "" if math.isnan(each.paper) else signed(each.paper, write)
+        lines.append((name, paper, signed(each.by, write) + half, each.over, each.verdict))
     columns = ("difference", "paper", "here", "over", "verdict")
-    return Table("Trends", columns, tuple(map(_line, differences)))
+    return Table("Trends", columns, tuple(lines))
 
 
-def _line(each: Difference) -> tuple[str, ...]:
-    label, write = metric_format(each.metric)
-    half = f" ± {write(each.half)}" if each.half > 0 else ""
-    return (
-        f"{label.rstrip(' ↑↓')}: {each.smaller} < {each.larger}",
-        "" if math.isnan(each.paper) else _signed(each.paper, write),
-        _signed(each.by, write) + half,
-        each.over,
-        each.verdict,
-    )
-
-
-def _signed(by: float, write: Write) -> str:
+def signed(by: float, write: Write) -> str:
+    """A difference with its sign."""
     return ("-" if by < 0 else "+") + write(abs(by))

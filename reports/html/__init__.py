@@ -1,7 +1,7 @@
 """The HTML page, a single file that loads nothing from elsewhere.
 
-Texts and tables are rendered from the same Markdown as report.md; plots are drawn by the same code,
-as SVG. The files beside this module are the page's template, its style and its script.
+Texts and cells are rendered from the same Markdown as in report.md; plots are drawn by the same
+code, as SVG. The files beside this module are the page's templates, its style and its script.
 """
 
 from __future__ import annotations
@@ -20,13 +20,11 @@ import matplotlib
 import numpy as np
 from jinja2 import Environment, FileSystemLoader
 from markdown_it import MarkdownIt
-from markdown_it.token import Token
 from PIL import Image
 
 from reports.comparison import COST, metric_format
 from reports.images import ZOOM
-from reports.parts import Frame, Mark, Part, Plot
-from reports.provenance import facts, settings
+from reports.parts import Frame, Part, Picture
 from reports.runs import Run
 from reports.tables import QUALITY, Table
 
@@ -40,16 +38,15 @@ LOSSLESS_PIXELS = 800 * 800
 
 LOSSY_QUALITY = 90
 
-PARSER = MarkdownIt("commonmark", {"html": False}).enable("table").disable("image")
+PARSER = MarkdownIt("commonmark", {"html": False}).disable("image")
 """Images in texts are disabled, because pictures are parts of their own."""
+TEMPLATES.filters["inline"] = PARSER.renderInline
 
 
 def html_page(parts: Sequence[Part], runs: Sequence[Run]) -> str:
-    """The page of `parts` as HTML.
+    """The page of `parts` as HTML; the first begins with the title as a heading.
 
-    Args:
-        parts: from top to bottom; the first begins with the title as a heading.
-        runs: the runs whose keys occur in tables and marks.
+    `runs` are those whose keys occur in tables and marks.
     """
     origins = {run.key: _origin(run) for run in runs}
     headings: dict[str, str] = {}
@@ -71,12 +68,12 @@ def _origin(run: Run) -> dict[str, str]:
         for metric, (label, write) in formats.items()
         if metric in run.values
     ]
-    chosen = ", ".join(f"{name}={value}" for name, value in settings(run).items())
+    chosen = ", ".join(f"{name}={value}" for name, value in run.settings.items())
     return {
         "method": str(run.facts["method"]),
         "figures": "; ".join(figures),
         "command": run.record["command"],
-        **facts(run),
+        **run.provenance,
         **({"settings": chosen} if chosen else {}),
     }
 
@@ -85,51 +82,20 @@ def _html(part: Part, origins: dict[str, dict[str, str]], headings: dict[str, st
     """A part of the page as HTML; adds its second-level headings to `headings`, by id."""
     match part:
         case Table():
-            return _table(part, origins)
-        case Plot():
+            return TEMPLATES.get_template("table.html").render(table=part, origins=origins)
+        case Picture():
             return f'<div class="plot scrolls">{_svg(part)}</div>'
         case Frame():
-            return TEMPLATES.get_template("frame.html").render(_frame(part))
+            return _frame(part)
     tokens = PARSER.parse(part)
     for heading, text in pairwise(tokens):
         if heading.type == "heading_open" and heading.tag == "h2":
             heading.attrSet("id", name := f"part-{len(headings) + 1}")
             headings[name] = text.content
-    return _rendered(tokens)
-
-
-def _rendered(tokens: Sequence[Token]) -> str:
     return str(PARSER.renderer.render(tokens, PARSER.options, {}))
 
 
-def _table(table: Table, origins: dict[str, dict[str, str]]) -> str:
-    """Render the Markdown of `table`.
-
-    A line's tooltip names the runs behind it, and its first cell links to the first of them.
-    """
-    tokens = PARSER.parse(table.markdown())
-    _, *lines = (n for n, token in enumerate(tokens) if token.type == "tr_open")
-    for line, sources in zip(lines, table.sources, strict=False):
-        known = [key for key in sources if key in origins]
-        if known:
-            tokens[line].attrSet("data-runs", " ".join(known))
-            tokens[line].attrSet("title", _in_short(known, origins))
-            label = tokens[line + 2]  # after the tokens that open line and cell
-            link = Token("link_open", "a", 1, attrs={"href": f"#run-{known[0]}", "class": "origin"})
-            label.children = [link, *(label.children or ()), Token("link_close", "a", -1)]
-    return f'<div class="table scrolls">{_rendered(tokens)}</div>'
-
-
-def _in_short(keys: Sequence[str], origins: dict[str, dict[str, str]]) -> str:
-    shown = [
-        "run {run}, commit {commit}, {machine}: {command}".format(**origins[key])
-        for key in keys[:3]
-    ]
-    more = [f"and {len(keys) - 3} more runs"] if len(keys) > 3 else []
-    return "\n".join([*shown, *more])
-
-
-def _svg(plot: Plot) -> str:
+def _svg(plot: Picture) -> str:
     """`plot` as SVG; its marks can be focused and have descriptions."""
     with (
         tempfile.TemporaryDirectory() as place,
@@ -143,8 +109,12 @@ def _svg(plot: Plot) -> str:
         element.tag = element.tag.rpartition("}")[2]  # HTML needs no namespaces in <svg>
         element.attrib = {name.rpartition("}")[2]: of for name, of in element.attrib.items()}
         name = element.get("id", "")
-        if name in plot.marks:
-            _name_mark(element, plot.marks[name])
+        if mark := plot.marks.get(name):
+            element.attrib |= {"class": "mark", "tabindex": "0", "role": "button"}
+            element.attrib |= {"aria-label": mark.says, "data-runs": " ".join(mark.sources)}
+            title = ElementTree.Element("title")
+            title.text = mark.says
+            element.insert(0, title)
         if name not in used:  # another plot on the page may use the same id
             element.attrib.pop("id", None)
     root.remove(next(child for child in root if child.tag == "metadata"))
@@ -154,33 +124,24 @@ def _svg(plot: Plot) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def _name_mark(element: ElementTree.Element, mark: Mark) -> None:
-    attributes = {"class": "mark", "tabindex": "0", "role": "button", "aria-label": mark.says}
-    element.attrib |= {**attributes, "data-runs": " ".join(mark.sources)}
-    title = ElementTree.Element("title")
-    title.text = mark.says
-    element.insert(0, title)
-
-
-def _frame(frame: Frame) -> dict[str, Any]:
+def _frame(frame: Frame) -> str:
     height, width = frame.truth.shape[:2]
-    left, top, right, bottom = frame.detail.box
+    left, top, right, bottom = frame.box
+    box = (left / width, top / height, (right - left) / width, (bottom - top) / height)
     views = [{"titles": ("ground truth",), "rendering": _uri(frame.truth)}]
     views += [
         {"titles": view.titles, "rendering": _uri(view.rendering), "error": _uri(view.error)}
         for view in frame.views
     ]
-    box = (left / width, top / height, (right - left) / width, (bottom - top) / height)
-    lossy = LOSSY_QUALITY if height * width > LOSSLESS_PIXELS else None
-    return {
-        "frame": frame,
-        "views": views,
-        "width": width,
-        "height": height,
-        "box": " ".join(f"{edge:.4f}" for edge in box),
-        "zoom": ZOOM,
-        "lossy": lossy,
-    }
+    return TEMPLATES.get_template("frame.html").render(
+        frame=frame,
+        views=views,
+        width=width,
+        height=height,
+        box=" ".join(f"{edge:.4f}" for edge in box),
+        zoom=ZOOM,
+        lossy=LOSSY_QUALITY if height * width > LOSSLESS_PIXELS else None,
+    )
 
 
 def _uri(picture: np.ndarray) -> str:

@@ -6,11 +6,11 @@ import math
 from dataclasses import replace
 
 import pytest
+from reports.scenes import over_scenes
 
 from reports.paper_tables import Line, PaperTable, section
 from reports.publish import markdown
 from reports.runs import Repeated, Run
-from reports.scenes import over_scenes
 from reports.trends import SEEN, Trend, differences
 
 
