@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from bench.results import COLD
 from reports.comparison import written
-from reports.parts import Mark, Picture
+from reports.images import Mark, Picture
 from reports.runs import Repeated, Run
 from reports.tables import NOT_AVAILABLE
 

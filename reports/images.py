@@ -1,10 +1,14 @@
-"""Composes a frame of several runs into one image: truth, renderings, details, error maps."""
+"""What a page shows beside its text: plots, and a frame of several runs for comparison.
+
+`publish` writes the same parts of a page as Markdown and as HTML. In Markdown, a frame is one image
+of truth, renderings, details and error maps.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -14,8 +18,8 @@ from scipy.ndimage import uniform_filter
 
 from bench.results import COLD
 from bench.trajectories import spread
-from reports.parts import Frame, Picture, View
 from reports.runs import Run
+from reports.tables import Table
 
 MOST_FRAMES = 3
 """Maximum number of frames of a run on a page."""
@@ -34,8 +38,63 @@ ZOOM = 4
 """Magnification of the detail relative to its picture."""
 
 Box = tuple[int, int, int, int]
+"""Left, top, right, bottom."""
+
 Band = tuple[str, Sequence[Image.Image | None]]
 """One row of panels below a caption; None leaves a place empty."""
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A mark in a plot: its name and figures in words, and the keys of the runs behind it."""
+
+    says: str
+    sources: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A drawing: the prefix of its file name, and what it shows, in words.
+
+    `draw` writes it to a path, in the format given by the ending. In a plot by matplotlib, `marks`
+    are keyed by the `gid` that `draw` gives their artists.
+    """
+
+    stem: str
+    shows: str
+    draw: Callable[[Path], object]
+    marks: Mapping[str, Mark] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class View:
+    """A frame rendered by one run: titles, rendering and error map, uint8 [H, W, 3] each."""
+
+    titles: tuple[str, ...]
+    rendering: np.ndarray
+    error: np.ndarray
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame of several runs, for comparison.
+
+    `name` has scene, view and number; `stem` begins the names of its files; `truth` is uint8
+    [H, W, 3]. The part `box` is enlarged; `where` says why this part was chosen, and `errors` what
+    the error maps show.
+    """
+
+    name: str
+    stem: str
+    truth: np.ndarray
+    views: Sequence[View]
+    box: Box
+    where: str
+    errors: str
+
+
+Part = str | Table | Picture | Frame
+"""A part that is a string is Markdown."""
 
 
 def kept_frames(runs: Sequence[Run]) -> list[str]:

@@ -10,8 +10,7 @@ from pathlib import Path
 from bench.results import Store
 from reports import figures
 from reports.comparison import comparison, conditions_of
-from reports.images import MOST_RENDERINGS, frame_section, kept_frames
-from reports.parts import Part, Picture
+from reports.images import MOST_RENDERINGS, Part, Picture, frame_section, kept_frames
 from reports.publish import publish
 from reports.runs import Repeated, Run, load, missing_figures, over_common_frames
 from reports.tables import Table, run_tables
@@ -23,10 +22,8 @@ def write_page(
     """Write `folder/report.md` with its pictures, and the same as `report.html`; return the former.
 
     The page replaces an earlier one only once it is complete. `labels` has the names of the runs on
-    the page, by key and in its order; `failures` says why a run is missing, by its label.
-
-    Raises:
-        SteerbenchError: a run is not in the store, or `folder` cannot be written to.
+    the page, by key and in its order; `failures` says why a run is missing, by its label. Raises
+    SteerbenchError if a run is not in the store or `folder` cannot be written to.
     """
     runs = over_common_frames(load(store, labels))
     parts = [

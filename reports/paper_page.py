@@ -14,10 +14,9 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from reports import figures
-from reports.images import frame_section, kept_frames
+from reports.images import Part, Picture, frame_section, kept_frames
 from reports.outliers import Outlier, outlier_table
 from reports.paper_tables import SHARES, Lines, PaperTable, section
-from reports.parts import Part, Picture
 from reports.publish import publish
 from reports.runs import Run
 
@@ -34,14 +33,11 @@ def write_paper_page(
     """Write `folder/report.md` with its pictures, and the same as `report.html`; return the former.
 
     The page shows `tables` in this order, with the `lines` that were measured, and the outliers
-    `found` among their runs. `missing` says why scenes of the data set are left out, by name.
-
-    Raises:
-        SteerbenchError: `folder` cannot be written to.
+    `found` among their runs; `missing` says why scenes are left out, by name. Raises
+    SteerbenchError if `folder` cannot be written to.
     """
-    runs = list(
-        {run.key: run for of in lines.values() for line in of for run in line.measured}.values()
-    )
+    measured = (run for of in lines.values() for line in of for run in line.measured)
+    runs = list({run.key: run for run in measured}.values())
     left_out = "\n".join(f"- missing: {name}: {why}" for name, why in missing.items())
     listed = outlier_table(found, runs)
     sources = "\n".join(f"{run.key}  {run.record['command']}" for run in runs)

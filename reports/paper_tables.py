@@ -44,19 +44,14 @@ class Line:
 
 @dataclass(frozen=True)
 class PaperTable:
-    """A table of the paper; `metrics` are its columns, `lines` are in the paper's order.
+    """A table of the paper, measured by the experiment `name`; `metrics` are its columns.
 
-    Attributes:
-        name: the name of the experiment that measures it.
-        published_on: scenes, size and machine of the paper's figures.
-        notes: what a reader should know before comparing.
-        trends: what the paper concludes from it.
-        beyond: a method beyond the paper, shown with the same lines as the paper's method, or None.
-        beyond_notes: the notes about `beyond`.
-        scenes: the metrics that are also shown for every scene of a data set; empty: no such table.
-        in_turns: whether the lines of a block are measured in turns, frame by frame, because the
-            table compares times.
-        curve: whether the lines of the paper's method are also shown as curves over the training.
+    `published_on` has scenes, size and machine of the paper's figures. `notes` are what a reader
+    should know before comparing, `trends` what the paper concludes. `beyond` is a method beyond the
+    paper, shown with the same lines as the paper's method and notes of its own. The metrics
+    `scenes` are also shown for every scene of a data set. Where a table compares times, the lines
+    of a block are measured `in_turns`, frame by frame. With `curve`, the lines of the paper's
+    method are also shown as curves over the training.
     """
 
     name: str

@@ -110,8 +110,7 @@ def changes(
     several seeds the interval is that over the seeds. It holds what rounding does to a training
     where another processor adds in another order; that over the frames of one training does not.
 
-    Raises:
-        SteerbenchError: the runs rendered other frames.
+    Raises SteerbenchError if the runs rendered other frames.
     """
     pairs = list(zip(old, new, strict=True))
     for before, after in pairs:
@@ -128,7 +127,7 @@ def changes(
 
 def _change(metric: str, limit: Limit, pairs: Sequence[tuple[Figures, Figures]]) -> Change:
     values = np.array([[run.values.get(metric, math.nan) for run in pair] for pair in pairs])
-    frames = [_frames_apart(metric, *pair) for pair in pairs]
+    frames = [frames_apart(metric, *pair) for pair in pairs]
     by_seed = np.array(
         [
             each.mean() if len(each) > 1 else _apart(*pair)
@@ -152,7 +151,7 @@ def _change(metric: str, limit: Limit, pairs: Sequence[tuple[Figures, Figures]])
     return Change(metric, before, after, by, interval, verdict)
 
 
-def _frames_apart(metric: str, old: Figures, new: Figures) -> np.ndarray:
+def frames_apart(metric: str, old: Figures, new: Figures) -> np.ndarray:
     """New less old of the frames that both have, in the order of the path."""
     one, other = old.frames.get(metric, {}), new.frames.get(metric, {})
     return np.array([_apart(one[name], other[name]) for name in one if name in other])

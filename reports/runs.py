@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
@@ -122,8 +122,10 @@ class Run:
     @property
     def settings(self) -> dict[str, str]:
         """The settings of the method by the names that one types; none for scored pictures."""
-        config = self.record["made_of"].get("config", {})
-        return dict(_flat("method", config.get("method", {})))
+        method = self.record["made_of"].get("config", {}).get("method", {})
+        found = pd.json_normalize({"method": method}).to_dict("records")
+        named = [(str(name), str(value)) for each in found for name, value in each.items()]
+        return dict(pair for pair in named if "._" not in pair[0])  # Hydra's own, as `_target_`
 
 
 @dataclass(frozen=True)
@@ -199,8 +201,7 @@ def readable(store: Store, keys: Collection[str] | None = None) -> list[Run]:
 def load(store: Store, labels: Mapping[str, str]) -> list[Run]:
     """Load the runs whose keys are in `labels`, in its order.
 
-    Raises:
-        SteerbenchError: a run is not in the store, or has a schema that cannot be read.
+    Raises SteerbenchError if one is not in the store, or has a schema that cannot be read.
     """
     runs = {run.key: run for run in readable(store, labels)}
     for key in labels:
@@ -221,8 +222,7 @@ def over_common_frames(runs: Sequence[Run]) -> list[Run]:
 
     "All" means the runs that render the same views. A method with memory has fewer steady ones, and
     the first frames of a path are not typical, so that means over different frames would mislead.
-
-    Runs without steady frames stay unchanged, and so do runs without any common steady frame.
+    Runs without steady frames, or without a common one, stay unchanged.
     """
     steady = [set(run.frames.loc[run.frames["phase"] == STEADY, "frame"]) for run in runs]
     common: dict[tuple[object, ...], set[int]] = {}
@@ -300,15 +300,6 @@ def _joined(values: Sequence[Any]) -> Any:
     """The value if all are equal, otherwise all of them as text."""
     distinct = list(dict.fromkeys(values))
     return distinct[0] if len(distinct) == 1 else " / ".join(map(str, distinct))
-
-
-def _flat(name: str, value: Any) -> Iterator[tuple[str, str]]:
-    if not isinstance(value, Mapping):
-        yield name, str(value)
-    else:
-        for key, inner in value.items():
-            if not key.startswith("_"):  # Hydra's own, such as `_target_`
-                yield from _flat(f"{name}.{key}", inner)
 
 
 def _listed(values: Mapping[str, Any]) -> str:

@@ -84,10 +84,8 @@ def phases(rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
 
     Each has the suffix of labels for its figures; that of steady frames is empty.
     """
-    by_phase = [
-        (of, rows[rows["phase"] == phase]) for of, phase in (("", STEADY), (", cold", COLD))
-    ]
-    return [(suffix, of_phase) for suffix, of_phase in by_phase if len(of_phase)]
+    by_phase = {"": rows[rows["phase"] == STEADY], ", cold": rows[rows["phase"] == COLD]}
+    return [(suffix, of_phase) for suffix, of_phase in by_phase.items() if len(of_phase)]
 
 
 def run_tables(rows: pd.DataFrame) -> list[Table]:

@@ -1,8 +1,7 @@
 """Sends a run of the store to an experiment tracker, under the run's key.
 
-There is one function per tracker. Each sends the figures of every frame as a series, the headline
-figures as a summary, the pictures and the provenance. A run already sent under the same key is
-replaced or kept.
+Each tracker gets the figures of every frame as a series, the headline figures as a summary, the
+pictures and the provenance. A run already sent under the same key is replaced or kept.
 """
 
 from __future__ import annotations
@@ -62,12 +61,7 @@ TRACKERS = {"wandb": to_wandb, "tensorboard": to_tensorboard}
 
 
 def tracker(name: str) -> Callable[[Run, Path], None]:
-    """What sends a run to the tracker called `name`.
-
-    Raises:
-        SteerbenchError: there is no such tracker.
-        Unavailable: its package is not installed.
-    """
+    """What sends a run to the tracker called `name`; raises if it is unknown or not installed."""
     if name not in TRACKERS:
         raise SteerbenchError(f"tracker: expected one of {', '.join(TRACKERS)}, got {name!r}")
     if find_spec(name) is None:

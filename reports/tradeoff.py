@@ -15,7 +15,7 @@ from bench.errors import explained
 from bench.provenance import commit, machine
 from bench.sharing import whole
 from reports.figures import frontier_plot
-from reports.parts import Part, Picture
+from reports.images import Part, Picture
 from reports.publish import publish
 from reports.tables import Table, decimal, spread
 
@@ -68,10 +68,7 @@ def write_tradeoff(
     """Write `folder/report.md` and `report.html`, with the plot and all rows as CSV beside them.
 
     `experiments` are rows of kernels; `settings` are rows of methods, and may be missing. Returns
-    the path of report.md.
-
-    Raises:
-        SteerbenchError: `folder` cannot be written to.
+    the path of report.md; raises SteerbenchError if `folder` cannot be written to.
     """
     tables = [experiment_table(experiments)]
     made = f"```sh\n{command}\n```\n\nCommit {commit()}, {machine()['cpu']}."

@@ -11,7 +11,7 @@ import numpy as np
 
 from bench.intervals import half_interval, path_interval
 from reports.comparison import Write, metric_format
-from reports.regression import LIMITS, Figures
+from reports.regression import LIMITS, Figures, frames_apart
 from reports.runs import Repeated
 from reports.tables import Table
 
@@ -98,8 +98,7 @@ def _growth(one: Repeated, other: Repeated, metric: str) -> tuple[float, float, 
         return by, 0.0, "computed, not sampled", True
     if len(pairs) > 1:
         return by, half_interval(by_seed), f"{len(pairs)} seeds", True
-    frames, others = (Figures.of(run).frames.get(metric, {}) for run in pairs[0])
-    by_frame = np.array([others[name] - frames[name] for name in frames if name in others])
+    by_frame = frames_apart(metric, *map(Figures.of, pairs[0]))
     if len(by_frame) > 1:
         over = f"{len(by_frame)} frames of one seed"
         return float(by_frame.mean()), path_interval(by_frame), over, False

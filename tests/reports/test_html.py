@@ -17,8 +17,8 @@ from PIL import Image
 
 from bench.results import Store
 from reports import html
+from reports.images import Detail, Frame, View
 from reports.page import write_page
-from reports.parts import Detail, Frame, View
 from reports.tables import Table
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")

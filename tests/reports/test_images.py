@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from reports.images import MOST_FRAMES, find_detail, kept_frames, write_image
-from reports.parts import View
+from reports.images import MOST_FRAMES, View, find_detail, kept_frames, write_image
 
 HEIGHT, WIDTH = 64, 96
 

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from reports import figures
+from reports.images import Plot
 from reports.outliers import Outlier
 from reports.paper_page import PAGE, _curves, write_paper_page
-from reports.parts import Plot
 from reports.runs import Repeated, Run
 from sweeps.plan import chosen
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from bench.types import SteerbenchError
-from reports.parts import Part, Plot
+from reports.images import Part, Plot
 from reports.publish import publish
 from reports.tables import Table
 

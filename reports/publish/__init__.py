@@ -1,16 +1,19 @@
-"""The HTML page, a single file that loads nothing from elsewhere.
+"""Writes a page in two forms: Markdown with pictures beside it, and one self-contained HTML file.
 
-Texts and cells are rendered from the same Markdown as in report.md; plots are drawn by the same
-code, as SVG. The files beside this module are the page's templates, its style and its script.
+Both are made from the same parts, so that they show the same content: texts and cells of the HTML
+page are rendered from Markdown, plots are drawn by the same code, as SVG. The files beside this
+module are the page's templates, its style and its script.
 """
 
 from __future__ import annotations
 
 import base64
+import hashlib
 import io
 import re
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -22,15 +25,21 @@ from jinja2 import Environment, FileSystemLoader
 from markdown_it import MarkdownIt
 from PIL import Image
 
-from reports.comparison import COST, metric_format
-from reports.images import ZOOM
-from reports.parts import Frame, Part, Picture
-from reports.runs import Run
+from bench.errors import explained
+from bench.sharing import whole
+from reports.comparison import COST, metric_format, written
+from reports.images import ZOOM, Frame, Part, Picture, still_images
+from reports.runs import Repeated, Run
 from reports.tables import QUALITY, Table
 
-FOLDER = Path(__file__).parent
+PICTURE = re.compile(r".+-[0-9a-f]{12}\.png")
+"""File names of a page's pictures: a stem, then a digest of the content."""
+
 TEMPLATES = Environment(
-    loader=FileSystemLoader(FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True
+    loader=FileSystemLoader(Path(__file__).parent),
+    autoescape=True,
+    trim_blocks=True,
+    lstrip_blocks=True,
 )
 
 LOSSLESS_PIXELS = 800 * 800
@@ -43,6 +52,54 @@ PARSER = MarkdownIt("commonmark", {"html": False}).disable("image")
 TEMPLATES.filters["inline"] = PARSER.renderInline
 
 
+def publish(parts: Sequence[Part], folder: Path, runs: Sequence[Run] = ()) -> Path:
+    """Write `parts` as `report.md` and `report.html`, each atomically; return the former.
+
+    The first part begins with the title of the page as a heading. `runs` are those behind the
+    figures; the HTML page shows their provenance. Pictures of an earlier page are kept until that
+    page is replaced. Raises SteerbenchError if `folder` cannot be written to.
+    """
+    with explained(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        text = markdown(parts, folder)
+        for name, content in (("report.html", html_page(parts, runs)), ("report.md", f"{text}\n")):
+            with whole(folder / name) as new:
+                new.write_text(content, encoding="utf-8")
+    for picture in (folder / "pictures").glob("*.png"):
+        if PICTURE.fullmatch(picture.name) and f"(pictures/{picture.name})" not in text:
+            with suppress(OSError):  # the page is already published
+                picture.unlink()
+    return folder / "report.md"
+
+
+def markdown(parts: Sequence[Part], folder: Path) -> str:
+    """`parts` in GitHub's Markdown; writes their pictures below `folder`."""
+    texts: list[str] = []
+    for part in parts:
+        match part:
+            case Table():
+                texts.append(part.markdown())
+            case Frame():
+                texts += [_shown(picture, folder) for picture in still_images(part)]
+            case Picture():
+                texts.append(_shown(part, folder))
+            case _:
+                texts.append(part)
+    return "\n\n".join(texts)
+
+
+def _shown(picture: Picture, folder: Path) -> str:
+    """Draw `picture` into `folder`, named after its content; return the Markdown that shows it."""
+    with tempfile.TemporaryDirectory() as place:
+        picture.draw(drawn := Path(place) / f"{picture.stem}.png")
+        content = drawn.read_bytes()
+    name = f"pictures/{picture.stem}-{hashlib.sha256(content).hexdigest()[:12]}.png"
+    (folder / "pictures").mkdir(exist_ok=True)
+    with whole(folder / name) as new:
+        new.write_bytes(content)
+    return f"![{picture.shows}]({name})"
+
+
 def html_page(parts: Sequence[Part], runs: Sequence[Run]) -> str:
     """The page of `parts` as HTML; the first begins with the title as a heading.
 
@@ -50,22 +107,19 @@ def html_page(parts: Sequence[Part], runs: Sequence[Run]) -> str:
     """
     origins = {run.key: _origin(run) for run in runs}
     headings: dict[str, str] = {}
-    title = str(parts[0]).partition("\n")[0].lstrip("# ")
     return TEMPLATES.get_template("page.html").render(
-        title=title,
+        title=str(parts[0]).partition("\n")[0].lstrip("# "),
         parts=[_html(part, origins, headings) for part in parts],
         headings=headings,
         origins=origins,
-        style=(FOLDER / "page.css").read_text(encoding="utf-8"),
-        script=(FOLDER / "page.js").read_text(encoding="utf-8"),
     )
 
 
 def _origin(run: Run) -> dict[str, str]:
-    formats = {metric: metric_format(metric) for metric in (*QUALITY, *COST)}
+    line = Repeated(run.label, [run])
     figures = [
-        f"{label.rstrip(' ↑↓')} {write(run.values[metric])}"
-        for metric, (label, write) in formats.items()
+        f"{metric_format(metric)[0].rstrip(' ↑↓')} {written(line, metric)}"
+        for metric in (*QUALITY, *COST)
         if metric in run.values
     ]
     chosen = ", ".join(f"{name}={value}" for name, value in run.settings.items())
