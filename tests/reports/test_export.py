@@ -12,6 +12,7 @@ from reports import export
 from reports.paper_tables import Line, PaperTable
 from reports.runs import Repeated, Run
 from sweeps.plan import chosen
+from tests.reports.conftest import changed
 
 TABLE = PaperTable(
     name="table9",
@@ -24,7 +25,6 @@ TABLE = PaperTable(
         Line("mine_1", {"method": "c"}),
         Line("not yet", {"method": "d"}, {"psnr": 30.0}),
     ],
-    notes=[],
 )
 
 
@@ -32,18 +32,11 @@ TABLE = PaperTable(
 def lines(run: Run) -> dict[str, list[Repeated]]:
     """Three measured lines; two of them differ by less than the decimals show."""
     figures = {
-        "T = 2^19": (30.456, 0.9512, 25.24e6),
-        "K = 3": (30.461, 0.9514, 25.0e6),
-        "mine_1": (29.0, 0.9, 3e6),
+        "T = 2^19": {"psnr": 30.456, "ssim": 0.9512, "size_bytes.total": 25.24e6},
+        "K = 3": {"psnr": 30.461, "ssim": 0.9514, "size_bytes.total": 25.0e6},
+        "mine_1": {"psnr": 29.0, "ssim": 0.9, "size_bytes.total": 3e6},
     }
-    return {"table9": [Repeated(label, [of(run, *values)]) for label, values in figures.items()]}
-
-
-def of(run: Run, psnr: float, ssim: float, size: float) -> Run:
-    values = {"psnr": psnr, "ssim": ssim, "size_bytes.total": size}
-    rows = run.rows[run.rows["metric"].isin(values)].copy()
-    rows["value"] = rows["metric"].map(values)
-    return replace(run, rows=rows)
+    return {"table9": [Repeated(label, [changed(run, of)]) for label, of in figures.items()]}
 
 
 def cells(text: str) -> dict[str, list[str]]:
@@ -65,7 +58,7 @@ def test_latex_has_the_decimals_of_the_paper_and_marks_the_best(lines):
 
 def test_latex_of_several_seeds_has_their_interval(lines):
     (line, *_) = lines["table9"]
-    runs = [of(line.runs[0], psnr, 0.95, 1e6) for psnr in (29.0, 31.0)]
+    runs = [changed(line.runs[0], {"psnr": psnr}) for psnr in (29.0, 31.0)]
     found = cells(export.latex([TABLE], {"table9": [replace(line, runs=runs)]}))
     assert found["$T = 2^{19}$"][0] == r"30.00 $\pm$ 12.71"  # t(0.975, 1) = 12.71
 

@@ -16,10 +16,11 @@ import pytest
 from PIL import Image
 
 from bench.results import Store
-from reports import html
-from reports.images import Detail, Frame, View
+from reports import publish
+from reports.images import Frame, View
 from reports.page import write_page
 from reports.tables import Table
+from tests.reports.conftest import rewrite
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 FIRST = re.compile(r"first: tiny, .*, frame 1 of 6")
@@ -124,11 +125,11 @@ def test_pictures_lose_nothing(several, stored_run, parsed):
 
 def test_a_page_with_large_pictures_says_that_they_are_compressed(monkeypatch):
     grey = np.full((8, 8, 3), 99, np.uint8)
-    detail = Detail((0, 0, 2, 2), "nothing differs")
-    frame = Frame("ball, 0", "frame", grey, [View(("a", "b"), grey, grey)], detail, "no error")
-    assert "compressed" not in html.html_page(["# Title", frame], [])
-    monkeypatch.setattr(html, "LOSSLESS_PIXELS", 63)
-    assert "compressed for this page: WebP, quality 90" in html.html_page(["# Title", frame], [])
+    views = [View(("a", "b"), grey, grey)]
+    frame = Frame("ball, 0", "frame", grey, views, (0, 0, 2, 2), "nothing differs", "no error")
+    assert "compressed" not in publish.html_page(["# Title", frame], [])
+    monkeypatch.setattr(publish, "LOSSLESS_PIXELS", 63)
+    assert "compressed for this page: WebP, quality 90" in publish.html_page(["# Title", frame], [])
 
 
 def test_every_line_and_every_mark_leads_to_its_run(several, parsed):
@@ -156,10 +157,7 @@ HOSTILE = "<script>x</script>![](http://a/b.png)"
 def test_names_are_text_and_nothing_else(store, stored_run, tmp_path):
     rows = store.folder / stored_run / "rows.csv"
     rows.write_text(rows.read_text().replace(",tiny,", f",{HOSTILE},"))
-    record = store.folder / stored_run / "record.json"
-    facts = json.loads(record.read_text())
-    facts |= {"command": HOSTILE, "error_map": HOSTILE}
-    record.write_text(json.dumps(facts))
+    rewrite(store, stored_run, command=HOSTILE, error_map=HOSTILE)
     write_page(store, {stored_run: HOSTILE}, tmp_path / "page", {HOSTILE: HOSTILE})
     text = (tmp_path / "page" / "report.html").read_text()
     assert "<script>x" not in text
@@ -222,7 +220,7 @@ def test_a_click_on_a_head_sorts_numbers_as_numbers_the_best_above_and_the_missi
         ("e", "**9.60**", "900.0"),
     )
     table = Table("t", ("name", "PSNR, dB ↑", "ms ↓"), lines)
-    found = in_browser(html.html_page(["# Title", table], []), SORT, tmp_path)
+    found = in_browser(publish.html_page(["# Title", table], []), SORT, tmp_path)
     assert found["sorted"] == [
         ["descending", "ceadb"],
         ["ascending", "daecb"],
@@ -258,7 +256,7 @@ def test_rows_of_a_long_table_are_laid_out_apart_below_their_heads(tmp_path):
         Table(name, ("name", "PSNR, dB ↑", "ms"), lines[:rows])
         for name, rows in (("a", 50), ("b", 300))
     ]
-    short, long = in_browser(html.html_page(["# Title", *tables], []), LONG, tmp_path)["found"]
+    short, long = in_browser(publish.html_page(["# Title", *tables], []), LONG, tmp_path)["found"]
     assert (short["apart"], long["apart"]) == (False, True)
     for one, rows in ((short, 50), (long, 300)):
         assert one["aligned"]
