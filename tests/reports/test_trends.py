@@ -24,11 +24,12 @@ from reports.trends import (
 )
 from tests.reports.conftest import changed, elsewhere, shifted
 
-Published = Mapping[str, Mapping[str, float]]
-
 
 def between(
-    one: list[Run], two: list[Run], metric: str = "psnr", published: Published = {}
+    one: list[Run],
+    two: list[Run],
+    metric: str = "psnr",
+    published: Mapping[str, Mapping[str, float]] = {},
 ) -> list[Difference]:
     """The difference between two lines, if there is one."""
     lines = {"one": Repeated("one", one), "two": Repeated("two", two)}
@@ -108,9 +109,8 @@ def test_a_line_of_the_table_has_both_differences_in_the_unit_of_the_metric():
 
 
 def test_seeds_that_only_one_line_has_are_left_out(run):
-    (difference,) = between(
-        [shifted(run, 0, seed=0), shifted(run, 9, seed=1)], [shifted(run, 1, seed=0)]
-    )
+    one = [shifted(run, 0, seed=0), shifted(run, 9, seed=1)]
+    (difference,) = between(one, [shifted(run, 1, seed=0)])
     assert difference.over == "6 frames of one seed"
     assert difference.by == pytest.approx(1)
 
