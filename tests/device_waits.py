@@ -37,13 +37,6 @@ PARTS = {
 }
 
 
-def small_scene() -> Scene:
-    cameras = [look_at_the_middle(i / 40, 0.3) for i in range(4)]
-    split = Split(cameras, [ball(camera) for camera in cameras], [f"r_{i}" for i in range(4)])
-    bounds = torch.tensor([[0.1, 0.1, 0.1], [0.9, 0.9, 0.9]])
-    return Scene("ball", {"train": split, "test": split}, torch.ones(3), bounds, 1.0, "ball")
-
-
 def counted(what: str, call, waits: dict[str, list[Counter[Line]]]):
     """`call`, which adds what it waits for to those of `what`."""
 
@@ -56,15 +49,11 @@ def counted(what: str, call, waits: dict[str, list[Counter[Line]]]):
     return calling
 
 
-def show(what: str, times: list[Counter[Line]]) -> None:
-    total = sum(times, Counter())
-    print(f"\n{what}: {total.total() / len(times):.1f} waits, mean of {len(times)}")
-    for line, count in total.most_common():
-        print(f"{count / len(times):8.1f}  {line.place:48} {line.source}")
-
-
 def main() -> None:
-    scene = small_scene()
+    cameras = [look_at_the_middle(i / 40, 0.3) for i in range(4)]
+    split = Split(cameras, [ball(camera) for camera in cameras], [f"r_{i}" for i in range(4)])
+    bounds = torch.tensor([[0.1, 0.1, 0.1], [0.9, 0.9, 0.9]])
+    scene = Scene("ball", {"train": split, "test": split}, torch.ones(3), bounds, 1.0, "ball")
     budget = replace(BUDGET, steps=18, renderer_steps=4)
     for name in ("ngp", "steernerf", "steernerf_lean"):
         waits: dict[str, list[Counter[Line]]] = {}
@@ -81,7 +70,10 @@ def main() -> None:
             waits[f"a frame of {name}"] = waits[f"a frame of {name}"][2:]  # with preceding ones
         for what, times in waits.items():
             if name == "ngp" or "stage 1" not in what:
-                show(what, times)
+                total = sum(times, Counter())
+                print(f"\n{what}: {total.total() / len(times):.1f} waits, mean of {len(times)}")
+                for line, count in total.most_common():
+                    print(f"{count / len(times):8.1f}  {line.place:48} {line.source}")
 
 
 if __name__ == "__main__":

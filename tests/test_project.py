@@ -22,6 +22,7 @@ from sweeps.overrides import composed
 ROOT = Path(__file__).parent.parent
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 CONFIGS = ROOT / "sweeps" / "configs"
+PACKAGES = ("bench", "methods", "reports", "sweeps")
 EXTRAS = PYPROJECT["project"]["optional-dependencies"]
 
 
@@ -52,11 +53,8 @@ def closure(requirements: list[str]) -> Iterator[Requirement]:
 
 def test_every_package_on_disk_is_listed_and_nothing_else():
     listed = PYPROJECT["tool"]["setuptools"]["packages"]
-    found = {
-        str(path.parent.relative_to(ROOT)).replace(os.sep, ".")
-        for top in ("bench", "methods", "reports", "sweeps")
-        for path in (ROOT / top).rglob("__init__.py")
-    }
+    modules = (path for top in PACKAGES for path in (ROOT / top).rglob("__init__.py"))
+    found = {str(path.parent.relative_to(ROOT)).replace(os.sep, ".") for path in modules}
     assert sorted(listed) == sorted(found)
 
 
@@ -67,11 +65,8 @@ def test_every_file_beside_the_sources_is_shipped():
         path for name, patterns in of_package.items() for of in patterns
         for path in folders[name].glob(of)
     }  # fmt: skip
-    found = {
-        path for top in ("bench", "methods", "reports", "sweeps")
-        for path in (ROOT / top).rglob("*.*")
-        if path.suffix != ".py" and path.parent.name != "__pycache__"
-    }  # fmt: skip
+    files = (path for top in PACKAGES for path in (ROOT / top).rglob("*.*"))
+    found = {path for path in files if path.suffix != ".py" and path.parent.name != "__pycache__"}
     assert shipped == found
 
 
@@ -87,24 +82,6 @@ def test_every_pin_suits_the_range_in_pyproject():
     for requirement in map(Requirement, texts):
         version = pins()[canonicalize_name(requirement.name)]
         assert requirement.specifier.contains(version), f"{requirement}: pinned to {version}"
-
-
-def test_extras_are_those_that_are_promised():
-    assert set(EXTRAS) == {
-        *(
-            "openvino",
-            "tensorrt",
-            "video",
-            "viewer",
-            "colmap",
-            "tensorboard",
-            "wandb",
-            "joblib",
-            "ray",
-            "slurm",
-            "dev",
-        )
-    }
 
 
 def test_continuous_integration_runs_all_tests():
