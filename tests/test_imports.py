@@ -30,10 +30,11 @@ REACHES = {
 FIELD = {"kernels", "rendering", "training", "instant_ngp"}
 STANDS_ON = {
     "kernels": set(),
-    **dict.fromkeys(("engines", "rendering", "training"), {"kernels"}),
+    **{name: {"kernels"} for name in ("engines", "rendering", "training")},
     "instant_ngp": {"kernels", "rendering", "training"},
-    **dict.fromkeys(("gaussians", "students"), FIELD),
-    **dict.fromkeys(("nerf", "nsvf", "kilonerf", "plenoctree", "diver"), {*FIELD, "students"}),
+    "gaussians": FIELD,
+    "students": FIELD,
+    **{name: {*FIELD, "students"} for name in ("nerf", "nsvf", "kilonerf", "plenoctree", "diver")},
     "steernerf": {*FIELD, "engines"},
     "steernerf_lean": {*FIELD, "engines", "steernerf"},
 }

@@ -27,8 +27,10 @@ class Handler(BaseHTTPRequestHandler):
 
 
 class Web(ThreadingHTTPServer):
-    """Has `files`, by path; of every answer `breaks_after` bytes arrive (None: all); `asked` has the
-    path of every request."""
+    """Serves `files`, by path; of every answer `breaks_after` bytes arrive (None: all).
+
+    `asked` has the path of every request.
+    """
 
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), Handler)
