@@ -119,7 +119,7 @@ def ranks(lines: Sequence[Repeated], metric: str, write: Write | None = None) ->
     return places
 
 
-def conditions_of(runs: Sequence[Run]) -> str:
+def conditions_of(runs: Sequence[Run], facts: Sequence[str] = COMMON) -> str:
     """Scene, resolution, trajectory and so on of `runs`, as text; lists all values of a fact."""
-    values = {name: dict.fromkeys(str(run.facts[name]) for run in runs) for name in COMMON}
+    values = {name: dict.fromkeys(str(run.facts[name]) for run in runs) for name in facts}
     return ", ".join(f"{name} {' / '.join(several)}" for name, several in values.items())

@@ -71,7 +71,7 @@ def _rows(block: PaperTable, known: Mapping[str, Repeated]) -> list[list[str]]:
     lines = block.measured(known)
     columns = [marked(lines, metric, MARKS, partial(_written, metric)) for metric in block.metrics]
     return [
-        [_label(line.label), *((text or "--").replace("±", r"$\pm$") for text in row)]
+        [_escaped(line.label), *((text or "--").replace("±", r"$\pm$") for text in row)]
         for line, *row in zip(lines, *columns, strict=True)
     ]
 
@@ -109,11 +109,7 @@ def _written(metric: str, value: float | None) -> str:
     return decimal(value, DECIMALS.get(family, 0))
 
 
-def _label(label: str) -> str:
-    if SETTING.fullmatch(label):
-        return "$" + re.sub(r"\^(\d+)", r"^{\1}", label) + "$"
-    return _escaped(label)
-
-
 def _escaped(text: str) -> str:
+    if SETTING.fullmatch(text):
+        return "$" + re.sub(r"\^(\d+)", r"^{\1}", text) + "$"
     return text.translate(ESCAPES)

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from bench.results import COLD
 from reports.comparison import written
-from reports.images import Mark, Picture
+from reports.images import Picture
 from reports.runs import Repeated, Run
 from reports.tables import NOT_AVAILABLE
 
@@ -39,7 +39,7 @@ COSTS = {
 """What quality is plotted against: prefix of the file name, unit and label of the axis."""
 
 MARK = "mark-{}"
-"""The `gid` of the mark for the line with this number in `quality_against`."""
+"""The `gid` of the mark of the line with this number."""
 
 NAME_SIZE = (160, 13)
 """Width and height in pixels of the name of a setting on a plot."""
@@ -48,8 +48,7 @@ NAME_SIZE = (160, 13)
 def stage_bars(runs: Sequence[Run], path: Path) -> None:
     """Write a PNG: one bar per run, its mean frame time in ms split into stages.
 
-    A stage includes its nested stages and has the same colour in all bars. Time outside all stages
-    is grey and comes last.
+    A stage includes its nested stages. Time outside all stages is grey and comes last.
     """
     names = (name for run in runs for name in run.values if name.startswith(STAGE))
     stages = list(dict.fromkeys(name.partition("/")[0] for name in names))
@@ -76,17 +75,14 @@ def stage_bars(runs: Sequence[Run], path: Path) -> None:
 
 
 def quality_plot(lines: Sequence[Repeated], metric: str) -> Picture:
-    """`quality_against` as a part of a page: each mark tells its label, PSNR and `metric`.
-
-    A line that lacks one of these figures has no mark.
-    """
+    """`quality_against` as a part of a page, with a mark for each line that has both figures."""
     stem, _, axis = COSTS[metric]
     marks = {}
     for number, line in enumerate(lines):
         quality, cost = written(line, "psnr"), written(line, metric)
         if not {quality, cost} & {None, NOT_AVAILABLE}:
             says = f"{line.label}: PSNR {quality} dB, {cost} {axis}"
-            marks[MARK.format(number)] = Mark(says, line.keys)
+            marks[MARK.format(number)] = says, line.keys
     shows = f"PSNR in dB against {axis}, one mark a run"
     return Picture(stem, shows, partial(quality_against, lines, metric), marks)
 
@@ -100,7 +96,9 @@ def quality_against(lines: Sequence[Repeated], metric: str, path: Path) -> None:
     labels = [textwrap.fill(line.label, LEGEND_WIDTH) for line in lines]
     half = -(-len(labels) // 2)  # the legend has two columns
     legend_lines = max("\n".join(part).count("\n") + 1 for part in (labels[:half], labels[half:]))
-    figure, axes = _psnr_axes(4.0 + 0.25 * legend_lines, label)
+    figure = Figure(figsize=(8, 4.0 + 0.25 * legend_lines), layout="constrained")
+    axes = figure.subplots()
+    _label(axes, label)
     for number, line in enumerate(lines):
         across, up = line.mean(metric), line.mean("psnr")
         if across is None or up is None:
@@ -117,25 +115,21 @@ def quality_against(lines: Sequence[Repeated], metric: str, path: Path) -> None:
         )
         drawn[0].set_gid(MARK.format(number))
     axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=_steps_of_a_decade(*axes.get_xlim())))
+    low, high = axes.get_xlim()
+    decades = math.log10(high / low)  # the more of them, the fewer ticks in each
+    ticks = (1, 2, 3, 5, 7) if decades < 1.5 else (1, 2, 5) if decades < 3 else (1,)
+    axes.xaxis.set_major_locator(LogLocator(subs=ticks))
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_locator(NullLocator())
     figure.legend(loc="outside lower center", ncols=2, frameon=False)
     figure.savefig(path, dpi=150)
 
 
-def _steps_of_a_decade(low: float, high: float) -> tuple[int, ...]:
-    """Which multiples of powers of ten get a tick: the wider the range, the fewer."""
-    decades = math.log10(high / low)
-    return (1, 2, 3, 5, 7) if decades < 1.5 else (1, 2, 5) if decades < 3 else (1,)
-
-
 def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
-    """Write a PNG: PSNR of every frame with a ground truth along the path, one curve per run.
-
-    Cold frames are hollow.
-    """
-    figure, axes = _psnr_axes(3.5, "frame of the path")
+    """Write a PNG: PSNR of scored frames along the path, one curve per run; cold are hollow."""
+    figure = Figure(figsize=(8, 3.5), layout="constrained")
+    axes = figure.subplots()
+    _label(axes, "frame of the path")
     for number, run in enumerate(runs):
         scored = run.frames.dropna(subset=["psnr"])
         colour, cold = COLOURS[number % len(COLOURS)], scored[scored["phase"] == COLD]
@@ -158,14 +152,11 @@ class Curve:
 
 
 def quality_over_training(curves: Sequence[Curve], path: Path) -> None:
-    """Write a PNG: PSNR over training steps (log scale), one panel for each `panel` of `curves`.
-
-    With several seeds, error bars show the intervals.
-    """
+    """Write a PNG: PSNR over training steps (log scale), one panel for each `panel` of `curves`."""
     titles = list(dict.fromkeys(curve.panel for curve in curves))
     figure = Figure(figsize=(4.2 * len(titles), 3.6), layout="constrained")
     for axes, title in zip(figure.subplots(1, len(titles), squeeze=False)[0], titles, strict=True):
-        _label_psnr(axes, "steps of stage 2")
+        _label(axes, "steps of stage 2")
         axes.set_title(title, fontsize="medium")
         shown = [curve for curve in curves if curve.panel == title]
         for number, curve in enumerate(shown):
@@ -188,15 +179,7 @@ def _style(number: int) -> dict[str, Any]:
     return {"marker": marker, "color": colour, "linestyle": "none"}
 
 
-def _psnr_axes(height: float, across: str) -> tuple[Figure, Axes]:
-    """Axes with PSNR as y and the x label `across`; `height` in inches."""
-    figure = Figure(figsize=(8, height), layout="constrained")
-    axes = figure.subplots()
-    _label_psnr(axes, across)
-    return figure, axes
-
-
-def _label_psnr(axes: Axes, across: str) -> None:
+def _label(axes: Axes, across: str) -> None:
     axes.set_xlabel(across)
     axes.set_ylabel("PSNR, dB")
     axes.grid(alpha=0.3)

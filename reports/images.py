@@ -37,33 +37,23 @@ INK, PAPER, MARK = (30, 30, 30), (255, 255, 255), (214, 0, 110)
 ZOOM = 4
 """Magnification of the detail relative to its picture."""
 
-Box = tuple[int, int, int, int]
-"""Left, top, right, bottom."""
-
+Box = tuple[int, int, int, int]  # left, top, right, bottom
 Band = tuple[str, Sequence[Image.Image | None]]
 """One row of panels below a caption; None leaves a place empty."""
-
-
-@dataclass(frozen=True)
-class Mark:
-    """A mark in a plot: its name and figures in words, and the keys of the runs behind it."""
-
-    says: str
-    sources: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Picture:
     """A drawing: the prefix of its file name, and what it shows, in words.
 
-    `draw` writes it to a path, in the format given by the ending. In a plot by matplotlib, `marks`
-    are keyed by the `gid` that `draw` gives their artists.
+    `draw` writes it to a path, in the format given by the ending. The marks of a plot, by the `gid`
+    that `draw` gives their artists, are their figures in words and the keys of the runs behind.
     """
 
     stem: str
     shows: str
     draw: Callable[[Path], object]
-    marks: Mapping[str, Mark] = field(default_factory=dict)
+    marks: Mapping[str, tuple[str, tuple[str, ...]]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -98,10 +88,7 @@ Part = str | Table | Picture | Frame
 
 
 def kept_frames(runs: Sequence[Run]) -> list[str]:
-    """File name prefixes of the frames whose pictures all `runs` kept.
-
-    At most `MOST_FRAMES` of them, evenly spread.
-    """
+    """File name prefixes of at most `MOST_FRAMES` frames that all `runs` kept, evenly spread."""
     kept = [{path.name.split("-")[0] for path in run.pictures.glob("*-truth.png")} for run in runs]
     common = sorted(set.intersection(*kept))
     return [common[index] for index in spread(len(common), MOST_FRAMES)]

@@ -29,7 +29,10 @@ def write_page(
     parts = [
         *_heading(runs, failures),
         *_tradeoffs(runs),
-        *_time(runs),
+        "## Where the time goes",
+        Picture("stages", "Mean ms of a frame by stages", partial(figures.stage_bars, runs)),
+        "One bar per run: the mean time of a frame, divided into the stages of the method; a stage"
+        " includes the stages inside it. Time outside all stages is `other`.",
         *_pictures(runs),
         *(part for run in runs for part in _figures(run)),
         *_provenance(runs),
@@ -72,16 +75,6 @@ def _tradeoffs(runs: Sequence[Run]) -> Iterator[Part]:
             yield f"## {title}"
             yield plot
             yield f"One mark a run: further up is better, further left is {better}."
-
-
-def _time(runs: Sequence[Run]) -> Iterator[Part]:
-    yield "## Where the time goes"
-    shows = "Mean time of a frame in ms, one bar per run, divided into stages"
-    yield Picture("stages", shows, partial(figures.stage_bars, runs))
-    yield (
-        "One bar per run: the mean time of a frame, divided into the stages of the method; a stage"
-        " includes the stages inside it. Time outside all stages is `other`."
-    )
 
 
 def _pictures(runs: Sequence[Run]) -> Iterator[Part]:

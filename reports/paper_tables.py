@@ -10,8 +10,8 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from reports.comparison import conditions_of, marked, metric_format, written
-from reports.runs import Repeated, Run, missing_figures
+from reports.comparison import COMMON, conditions_of, marked, metric_format, written
+from reports.runs import Repeated, missing_figures
 from reports.tables import NOT_AVAILABLE, Table
 from reports.trends import Trend, differences, signed, trend_table
 
@@ -30,11 +30,9 @@ Lines = Mapping[str, Sequence[Repeated]]
 
 @dataclass(frozen=True)
 class Line:
-    """A line of a table.
+    """A line of a table: `job` has its settings, beside those of all lines; the paper's figures.
 
-    `job` has the settings that measure it, beside those of all lines; without a `method` it is a
-    line of the paper's method. The paper's figures, by metric, are in bytes, ms and dB as in our
-    rows.
+    Without a `method` it is one of the paper's method. Units are bytes, ms and dB, as in our rows.
     """
 
     label: str
@@ -74,10 +72,7 @@ class PaperTable:
 
     @property
     def marks(self) -> dict[tuple[str, float], Line]:
-        """The additional lines measured for the curves.
-
-        Keys are the label of a line and the share of the training after which it is rendered.
-        """
+        """The lines added for curves, by the label of a line and the share of its training."""
         return {
             (line.label, share): Line(
                 f"{line.label}, after {share}", {**line.job, AFTER: str(share), **OF_CURVES}
@@ -89,10 +84,7 @@ class PaperTable:
 
     @property
     def blocks(self) -> list[PaperTable]:
-        """The table, then the same for the method beyond the paper, if there is one.
-
-        The latter has the lines of the paper's method, without published figures, and the trends.
-        """
+        """The table, then the lines and trends of the paper's method for the one beyond it."""
         if self.beyond is None:
             return [self]
         of_paper = [line for line in self.lines if METHOD not in line.job]
@@ -173,24 +165,16 @@ def _block(
     """Conditions of the measured and the published figures, then the figures, trends, notes."""
     figures = {line.label: line.published for line in table.lines}
     runs = [run for line in table.measured(measured) for run in line.runs]
-    where = f"Measured: {conditions_of(runs)}, {_origin(runs)}." if runs else ""
+    machines = [run.record["machine"] for run in runs]
+    on = dict.fromkeys(f"{each['cpu']} with {each['threads']} threads" for each in machines)
+    facts = conditions_of(runs, (*COMMON, "method", "seed", "commit"))
+    where = f"Measured: {facts}, on {' / '.join(on)}." if runs else ""
     grown = [each for trend in table.trends for each in differences(trend, measured, figures)]
     trends = trend_table(grown) if grown else ""
     notes = dict.fromkeys((*table.notes, *missing_figures(runs)))
     listed = "\n".join(f"- {note}" for note in notes)
     shown = with_published(table, measured)
     return [part for part in (where, published, shown, trends, listed) if part]
-
-
-def _origin(runs: Sequence[Run]) -> str:
-    machines = [run.record["machine"] for run in runs]
-    origin = {
-        "method": [run.facts["method"] for run in runs],
-        "seed": [str(run.facts["seed"]) for run in runs],
-        "commit": [run.facts["commit"] for run in runs],
-        "on": [f"{each['cpu']} with {each['threads']} threads" for each in machines],
-    }
-    return ", ".join(f"{name} {' / '.join(dict.fromkeys(of))}" for name, of in origin.items())
 
 
 def with_published(table: PaperTable, measured: Mapping[str, Repeated]) -> Table:

@@ -19,8 +19,7 @@ from reports.tables import QUALITY, Table
 class Limit:
     """How much worse a metric may become: `absolute` in its unit, `relative` to the old figure.
 
-    `better` is 1 where more is better, -1 where less is. A metric of which `here` is true depends
-    on the machine and is compared on the same one only.
+    `better` is 1 where more is better, else -1. With `here`, it is compared on one machine only.
     """
 
     better: int
@@ -106,11 +105,10 @@ def changes(
     """The change of every metric of `old` that has a limit, over runs with the same seeds.
 
     A change beyond its limit is chance where its interval contains 0, unless one frame alone moves
-    the mean beyond the limit. Then that frame is broken; but a time may be long by chance. With
-    several seeds the interval is that over the seeds. It holds what rounding does to a training
-    where another processor adds in another order; that over the frames of one training does not.
-
-    Raises SteerbenchError if the runs rendered other frames.
+    the mean beyond the limit. Then that frame is broken; but a time may be long by chance. The
+    interval over several seeds holds what rounding does to a training where another processor adds
+    in another order; that over the frames of one training does not. Raises SteerbenchError if the
+    runs rendered other frames.
     """
     pairs = list(zip(old, new, strict=True))
     for before, after in pairs:

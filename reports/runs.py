@@ -22,9 +22,6 @@ from reports.tables import phases, run_tables
 FIGURES = ("metric", "unit", "phase", "value", "n", "lo", "hi")
 """The columns of rows that are not facts about the whole run."""
 
-PARTS = ("stage_ms.", "work.")
-"""Prefixes of metrics that a run lacks if the stage or the work did not occur in it."""
-
 
 @dataclass(frozen=True)
 class Run:
@@ -178,10 +175,7 @@ class Repeated:
 
 
 def readable(store: Store, keys: Collection[str] | None = None) -> list[Run]:
-    """Every run that this version can read, or those in `keys`, in the order of storing.
-
-    Each is labelled with its key.
-    """
+    """Every readable run, or those in `keys`, labelled with its key, in the order of storing."""
     rows = store.rows(report=lambda unreadable: None, keys=keys)
     runs = [
         Run(
@@ -251,13 +245,13 @@ def over_scenes(runs: Sequence[Run]) -> Run:
     """Average runs of different scenes into one run.
 
     Its rows are means of their headline rows, for the metrics that all of them have; its frames are
-    the frames of all. A stage or counter that a run lacks counts as 0 for it.
+    the frames of all. A stage or a work that a run lacks did not occur in it and counts as 0.
     """
     if len(runs) == 1:
         return runs[0]
     found = pd.concat([run.headline.reset_index() for run in runs])
     complete = found.groupby("metric")["value"].transform("size") == len(runs)
-    found = found[complete | found["metric"].str.startswith(PARTS)]
+    found = found[complete | found["metric"].str.startswith(("stage_ms.", "work."))]
     rows = found.groupby("metric", sort=False).agg(
         unit=("unit", "first"),
         phase=("phase", "first"),

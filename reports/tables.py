@@ -1,10 +1,7 @@
 """Tables of text for the terminal and for pages, and the format of figures in them.
 
-Units are dB, milliseconds and MB = 10^6 bytes. Every LPIPS column names its network. A missing
-figure is shown as `n/a`.
-
-The headline figures of a run are those of its steady frames. Cold frames, which have fewer
-preceding frames than the method can use, are listed separately.
+Units are dB, milliseconds and MB = 10^6 bytes. Every LPIPS column names its network. Cold frames,
+which have fewer preceding frames than the method can use, are listed separately.
 """
 
 from __future__ import annotations
@@ -17,7 +14,6 @@ import pandas as pd
 from bench.results import COLD, STEADY
 
 NOT_AVAILABLE = "n/a"
-
 DENSE = ".dense"
 """Suffix of a work counter for the work of a method that skips nothing."""
 

@@ -32,14 +32,21 @@ ON_FRONTIER = "— (frontier)"
 
 def experiment_table(rows: Sequence[Row]) -> Table:
     """A table of all settings of all experiments; first lines show the observed order."""
-    lines = []
+    lines: list[tuple[str, ...]] = []
     for subject, some in groupby(rows, lambda row: row["subject"]):
-        for number, row in enumerate(some):
-            first = (subject, row["knob"], _order(row)) if number == 0 else ("", "", "")
-            figures = (_setting(row["setting"]), f"{row['error']:.1e}", decimal(row["ms"], 2))
-            lines.append((*first[:2], *figures, first[2]))
+        first, *others = some
+        order = ""
+        if first["order"] is not None:
+            ends = f"{_setting(first['order_from'])} to {_setting(first['order_to'])}"
+            order = f"{first['order']:.2f} ({ends})"
+        lines.append((subject, first["knob"], *_trial(first), order))
+        lines += [("", "", *_trial(row), "") for row in others]
     title = "Kernels: run time against error, where the exact answer is known"
     return Table(title, EXPERIMENTS, tuple(lines))
+
+
+def _trial(row: Row) -> tuple[str, str, str]:
+    return _setting(row["setting"]), f"{row['error']:.1e}", decimal(row["ms"], 2)
 
 
 def setting_table(rows: Sequence[Row]) -> Table:
@@ -94,9 +101,3 @@ def _setting(value: float | str) -> str:
     if 0 < value < 1 and math.frexp(value)[0] == 0.5:
         return f"1/{1 / value:.0f}"
     return f"{value:g}"
-
-
-def _order(row: Row) -> str:
-    if row["order"] is None:
-        return ""
-    return f"{row['order']:.2f} ({_setting(row['order_from'])} to {_setting(row['order_to'])})"

@@ -35,12 +35,8 @@ from reports.tables import QUALITY, Table
 PICTURE = re.compile(r".+-[0-9a-f]{12}\.png")
 """File names of a page's pictures: a stem, then a digest of the content."""
 
-TEMPLATES = Environment(
-    loader=FileSystemLoader(Path(__file__).parent),
-    autoescape=True,
-    trim_blocks=True,
-    lstrip_blocks=True,
-)
+HERE = FileSystemLoader(Path(__file__).parent)
+TEMPLATES = Environment(loader=HERE, autoescape=True, trim_blocks=True, lstrip_blocks=True)
 
 LOSSLESS_PIXELS = 800 * 800
 """Pictures up to this size are stored losslessly; larger ones would make the page too large."""
@@ -163,11 +159,12 @@ def _svg(plot: Picture) -> str:
         element.tag = element.tag.rpartition("}")[2]  # HTML needs no namespaces in <svg>
         element.attrib = {name.rpartition("}")[2]: of for name, of in element.attrib.items()}
         name = element.get("id", "")
-        if mark := plot.marks.get(name):
+        if name in plot.marks:
+            says, runs = plot.marks[name]
             element.attrib |= {"class": "mark", "tabindex": "0", "role": "button"}
-            element.attrib |= {"aria-label": mark.says, "data-runs": " ".join(mark.sources)}
+            element.attrib |= {"aria-label": says, "data-runs": " ".join(runs)}
             title = ElementTree.Element("title")
-            title.text = mark.says
+            title.text = says
             element.insert(0, title)
         if name not in used:  # another plot on the page may use the same id
             element.attrib.pop("id", None)
