@@ -101,8 +101,8 @@ def frame_section(runs: Sequence[Run], frame: str, stem: str) -> Iterator[str | 
     views = [_view(run, frame) for run in runs]
     box, where = find_detail(truth, [view.rendering for view in views])
     view = first.frames.set_index("frame")["name"][int(frame)]
-    number = f"frame {int(frame) + 1} of {len(first.frames)}"
-    name, errors = f"{first.facts['scene']}, {view}, {number}", first.record["error_map"]
+    place = f"frame {int(frame) + 1} of {len(first.frames)}"
+    name, errors = f"{first.facts['scene']}, {view}, {place}", first.record["error_map"]
     yield f"### {name}"
     yield Frame(name, f"{stem}-{frame}", truth, views, box, where, errors)
     yield (

@@ -92,11 +92,10 @@ def _curves(table: PaperTable, lines: Lines) -> Iterator[figures.Curve]:
             yield figures.Curve(table.number, line.label, points)
 
 
-def _steps(run: Run) -> int:
+def _steps(run: Run) -> Any:
     """Steps of stage 2 in the training of `run`."""
     method = run.record["made_of"].get("config", {}).get("method", {})
-    steps: int = method.get("steps") or run.record["budget"]["renderer_steps"]
-    return steps
+    return method.get("steps") or run.record["budget"]["renderer_steps"]
 
 
 def _images(images: Mapping[str, Any], lines: Lines) -> Iterator[Part]:

@@ -126,12 +126,8 @@ def changes(
 def _change(metric: str, limit: Limit, pairs: Sequence[tuple[Figures, Figures]]) -> Change:
     values = np.array([[run.values.get(metric, math.nan) for run in pair] for pair in pairs])
     frames = [frames_apart(metric, *pair) for pair in pairs]
-    by_seed = np.array(
-        [
-            each.mean() if len(each) > 1 else _apart(*pair)
-            for each, pair in zip(frames, values, strict=True)
-        ]
-    )
+    pairwise = zip(frames, values, strict=True)
+    by_seed = np.array([x.mean() if len(x) > 1 else _apart(*pair) for x, pair in pairwise])
     before, after = map(float, values.mean(axis=0))
     allowed = limit.absolute + (limit.relative and limit.relative * abs(before))
     by, interval, certain = float(by_seed.mean()), None, True
@@ -142,9 +138,10 @@ def _change(metric: str, limit: Limit, pairs: Sequence[tuple[Figures, Figures]])
         broken = not limit.here and max(moved, default=0) / len(pairs) > allowed
         certain = broken or -limit.better * by - half > 0
     verdict = "worse" if certain and -limit.better * by > allowed else ""
-    if math.isnan(after) or any(
+    gone = (
         one.frames.get(metric, {}).keys() - other.frames.get(metric, {}) for one, other in pairs
-    ):
+    )
+    if math.isnan(after) or any(gone):
         verdict = "missing"
     return Change(metric, before, after, by, interval, verdict)
 

@@ -97,24 +97,21 @@ def run_tables(rows: pd.DataFrame) -> list[Table]:
     return [table for table in (*tables, _memory(rows)) if table.lines]
 
 
-def _values(rows: pd.DataFrame, prefix: str = "", column: str = "value") -> dict[str, float]:
+def _values(rows: pd.DataFrame, prefix: str = "") -> dict[str, float]:
     """Figures of one run by metric, for metrics with `prefix`, which is removed from the names."""
-    return {
-        metric.removeprefix(prefix): figure
-        for metric, figure in zip(rows["metric"], rows[column], strict=True)
-        if metric.startswith(prefix)
-    }
+    some = rows[rows["metric"].str.startswith(prefix)]
+    return dict(zip(some["metric"].str.removeprefix(prefix), some["value"], strict=True))
 
 
 def _quality(rows: pd.DataFrame, suffix: str) -> Table:
-    value, low, high, frames = (_values(rows, column=name) for name in ("value", "lo", "hi", "n"))
+    figures = rows.set_index("metric")
     lines = []
     for metric, (label, decimals) in QUALITY.items():
-        if metric in value:
-            ends = low[metric], high[metric]
-            interval = spread(*ends, decimals) if math.isfinite(ends[0]) else ""
-            lines.append((label, decimal(value[metric], decimals), interval))
-    title = f"Quality{suffix}, mean of {frames['psnr']} frames"
+        if metric in figures.index:
+            value, low, high = figures.loc[metric, ["value", "lo", "hi"]]
+            interval = spread(low, high, decimals) if math.isfinite(low) else ""
+            lines.append((label, decimal(value, decimals), interval))
+    title = f"Quality{suffix}, mean of {figures['n']['psnr']} frames"
     return Table(title, ("metric", "mean", "95 % interval"), tuple(lines))
 
 

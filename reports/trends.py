@@ -61,17 +61,13 @@ class Difference:
 def differences(
     trend: Trend, lines: Mapping[str, Repeated], published: Mapping[str, Mapping[str, float]]
 ) -> Iterator[Difference]:
-    """Every difference of `trend` between two measured `lines`, by label.
-
-    `published` has the paper's figures by label and metric.
-    """
+    """Every difference of `trend` between two measured `lines`; in the paper: `published`."""
     for smaller, larger in pairwise(trend.rising):
         one, other = lines.get(smaller), lines.get(larger)
         here = _growth(one, other, trend.metric) if one and other else None
         if here is not None:
-            below, above = (
-                published.get(label, {}).get(trend.metric, math.nan) for label in (smaller, larger)
-            )
+            figures = (published.get(label, {}) for label in (smaller, larger))
+            below, above = (figure.get(trend.metric, math.nan) for figure in figures)
             yield Difference(trend.metric, smaller, larger, above - below, *here)
 
 
