@@ -141,10 +141,7 @@ def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
 
 @dataclass(frozen=True)
 class Curve:
-    """A model, named `label` in the panel titled `panel`, at several points of its training.
-
-    `points` has training steps, each with what was measured after it.
-    """
+    """A line in the panel titled `panel`: what was measured, by the number of training steps."""
 
     panel: str
     label: str
@@ -190,11 +187,9 @@ def frontier_plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Write a PNG: error of a frame against its time, log-log, one point per setting.
 
     The left panel shows the error against the ground truth, with the Pareto frontier as a
-    staircase; the right panel, the error against everything off. Settings on the frontier and the
-    unchanged setting are circled, and named if there is room.
-
-    `rows` are everything off, the unchanged setting, then others. Each has knob, setting, ms,
-    ms_lo, ms_hi, psnr, psnr_to_first and instead, which equals setting on the frontier.
+    staircase; the right panel, the error against everything off. Settings on the frontier (those
+    whose `instead` is themselves) and the unchanged one, the second of `rows`, are circled, and
+    named if there is room.
     """
     figure = Figure(figsize=(13, 7), layout="constrained")
     truth, off = figure.subplots(1, 2, sharex=True)

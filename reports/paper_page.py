@@ -108,10 +108,7 @@ def _images(images: Mapping[str, Any], lines: Lines) -> Iterator[Part]:
 
 
 def _chosen(wanted: Mapping[str, Sequence[str]], lines: Lines, one_scene: bool) -> list[Run]:
-    """The first run of each measured line in `wanted`, which lists lines by label for each table.
-
-    A run is the mean over all scenes, or with `one_scene` that of the first scene.
-    """
+    """The first run, over all scenes or of the first one, of each measured line in `wanted`."""
     known = {(table, line.label): line for table in lines for line in lines[table]}
     found = ((label, known.get((table, line))) for label, (table, line) in wanted.items())
     runs = ((label, line.measured if one_scene else line.runs) for label, line in found if line)

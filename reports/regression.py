@@ -138,9 +138,7 @@ def _change(metric: str, limit: Limit, pairs: Sequence[tuple[Figures, Figures]])
         broken = not limit.here and max(moved, default=0) / len(pairs) > allowed
         certain = broken or -limit.better * by - half > 0
     verdict = "worse" if certain and -limit.better * by > allowed else ""
-    gone = (
-        one.frames.get(metric, {}).keys() - other.frames.get(metric, {}) for one, other in pairs
-    )
+    gone = (one.frames.get(metric, {}).keys() - of.frames.get(metric, {}) for one, of in pairs)
     if math.isnan(after) or any(gone):
         verdict = "missing"
     return Change(metric, before, after, by, interval, verdict)

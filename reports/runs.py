@@ -214,9 +214,9 @@ def missing_figures(runs: Sequence[Run]) -> list[str]:
 def over_common_frames(runs: Sequence[Run]) -> list[Run]:
     """The same runs, with steady figures recomputed over the frames that are steady in all of them.
 
-    "All" means the runs that render the same views. A method with memory has fewer steady ones, and
-    the first frames of a path are not typical, so that means over different frames would mislead.
-    Runs without steady frames, or without a common one, stay unchanged.
+    "All" are those of the same views. A method with memory has fewer steady frames, and the first
+    frames of a path are not typical: means over different frames would mislead. Runs without steady
+    frames, or without a common one, stay unchanged.
     """
     steady = [set(run.frames.loc[run.frames["phase"] == STEADY, "frame"]) for run in runs]
     common: dict[tuple[object, ...], set[int]] = {}
