@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shlex
 import subprocess
 import tomllib
 from collections.abc import Iterator
@@ -12,16 +11,13 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from sweeps.cli import COMMANDS
-from sweeps.overrides import composed
+from sweeps.overrides import CONFIGS, composed
 
 ROOT = Path(__file__).parent.parent
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-CONFIGS = ROOT / "sweeps" / "configs"
 PACKAGES = ("bench", "methods", "reports", "sweeps")
 EXTRAS = PYPROJECT["project"]["optional-dependencies"]
 
@@ -108,32 +104,10 @@ def test_make_explains_which_python_it_needs(tmp_path):
     assert "no-such-python" in done.stderr
 
 
-def readme_commands() -> list[list[str]]:
-    """The commands in README's shell blocks, split into words."""
-    blocks = re.findall(r"```sh\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    lines = re.sub(r"\\\n\s*", " ", "".join(blocks)).splitlines()
-    return [words for line in lines if (words := shlex.split(line, comments=True))]
-
-
-def test_every_command_of_the_readme_exists():
+def test_what_the_readme_makes_is_a_target():
     targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
-    commands = readme_commands()
-    assert ["make", "demo"] in commands
-    for program, *words in commands:
-        if program == "make":
-            assert {word for word in words if "=" not in word} <= set(targets)
-        if Path(program).name == "steerbench":
-            assert words[0] in COMMANDS or words[0].startswith("-")
-
-
-def test_every_run_of_the_readme_composes():
-    runs = [words[2:] for words in readme_commands() if words[1:2] == ["run"]]
-    assert runs
-    for words in runs:
-        overrides = [word for word in words if not word.startswith("-")]
-        if "-m" not in words and "-sc" not in words:
-            with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-                compose("run", overrides=overrides)
+    typed = re.findall(r"^make ([a-z]+)", (ROOT / "README.md").read_text(), re.MULTILINE)
+    assert {"demo", *typed} <= set(targets)
 
 
 @pytest.mark.parametrize("name", [path.stem for path in (CONFIGS / "experiment").glob("*.yaml")])

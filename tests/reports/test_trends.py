@@ -70,24 +70,21 @@ def test_several_seeds_are_compared_seed_by_seed(run, by, verdict):
 
 
 @pytest.mark.parametrize(
-    ("by", "half", "verdict"),
+    ("by", "half", "paper", "proves", "verdict"),
     [
-        (0.5, 0.4, HOLDS),
-        (0.5, 0.5, OPEN),  # up to 1.0, as in the paper
-        (0.4, 0.5, SMALLER),  # at most 0.9
-        (-0.1, 0.2, SMALLER),
-        (-0.5, 0.4, FAILS),
-        (0.0, 0.0, FAILS),
-        (0.5, math.nan, OPEN),
+        (0.5, 0.4, 1.0, True, HOLDS),
+        (0.5, 0.5, 1.0, True, OPEN),  # up to 1.0, as in the paper
+        (0.4, 0.5, 1.0, True, SMALLER),  # at most 0.9
+        (-0.1, 0.2, 1.0, True, SMALLER),
+        (-0.1, 0.2, 1.0, False, OPEN),  # only several seeds show that
+        (-0.1, 0.2, math.nan, True, OPEN),
+        (-0.5, 0.4, 1.0, True, FAILS),
+        (0.0, 0.0, 1.0, True, FAILS),
+        (0.5, math.nan, 1.0, True, OPEN),
     ],
 )
-def test_several_seeds_against_a_difference_of_one_decibel_in_the_paper(by, half, verdict):
-    assert difference_of(by, half, paper=1.0).verdict == verdict
-
-
-def test_only_several_seeds_show_that_a_difference_is_smaller_than_a_published_one():
-    assert difference_of(-0.1, 0.2, paper=math.nan).verdict == OPEN
-    assert difference_of(-0.1, 0.2, paper=1.0, proves=False).verdict == OPEN
+def test_a_verdict_is_that_of_the_whole_interval(by, half, paper, proves, verdict):
+    assert difference_of(by, half, paper, proves).verdict == verdict
 
 
 def test_the_papers_difference_is_known_where_both_its_figures_are(run):
