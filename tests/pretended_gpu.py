@@ -156,16 +156,12 @@ class PretendedGpu(TorchDispatchMode):
         self.waited += 1
         if self.graph is not None:
             raise RuntimeError("CUDA error: operation not permitted when stream is capturing")
+        message = "called a synchronizing CUDA operation"
         if self.sync_debug_mode == 2:
-            raise RuntimeError("called a synchronizing CUDA operation")
+            raise RuntimeError(message)
         if self.sync_debug_mode == 1:
             frame = _caller(TORCH)
-            warnings.warn_explicit(
-                "called a synchronizing CUDA operation",
-                UserWarning,
-                frame.f_code.co_filename,
-                frame.f_lineno,
-            )
+            warnings.warn_explicit(message, UserWarning, frame.f_code.co_filename, frame.f_lineno)
 
     def moved(self, tensor: Tensor, device: torch.device, waits: bool = True) -> Tensor:
         """A copy of `tensor` on the other device."""
