@@ -80,12 +80,6 @@ def test_every_pin_suits_the_range_in_pyproject():
         assert requirement.specifier.contains(version), f"{requirement}: pinned to {version}"
 
 
-def test_continuous_integration_runs_all_tests():
-    script = ROOT / ".ci" / "run"
-    assert os.access(script, os.X_OK)
-    assert "make test-all" in script.read_text()
-
-
 def test_the_changelog_tells_of_the_current_version():
     version = PYPROJECT["project"]["version"]
     assert f"## {version}" in (ROOT / "CHANGELOG.md").read_text()
