@@ -160,13 +160,10 @@ def here_and_there(compute: Callable[[str], Any]) -> tuple[Any, Any]:
         return here, compute("cuda")
 
 
-def assert_alike(some: list[torch.Tensor], others: list[torch.Tensor], atol: float = 0.0) -> None:
-    torch.testing.assert_close(some, others, rtol=0, atol=atol)
-
-
-ROUNDINGS = 1e-6
-"""A few of values up to 1. On a CPU with AVX-512 colours differed in the last bit; which operation
-rounds in another way is not known."""
+assert_equal = partial(torch.testing.assert_close, rtol=0, atol=0)
+assert_alike = partial(torch.testing.assert_close, rtol=0, atol=1e-6)
+"""But for a few roundings of values up to 1. On a CPU with AVX-512 colours differed in the last
+bit; which operation rounds in another way is not known."""
 
 
 def fewer(split: Split, count: int, side: int = 16) -> Split:
@@ -200,7 +197,7 @@ def one_round(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("name", METHODS)
 def test_it_trains_and_renders_as_on_the_cpu(name: str, scene: Scene, tmp_path: Path) -> None:
     drawn = here_and_there(lambda device: frames(fitted(name, device, scene, tmp_path), scene))
-    assert_alike(*drawn, ROUNDINGS)
+    assert_alike(*drawn)
 
 
 def test_with_products_of_bfloat16_it_trains_and_renders_as_on_the_cpu(
@@ -214,7 +211,7 @@ def test_with_products_of_bfloat16_it_trains_and_renders_as_on_the_cpu(
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities)
     multiplies_bf16.cache_clear()
     try:
-        assert_alike(*here_and_there(drawn), ROUNDINGS)
+        assert_alike(*here_and_there(drawn))
     finally:
         multiplies_bf16.cache_clear()
 
@@ -242,7 +239,7 @@ def test_killed_in_stage_2_it_goes_on_as_if_it_had_not_been(
     with killed(JointTraining, 1):
         fitted("steernerf", "cuda", scene, tmp_path / "killed")
     assert list((tmp_path / "killed").glob("cuda/stages/steernerf-*/checkpoint.safetensors"))
-    assert_alike(whole, frames(fitted("steernerf", "cuda", scene, tmp_path / "killed"), scene))
+    assert_equal(whole, frames(fitted("steernerf", "cuda", scene, tmp_path / "killed"), scene))
 
 
 @pytest.mark.parametrize("places", [("cuda", "cpu"), ("cpu", "cuda")])
@@ -366,7 +363,7 @@ def test_by_triton_it_trains_and_renders_as_on_the_cpu(
 
     here, there = here_and_there(drawn)
     assert here[0].std() > 0
-    assert_alike(here, there)
+    assert_equal(here, there)
 
 
 GO_ON = [
@@ -396,7 +393,7 @@ def test_a_case_of_a_kernel_of_triton_is_computed_there_as_on_the_cpu(
 ) -> None:
     prepare = preparation(which)
     here, there = here_and_there(lambda device: [x.cpu() for x in prepare(device)("gpu")])
-    assert_alike(here, there)
+    assert_equal(here, there)
 
 
 @needs_triton
