@@ -16,6 +16,10 @@ from matplotlib.figure import Figure
 
 from bench.results import COLUMNS, Store
 from reports.runs import Run, load
+from sweeps.plan import chosen
+
+TABLES = {table.name: table for table in chosen(None, [])}
+"""Those of the paper."""
 
 FIGURES = {
     "psnr": (30.456, 29.5, 31.5),

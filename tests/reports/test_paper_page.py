@@ -13,9 +13,7 @@ from reports.images import Picture
 from reports.outliers import Outlier
 from reports.paper_page import PAGE, _curves, write_paper_page
 from reports.runs import Repeated, Run
-from sweeps.plan import chosen
-
-TABLES = chosen(None, [])
+from tests.reports.conftest import TABLES
 
 
 def of(run: Run, label: str) -> Repeated:
@@ -24,7 +22,7 @@ def of(run: Run, label: str) -> Repeated:
 
 
 def test_every_line_that_is_shown_in_a_figure_is_one_of_the_tables():
-    blocks = [block for table in TABLES for block in table.blocks]
+    blocks = [block for table in TABLES.values() for block in table.blocks]
     lines = {(block.name, line.label) for block in blocks for line in block.lines}
     shown = [entry["lines"] for entry in (*PAGE["plots"], *PAGE["images"]) if "lines" in entry]
     assert shown
@@ -34,11 +32,11 @@ def test_every_line_that_is_shown_in_a_figure_is_one_of_the_tables():
 
 def test_the_page_has_every_table_and_every_figure(run, tmp_path):
     lines = {
-        table.name: [of(run, line.label) for block in table.blocks for line in block.lines]
-        for table in TABLES
+        name: [of(run, line.label) for block in table.blocks for line in block.lines]
+        for name, table in TABLES.items()
     }
     found = [Outlier(run.key, "13 dB among 30s"), Outlier("another", "not of this page")]
-    page = write_paper_page(TABLES, lines, found, tmp_path)
+    page = write_paper_page([*TABLES.values()], lines, found, tmp_path)
     text = page.read_text()
     shown = re.findall(r"!\[[^]]*\]\((.+?)\)", text)
     assert len(shown) == 6
@@ -54,7 +52,7 @@ def test_the_page_has_every_table_and_every_figure(run, tmp_path):
 
 
 def test_points_of_a_curve_are_not_plotted_against_cost(run, tmp_path, monkeypatch):
-    (table,) = (table for table in TABLES if table.name == "table6")
+    table = TABLES["table6"]
     lines = [of(run, line.label) for line in (*table.lines, *table.marks.values())]
     drawn: list[str] = []
     real = figures.quality_plot
@@ -70,7 +68,7 @@ def test_points_of_a_curve_are_not_plotted_against_cost(run, tmp_path, monkeypat
 
 def test_a_page_of_nothing_still_says_what_is_missing(tmp_path):
     lines = {"table5": [Repeated("with joint training", [], ["not measured yet"])]}
-    text = write_paper_page(TABLES, lines, [], tmp_path).read_text()
+    text = write_paper_page([*TABLES.values()], lines, [], tmp_path).read_text()
     assert "| with joint training: not measured yet | – / 33.05 |" in text
     assert "![" not in text
     assert "Outliers" not in text
@@ -95,7 +93,7 @@ def test_a_mark_stands_where_its_line_is_in_quality_and_cost(run, tmp_path, draw
 
 @pytest.mark.parametrize(("of_method", "of_budget"), [(None, 80), (80, 7)])
 def test_a_curve_has_a_point_for_every_measured_share(of_method, of_budget, run, tmp_path, drawn):
-    (table,) = (table for table in TABLES if table.name == "table5")
+    table = TABLES["table5"]
     made_of = {"config": {"method": {"steps": of_method}}}
     budget = {"renderer_steps": of_budget}
     trained = replace(run, record={**run.record, "budget": budget, "made_of": made_of})
