@@ -23,11 +23,16 @@ PSNR = [20.0, 26.0, 29.0, 30.0, 31.0, 30.0]
 def remembering(memory: int, scene: str = "one") -> Run:
     """A run whose first `memory` frames are cold."""
     ms = [10.0 + k for k in range(6)]
-    frames = pd.DataFrame({"frame": range(6), "psnr": PSNR, "frame_ms": ms, "stage_ms.other": ms})
-    frames = frames.assign(
-        name=[f"r_{k}" for k in range(6)],
-        phase=[COLD] * memory + [STEADY] * (6 - memory),
-        flicker=[math.nan] + [0.1] * 5,
+    frames = pd.DataFrame(
+        {
+            "frame": range(6),
+            "name": [f"r_{k}" for k in range(6)],
+            "phase": [COLD] * memory + [STEADY] * (6 - memory),
+            "psnr": PSNR,
+            "flicker": [math.nan] + [0.1] * 5,
+            "frame_ms": ms,
+            "stage_ms.other": ms,
+        }
     )
     rows = [
         row | {"phase": phase}
