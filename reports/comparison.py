@@ -9,7 +9,7 @@ from functools import partial
 from bench.errors import SteerbenchError
 from bench.run import UNITS
 from reports.runs import Repeated, Run
-from reports.tables import QUALITY, Table, decimal, megabytes
+from reports.tables import NOT_AVAILABLE, QUALITY, Table, decimal, megabytes
 
 Write = Callable[[float | None], str]
 
@@ -28,38 +28,33 @@ COMMON = ("scene", "resolution", "trajectory", "budget", "protocol", "device")
 def comparison(runs: Sequence[Run], failures: Mapping[str, str]) -> Table:
     """One line per run or per phase of a run, then one per failure; the best figures are bold.
 
-    Figures are ranked only among runs under the same conditions, if there are at least two.
-
-    Args:
-        runs: the runs; a quality metric that none of them has gets no column.
-        failures: why a run is missing, by its label.
+    Figures are ranked only among runs under the same conditions, if there are at least two. A
+    quality metric that no run has gets no column. `failures` says why a run is missing, by label.
     """
-    quality = [metric for metric in QUALITY if any(metric in run.values for run in runs)]
-    columns = {metric: metric_format(metric) for metric in (*quality, *COST)}
-    parts = [part for run in runs for part in run.phases()]
+    metrics = [*(name for name in QUALITY if any(name in run.values for run in runs)), *COST]
+    parts = [Repeated(part.label, [part]) for run in runs for part in run.phases()]
     lines = [
-        (part.label, *(write(part.values.get(metric)) for metric, (_, write) in columns.items()))
+        (part.label, *(written(part, metric) or NOT_AVAILABLE for metric in metrics))
         for part in parts
     ]
     bold = frozenset(
         (row, column)
-        for column, metric in enumerate(columns, 1)
+        for column, metric in enumerate(metrics, 1)
         for row, place in ranks(parts, metric).items()
         if place == 1
     )
-    blank = ("",) * len(columns)
-    sources = (*((part.key,) for part in parts), *(() for _ in failures))
+    blank = ("",) * len(metrics)
     lines += [(f"{label}: failed: {reason}", *blank) for label, reason in failures.items()]
     title = f"Comparison: {conditions_of(runs)}" if runs else "Comparison"
-    heads = ("run", *(label for label, _ in columns.values()))
+    heads = ("run", *(metric_format(metric)[0] for metric in metrics))
+    sources = (*(part.keys for part in parts), *(() for _ in failures))
     return Table(title, heads, tuple(lines), bold=bold, sources=sources)
 
 
 def metric_format(metric: str) -> tuple[str, Write]:
     """The label of a metric, with unit and an arrow to better values, and its number format.
 
-    Raises:
-        SteerbenchError: there is no such metric.
+    Raises SteerbenchError if there is no such metric.
     """
     if metric in QUALITY:
         label, decimals = QUALITY[metric]
@@ -77,26 +72,20 @@ def metric_format(metric: str) -> tuple[str, Write]:
     return f"{rest or family}, {unit} ↓", partial(decimal, decimals=0 if family == "work" else 2)
 
 
-def written(
-    found: Repeated, metric: str, write: Write | None = None, sign: str = " ± "
-) -> str | None:
+def written(line: Repeated, metric: str, write: Write | None = None) -> str | None:
     """The mean of a metric as text, with half its 95 % interval if known; None without a mean.
 
-    The text is made by `write`, or in the usual format.
+    Numbers are written by `write`, or in the usual format.
     """
-    mean, half = found.mean(metric), found.half(metric)
+    mean, half = line.mean(metric), line.half(metric)
     write = write or metric_format(metric)[1]
     if mean is None:
         return None
-    return f"{write(mean)}{sign}{write(half)}" if half > 0 else write(mean)
+    return f"{write(mean)} ± {write(half)}" if half > 0 else write(mean)
 
 
 def marked(
-    lines: Sequence[Repeated],
-    metric: str,
-    marks: Sequence[str],
-    write: Write | None = None,
-    sign: str = " ± ",
+    lines: Sequence[Repeated], metric: str, marks: Sequence[str], write: Write | None = None
 ) -> list[str | None]:
     """A column: what `written` returns for each line, the best and the second best with `marks`.
 
@@ -104,24 +93,23 @@ def marked(
     """
     places = {} if metric.startswith("stage_ms.") else ranks(lines, metric, write)
     forms = dict(enumerate(marks if len(places) > 2 else marks[:1], 1))
-    texts = [written(line, metric, write, sign) for line in lines]
+    texts = [written(line, metric, write) for line in lines]
     return [text and forms.get(places.get(n, 0), "%s") % text for n, text in enumerate(texts)]
 
 
-def ranks(
-    runs: Sequence[Run | Repeated], metric: str, write: Write | None = None
-) -> dict[int, int]:
-    """The rank, from 1, of each of `runs` among those under the same conditions, by its index.
+def ranks(lines: Sequence[Repeated], metric: str, write: Write | None = None) -> dict[int, int]:
+    """The rank, from 1, of each of `lines` among those under the same conditions, by its index.
 
-    Figures that look the same when written (by `write`, or in the usual format) share a rank. A run
-    that is alone under its conditions has no rank.
+    Figures that look the same when written (by `write`, or in the usual format) share a rank. A
+    line that is alone under its conditions has no rank.
     """
     label, usual = metric_format(metric)
     write = write or usual
     known: dict[tuple[object, ...], dict[int, float]] = {}
-    for row, run in enumerate(runs):
-        if math.isfinite(run.values.get(metric, math.nan)):
-            known.setdefault(run.conditions, {})[row] = run.values[metric]
+    for row, line in enumerate(lines):
+        mean = line.mean(metric)
+        if mean is not None and math.isfinite(mean):
+            known.setdefault(line.conditions, {})[row] = mean
     places: dict[int, int] = {}
     for figures in known.values():
         ordered = sorted(figures.values(), reverse=label.endswith("↑"))
@@ -131,7 +119,7 @@ def ranks(
     return places
 
 
-def conditions_of(runs: Sequence[Run]) -> str:
+def conditions_of(runs: Sequence[Run], facts: Sequence[str] = COMMON) -> str:
     """Scene, resolution, trajectory and so on of `runs`, as text; lists all values of a fact."""
-    values = {name: dict.fromkeys(str(run.facts[name]) for run in runs) for name in COMMON}
+    values = {name: dict.fromkeys(str(run.facts[name]) for run in runs) for name in facts}
     return ", ".join(f"{name} {' / '.join(several)}" for name, several in values.items())

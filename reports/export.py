@@ -31,7 +31,7 @@ ESCAPES = str.maketrans(
     }
 )
 
-SETTING = re.compile(r"(?P<name>[A-Z]) = (?P<base>\d+)(\^(?P<power>\d+))?")
+SETTING = re.compile(r"[A-Z] = \d+(\^\d+)?")
 """A label such as "T = 2^19", which is set in math mode."""
 
 MARKS = (r"\textbf{%s}", r"\underline{%s}")
@@ -49,33 +49,30 @@ def latex(tables: Sequence[PaperTable], measured: Lines) -> str:
 
 def _latex(table: PaperTable, lines: Sequence[Repeated]) -> str:
     known = {line.label: line for line in lines}
-    blocks = table.shown(known)
-    heads = ["", *(_escaped(metric_format(metric)[0]) for metric in table.metrics)]
-    rows = [row for block in blocks for row in _rows(block, known)]
+    rows, *beyond = (_rows(block, known) for block in table.shown(known))
     runs = [run for line in lines for run in line.runs]
     caption = f"{_escaped(table.title)}. " + (f"{_escaped(conditions_of(runs))}. " if runs else "")
-    text = pd.DataFrame(rows, columns=heads).to_latex(
+    text = pd.DataFrame(
+        sum(beyond, rows),
+        columns=["", *(_escaped(metric_format(metric)[0]) for metric in table.metrics)],
+    ).to_latex(
         index=False,
         column_format="l" + "r" * len(table.metrics),
         caption=caption.strip(),
         label=f"tab:{table.name}",
     )
-    if len(blocks) > 1:  # a rule before the lines beyond the paper
-        first = " & ".join(rows[len(_rows(table, known))])
+    for further in beyond:  # a rule before the lines beyond the paper
+        first = " & ".join(further[0])
         text = text.replace(first, f"\\midrule\n{first}", 1)
     return text
 
 
 def _rows(block: PaperTable, known: Mapping[str, Repeated]) -> list[list[str]]:
-    lines = [known.get(line.label, Repeated(line.label, ())) for line in block.lines]
-    columns = [
-        marked(lines, metric, MARKS, partial(_written, metric), r" $\pm$ ")
-        for metric in block.metrics
-    ]
-    rows = zip(*columns, strict=True)
+    lines = block.measured(known)
+    columns = [marked(lines, metric, MARKS, partial(_written, metric)) for metric in block.metrics]
     return [
-        [_label(line.label), *(text or "--" for text in row)]
-        for line, row in zip(block.lines, rows, strict=True)
+        [_escaped(line.label), *((text or "--").replace("±", r"$\pm$") for text in row)]
+        for line, *row in zip(lines, *columns, strict=True)
     ]
 
 
@@ -88,8 +85,7 @@ def csv(tables: Sequence[PaperTable], measured: Lines) -> str:
     for table in tables:
         known = {line.label: line for line in measured.get(table.name, ())}
         for block in table.shown(known):
-            for line in block.lines:
-                found = known.get(line.label, Repeated(line.label, ()))
+            for line, found in zip(block.lines, block.measured(known), strict=True):
                 rows += [
                     {
                         "table": table.name,
@@ -113,12 +109,7 @@ def _written(metric: str, value: float | None) -> str:
     return decimal(value, DECIMALS.get(family, 0))
 
 
-def _label(label: str) -> str:
-    if found := SETTING.fullmatch(label):
-        power = f"^{{{found['power']}}}" if found["power"] else ""
-        return f"${found['name']} = {found['base']}{power}$"
-    return _escaped(label)
-
-
 def _escaped(text: str) -> str:
+    if SETTING.fullmatch(text):
+        return "$" + re.sub(r"\^(\d+)", r"^{\1}", text) + "$"
     return text.translate(ESCAPES)

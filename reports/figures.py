@@ -12,6 +12,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, ScalarFormatter
@@ -19,11 +20,11 @@ from numpy.typing import ArrayLike
 
 from bench.results import COLD
 from reports.comparison import written
-from reports.parts import Mark, Plot
+from reports.images import Picture
 from reports.runs import Repeated, Run
 from reports.tables import NOT_AVAILABLE
 
-STAGE = "stage_ms."
+STAGE, OTHER = "stage_ms.", "stage_ms.other"
 LEGEND_COLUMNS = 4
 LEGEND_WIDTH = 44
 """Characters per line in a legend of two columns."""
@@ -31,33 +32,37 @@ MARKERS = "osD^vP*X<>"
 COLOURS = [matplotlib.colormaps["tab20"](index) for index in (*range(0, 20, 2), *range(1, 20, 2))]
 COLOURS = [colour for colour in COLOURS if len(set(colour[:3])) > 1]  # grey is for "other"
 
+COSTS = {
+    "frame_ms": ("psnr-ms", 1.0, "ms a frame"),
+    "size_bytes.total": ("psnr-bytes", 1e6, "MB of the model"),
+}
+"""What quality is plotted against: prefix of the file name, unit and label of the axis."""
+
 MARK = "mark-{}"
-"""The `gid` of the mark for the line with this number in `quality_against`."""
+"""The `gid` of the mark of the line with this number."""
 
 NAME_SIZE = (160, 13)
 """Width and height in pixels of the name of a setting on a plot."""
-
-Row = Mapping[str, Any]
 
 
 def stage_bars(runs: Sequence[Run], path: Path) -> None:
     """Write a PNG: one bar per run, its mean frame time in ms split into stages.
 
-    A stage includes its nested stages and has the same colour in all bars. Time outside all stages
-    is grey and comes last.
+    A stage includes its nested stages. Time outside all stages is grey and comes last.
     """
-    bars = [_stages(run) for run in runs]
-    stages = list(dict.fromkeys(name for bar in bars for name in bar))
-    stages.sort(key=lambda name: name == "other")
+    names = (name for run in runs for name in run.values if name.startswith(STAGE))
+    stages = list(dict.fromkeys(name.partition("/")[0] for name in names))
+    stages.sort(key=lambda stage: stage == OTHER)
     legend_lines = -(-len(stages) // LEGEND_COLUMNS)
     figure = Figure(figsize=(8, 0.7 + 0.25 * legend_lines + 0.5 * len(runs)), layout="constrained")
     axes = figure.subplots()
-    ends = [0.0] * len(runs)
+    ends = np.zeros(len(runs))
     for number, stage in enumerate(stages):
-        widths = [bar.get(stage, 0.0) for bar in bars]
-        colour = "lightgrey" if stage == "other" else COLOURS[number % len(COLOURS)]
-        axes.barh(range(len(runs)), widths, left=ends, height=0.6, label=stage, color=colour)
-        ends = [end + width for end, width in zip(ends, widths, strict=True)]
+        widths = np.array([Repeated(run.label, [run]).mean(stage) or 0.0 for run in runs])
+        colour = "lightgrey" if stage == OTHER else COLOURS[number % len(COLOURS)]
+        name = stage.removeprefix(STAGE)
+        axes.barh(range(len(runs)), widths, left=ends, height=0.6, label=name, color=colour)
+        ends = ends + widths
     for line, end in enumerate(ends):
         axes.text(end, line, f" {end:.1f}", va="center")
     axes.set_xlim(0, 1.12 * max(ends))
@@ -69,44 +74,31 @@ def stage_bars(runs: Sequence[Run], path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
-def _stages(run: Run) -> dict[str, float]:
-    """Mean ms of every outermost stage, including its nested stages."""
-    stages: dict[str, float] = {}
-    for name, ms in run.values.items():
-        if name.startswith(STAGE):
-            outermost = name.removeprefix(STAGE).partition("/")[0]
-            stages[outermost] = stages.get(outermost, 0.0) + ms
-    return stages
+def quality_plot(lines: Sequence[Repeated], metric: str) -> Picture:
+    """`quality_against` as a part of a page, with a mark for each line that has both figures."""
+    stem, _, axis = COSTS[metric]
+    marks = {}
+    for number, line in enumerate(lines):
+        quality, cost = written(line, "psnr"), written(line, metric)
+        if not {quality, cost} & {None, NOT_AVAILABLE}:
+            says = f"{line.label}: PSNR {quality} dB, {cost} {axis}"
+            marks[MARK.format(number)] = says, line.keys
+    shows = f"PSNR in dB against {axis}, one mark a run"
+    return Picture(stem, shows, partial(quality_against, lines, metric), marks)
 
 
-def quality_plot(
-    lines: Sequence[Repeated], metric: str, unit: float, axis: str, stem: str, shows: str
-) -> Plot:
-    """`quality_against` as a part of a page: each mark tells its label, PSNR and `metric`.
-
-    A line that lacks one of these figures has no mark.
-    """
-    marks = {
-        MARK.format(number): Mark(f"{line.label}: PSNR {quality} dB, {cost} {axis}", line.keys)
-        for number, line in enumerate(lines)
-        if (quality := written(line, "psnr") or NOT_AVAILABLE) != NOT_AVAILABLE
-        and (cost := written(line, metric) or NOT_AVAILABLE) != NOT_AVAILABLE
-    }
-    draw = partial(quality_against, lines, metric, unit, axis)
-    return Plot(stem, shows, draw, marks)
-
-
-def quality_against(
-    lines: Sequence[Repeated], metric: str, unit: float, axis: str, path: Path
-) -> None:
-    """Write a PNG: PSNR of each of `lines` against its `metric` / `unit`; `axis` is the label.
+def quality_against(lines: Sequence[Repeated], metric: str, path: Path) -> None:
+    """Write a PNG: PSNR of each of `lines` against its `metric`, one of `COSTS`.
 
     With several seeds, error bars show the intervals of both.
     """
+    _, unit, label = COSTS[metric]
     labels = [textwrap.fill(line.label, LEGEND_WIDTH) for line in lines]
     half = -(-len(labels) // 2)  # the legend has two columns
     legend_lines = max("\n".join(part).count("\n") + 1 for part in (labels[:half], labels[half:]))
-    figure, axes = _psnr_axes(4.0 + 0.25 * legend_lines, axis)
+    figure = Figure(figsize=(8, 4.0 + 0.25 * legend_lines), layout="constrained")
+    axes = figure.subplots()
+    _label(axes, label)
     for number, line in enumerate(lines):
         across, up = line.mean(metric), line.mean("psnr")
         if across is None or up is None:
@@ -117,32 +109,27 @@ def quality_against(
             up,
             xerr=bars[0] and bars[0] / unit,
             yerr=bars[1],
-            fmt=MARKERS[number % len(MARKERS)],
-            color=COLOURS[number % len(COLOURS)],
+            **_style(number),
             markersize=8,
             label=labels[number],
         )
         drawn[0].set_gid(MARK.format(number))
     axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=_steps_of_a_decade(*axes.get_xlim())))
+    low, high = axes.get_xlim()
+    decades = math.log10(high / low)  # the more of them, the fewer ticks in each
+    ticks = (1, 2, 3, 5, 7) if decades < 1.5 else (1, 2, 5) if decades < 3 else (1,)
+    axes.xaxis.set_major_locator(LogLocator(subs=ticks))
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_locator(NullLocator())
     figure.legend(loc="outside lower center", ncols=2, frameon=False)
     figure.savefig(path, dpi=150)
 
 
-def _steps_of_a_decade(low: float, high: float) -> tuple[int, ...]:
-    """Which multiples of powers of ten get a tick: the wider the range, the fewer."""
-    decades = math.log10(high / low)
-    return (1, 2, 3, 5, 7) if decades < 1.5 else (1, 2, 5) if decades < 3 else (1,)
-
-
 def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
-    """Write a PNG: PSNR of every frame with a ground truth along the path, one curve per run.
-
-    Cold frames are hollow.
-    """
-    figure, axes = _psnr_axes(3.5, "frame of the path")
+    """Write a PNG: PSNR of scored frames along the path, one curve per run; cold are hollow."""
+    figure = Figure(figsize=(8, 3.5), layout="constrained")
+    axes = figure.subplots()
+    _label(axes, "frame of the path")
     for number, run in enumerate(runs):
         scored = run.frames.dropna(subset=["psnr"])
         colour, cold = COLOURS[number % len(COLOURS)], scored[scored["phase"] == COLD]
@@ -154,13 +141,7 @@ def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
 
 @dataclass(frozen=True)
 class Curve:
-    """A model at several points of its training.
-
-    Attributes:
-        panel: the title of the panel that shows it.
-        label: its name in the panel.
-        points: training steps, each with what was measured after it.
-    """
+    """A line in the panel titled `panel`: what was measured, by the number of training steps."""
 
     panel: str
     label: str
@@ -168,27 +149,19 @@ class Curve:
 
 
 def quality_over_training(curves: Sequence[Curve], path: Path) -> None:
-    """Write a PNG: PSNR over training steps (log scale), one panel for each `panel` of `curves`.
-
-    With several seeds, error bars show the intervals.
-    """
+    """Write a PNG: PSNR over training steps (log scale), one panel for each `panel` of `curves`."""
     titles = list(dict.fromkeys(curve.panel for curve in curves))
     figure = Figure(figsize=(4.2 * len(titles), 3.6), layout="constrained")
     for axes, title in zip(figure.subplots(1, len(titles), squeeze=False)[0], titles, strict=True):
-        _label_psnr(axes, "steps of stage 2")
+        _label(axes, "steps of stage 2")
         axes.set_title(title, fontsize="medium")
         shown = [curve for curve in curves if curve.panel == title]
         for number, curve in enumerate(shown):
             halves = [line.half("psnr") for line in curve.points.values()]
-            axes.errorbar(
-                list(curve.points),
-                [line.mean("psnr") for line in curve.points.values()],
-                yerr=np.nan_to_num(halves) if np.isfinite(halves).all() else None,
-                marker=MARKERS[number % len(MARKERS)],
-                color=COLOURS[number % len(COLOURS)],
-                capsize=3,
-                label=curve.label,
-            )
+            psnr = [line.mean("psnr") for line in curve.points.values()]
+            bars = np.nan_to_num(halves) if np.isfinite(halves).all() else None
+            style = {**_style(number), "capsize": 3, "label": curve.label, "linestyle": "-"}
+            axes.errorbar(list(curve.points), psnr, yerr=bars, **style)
         axes.set_xscale("log")
         steps = sorted({step for curve in shown for step in curve.points})
         axes.set_xticks(steps, [f"{step:g}" for step in steps])
@@ -197,84 +170,71 @@ def quality_over_training(curves: Sequence[Curve], path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
-def _psnr_axes(height: float, across: str) -> tuple[Figure, Axes]:
-    """Axes with PSNR as y and the x label `across`; `height` in inches."""
-    figure = Figure(figsize=(8, height), layout="constrained")
-    axes = figure.subplots()
-    _label_psnr(axes, across)
-    return figure, axes
+def _style(number: int) -> dict[str, Any]:
+    """Marker and colour of the line with this number."""
+    marker, colour = MARKERS[number % len(MARKERS)], COLOURS[number % len(COLOURS)]
+    return {"marker": marker, "color": colour, "linestyle": "none"}
 
 
-def _label_psnr(axes: Axes, across: str) -> None:
+def _label(axes: Axes, across: str) -> None:
     axes.set_xlabel(across)
     axes.set_ylabel("PSNR, dB")
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def frontier_plot(rows: Sequence[Row], path: Path) -> None:
+def frontier_plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Write a PNG: error of a frame against its time, log-log, one point per setting.
 
     The left panel shows the error against the ground truth, with the Pareto frontier as a
-    staircase; the right panel, the error against everything off. Settings on the frontier and the
-    unchanged setting are circled, and named if there is room.
-
-    Args:
-        rows: everything off, the unchanged setting, then others. Each has knob, setting, ms, ms_lo,
-            ms_hi, psnr, psnr_to_first and instead, which equals setting on the frontier.
+    staircase; the right panel, the error against everything off. Settings on the frontier (those
+    whose `instead` is themselves) and the unchanged one, the second of `rows`, are circled, and
+    named if there is room.
     """
     figure = Figure(figsize=(13, 7), layout="constrained")
     truth, off = figure.subplots(1, 2, sharex=True)
-    best = sorted((row for row in rows if row["instead"] == row["setting"]), key=lambda r: r["ms"])
+    table = pd.DataFrame(rows)
+    best = table[table["instead"] == table["setting"]].sort_values("ms", kind="stable")
     for axes, column in ((truth, "psnr"), (off, "psnr_to_first")):
-        _error_against_time(axes, rows, column)
+        _error_against_time(axes, table, column)
     fastest, slowest = truth.get_xlim()
     truth.set_xlim(fastest * (fastest / slowest) ** 0.2, slowest)  # room for names on the left
-    stairs = [row["ms"] for row in best], [_rms(row["psnr"]) for row in best]
-    truth.step(*stairs, where="post", color="black", linewidth=1, label="frontier")
+    truth.step(
+        best["ms"], _rms(best["psnr"]), where="post", color="black", linewidth=1, label="frontier"
+    )
     truth.set_title("against the ground truth: lower left is better")
     off.set_title("against the same model with everything off")
     figure.legend(*truth.get_legend_handles_labels(), loc="outside lower center", ncols=6)
     figure.draw_without_rendering()  # fixes the positions of points on the page
-    _circle(truth, [*rows[1:2], *best], "psnr")
-    _circle(off, rows[1:2], "psnr_to_first")
+    _circle(truth, pd.concat([table[1:2], best]), "psnr")
+    _circle(off, table[1:2], "psnr_to_first")
     figure.savefig(path, dpi=100)
 
 
-def _circle(axes: Axes, rows: Sequence[Row], column: str) -> None:
+def _circle(axes: Axes, rows: pd.DataFrame, column: str) -> None:
     """Circle the points of `rows`, and name each on its left unless another name is there."""
     style: dict[str, Any] = {"textcoords": "offset points", "size": 8, "ha": "right", "va": "top"}
     names: list[np.ndarray] = []
-    for row in rows:
-        place = (row["ms"], _rms(row[column]))
+    for setting, *place in zip(rows["setting"], rows["ms"], _rms(rows[column]), strict=True):
         axes.plot(*place, "o", markersize=11, fillstyle="none", color="black")
         on_page = axes.transData.transform(place)
         if all((abs(on_page - other) > NAME_SIZE).any() for other in names):
             names.append(on_page)
-            axes.annotate(row["setting"], place, xytext=(-5, -5), **style)
+            axes.annotate(setting, place, xytext=(-5, -5), **style)
 
 
-def _error_against_time(axes: Axes, rows: Sequence[Row], column: str) -> None:
-    for number, knob in enumerate(dict.fromkeys(row["knob"] for row in rows)):
-        some = [row for row in rows if row["knob"] == knob and math.isfinite(row[column])]
-        low = [row["ms"] - row["ms_lo"] for row in some]
-        high = [row["ms_hi"] - row["ms"] for row in some]
-        axes.errorbar(
-            [row["ms"] for row in some],
-            [_rms(row[column]) for row in some],
-            xerr=(low, high),
-            fmt=MARKERS[number % len(MARKERS)],
-            color=COLOURS[number % len(COLOURS)],
-            alpha=0.8,
-            elinewidth=0.6,
-            label=knob,
-        )
+def _error_against_time(axes: Axes, rows: pd.DataFrame, column: str) -> None:
+    for number, (knob, of_knob) in enumerate(rows.groupby("knob", sort=False)):
+        some = of_knob[np.isfinite(of_knob[column])]
+        bars = some["ms"] - some["ms_lo"], some["ms_hi"] - some["ms"]
+        style = {**_style(number), "alpha": 0.8, "elinewidth": 0.6, "label": knob}
+        axes.errorbar(some["ms"], _rms(some[column]), xerr=bars, **style)
     axes.loglog()
     axes.margins(0.15, 0.12)
-    errors = [float(_rms(row[column])) for row in rows if math.isfinite(row[column])]
-    if errors and max(errors) < 1.01 * min(errors):  # autoscale needs a range to work with
+    errors = _rms(rows[column][np.isfinite(rows[column])])
+    if len(errors) and errors.max() < 1.01 * errors.min():  # autoscale needs a range to work with
         axes.set_autoscaley_on(False)
-        axes.set_ylim(min(errors) / 2, max(errors) * 2)
+        axes.set_ylim(errors.min() / 2, errors.max() * 2)
     axes.set_xlabel("ms of a frame: median of the rounds, bars from the fastest to the slowest")
     axes.set_ylabel("error of a pixel (root mean square; 1 is black against white)")
     decibels = axes.secondary_yaxis("right", functions=(_psnr, _rms))

@@ -1,10 +1,14 @@
-"""Composes a frame of several runs into one image: truth, renderings, details, error maps."""
+"""What a page shows beside its text: plots, and a frame of several runs for comparison.
+
+`publish` writes the same parts of a page as Markdown and as HTML. In Markdown, a frame is one image
+of truth, renderings, details and error maps.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -14,8 +18,8 @@ from scipy.ndimage import uniform_filter
 
 from bench.results import COLD
 from bench.trajectories import spread
-from reports.parts import Detail, Frame, Picture, View
 from reports.runs import Run
+from reports.tables import Table
 
 MOST_FRAMES = 3
 """Maximum number of frames of a run on a page."""
@@ -33,20 +37,58 @@ INK, PAPER, MARK = (30, 30, 30), (255, 255, 255), (214, 0, 110)
 ZOOM = 4
 """Magnification of the detail relative to its picture."""
 
+Box = tuple[int, int, int, int]  # left, top, right, bottom
+Band = tuple[str, Sequence[Image.Image | None]]
+"""One row of panels below a caption; None leaves a place empty."""
+
 
 @dataclass(frozen=True)
-class Band:
-    """One row of panels below a caption; None leaves a place empty."""
+class Picture:
+    """A drawing: the prefix of its file name, and what it shows, in words.
 
-    caption: str
-    panels: Sequence[Image.Image | None]
+    `draw` writes it to a path, in the format given by the ending. The marks of a plot, by the `gid`
+    that `draw` gives their artists, are their figures in words and the keys of the runs behind.
+    """
+
+    stem: str
+    shows: str
+    draw: Callable[[Path], object]
+    marks: Mapping[str, tuple[str, tuple[str, ...]]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class View:
+    """A frame rendered by one run: titles, rendering and error map, uint8 [H, W, 3] each."""
+
+    titles: tuple[str, ...]
+    rendering: np.ndarray
+    error: np.ndarray
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame of several runs, for comparison.
+
+    `name` has scene, view and number; `stem` begins the names of its files; `truth` is uint8
+    [H, W, 3]. The part `box` is enlarged; `where` says why this part was chosen, and `errors` what
+    the error maps show.
+    """
+
+    name: str
+    stem: str
+    truth: np.ndarray
+    views: Sequence[View]
+    box: Box
+    where: str
+    errors: str
+
+
+Part = str | Table | Picture | Frame
+"""A part that is a string is Markdown."""
 
 
 def kept_frames(runs: Sequence[Run]) -> list[str]:
-    """File name prefixes of the frames whose pictures all `runs` kept.
-
-    At most `MOST_FRAMES` of them, evenly spread.
-    """
+    """File name prefixes of at most `MOST_FRAMES` frames that all `runs` kept, evenly spread."""
     kept = [{path.name.split("-")[0] for path in run.pictures.glob("*-truth.png")} for run in runs]
     common = sorted(set.intersection(*kept))
     return [common[index] for index in spread(len(common), MOST_FRAMES)]
@@ -54,30 +96,19 @@ def kept_frames(runs: Sequence[Run]) -> list[str]:
 
 def frame_section(runs: Sequence[Run], frame: str, stem: str) -> Iterator[str | Frame]:
     """`frame` of `runs` as parts of a page: heading, pictures and caption."""
-    truth = _read(runs[0].pictures / f"{frame}-truth.png")
+    first = runs[0]
+    truth = _read(first.pictures / f"{frame}-truth.png")
     views = [_view(run, frame) for run in runs]
-    detail = find_detail(truth, [view.rendering for view in views])
-    view = runs[0].frames.set_index("frame")["name"][int(frame)]
-    number = f"frame {int(frame) + 1} of {len(runs[0].frames)}"
-    name, errors = f"{runs[0].facts['scene']}, {view}, {number}", runs[0].record["error_map"]
+    box, where = find_detail(truth, [view.rendering for view in views])
+    view = first.frames.set_index("frame")["name"][int(frame)]
+    place = f"frame {int(frame) + 1} of {len(first.frames)}"
+    name, errors = f"{first.facts['scene']}, {view}, {place}", first.record["error_map"]
     yield f"### {name}"
-    yield Frame(name, f"{stem}-{frame}", truth, views, detail, errors)
+    yield Frame(name, f"{stem}-{frame}", truth, views, box, where, errors)
     yield (
-        "PSNR and time of a picture are of this frame alone. The framed part, where"
-        f" {detail.where}, can be seen {ZOOM} times enlarged. Error maps show the {errors}."
+        f"PSNR and time of a picture are of this frame alone. The framed part, where {where}, can"
+        f" be seen {ZOOM} times enlarged. Error maps show the {errors}."
     )
-
-
-def still_images(frame: Frame) -> Iterator[Picture]:
-    """Static images that show all renderings of `frame`, at most `MOST_RENDERINGS` in each."""
-    count = len(frame.views)
-    width = math.ceil(count / math.ceil(count / MOST_RENDERINGS))  # evenly filled images
-    for first in range(0, count, width):
-        group = frame.views[first : first + width]
-        draw = partial(write_image, frame.truth, group, frame.detail, frame.errors)
-        shown = ", ".join(view.titles[0] for view in group)
-        shows = f"Ground truth, {shown}; a detail of each; error maps"
-        yield Picture(f"{frame.stem}-{first}", shows, draw)
 
 
 def _view(run: Run, frame: str) -> View:
@@ -95,8 +126,8 @@ def _read(path: Path) -> np.ndarray:
         return np.asarray(picture.convert("RGB"))
 
 
-def find_detail(truth: np.ndarray, renderings: Sequence[np.ndarray]) -> Detail:
-    """Find the part of a frame where its pictures differ most, on average.
+def find_detail(truth: np.ndarray, renderings: Sequence[np.ndarray]) -> tuple[Box, str]:
+    """The part of a frame where its pictures differ most, on average, and what differs there.
 
     Several renderings are compared with each other, a single one with the ground truth. If nothing
     differs, the centre is used.
@@ -113,86 +144,85 @@ def find_detail(truth: np.ndarray, renderings: Sequence[np.ndarray]) -> Detail:
     top = min(max(0, middle[0] - high // 2), height - high)
     left = min(max(0, middle[1] - wide // 2), width - wide)
     where = "the error is largest" if alone else "the renderings differ most"
-    return Detail((left, top, left + wide, top + high), where)
+    return (left, top, left + wide, top + high), where
 
 
-def write_image(
-    truth: np.ndarray, views: Sequence[View], detail: Detail, errors: str, path: Path
-) -> None:
-    """Write a PNG with the ground truth, the `views`, the `detail` of each, and error maps.
+def still_images(frame: Frame) -> Iterator[Picture]:
+    """Static images that show all renderings of `frame`, at most `MOST_RENDERINGS` in each."""
+    count = len(frame.views)
+    width = math.ceil(count / math.ceil(count / MOST_RENDERINGS))  # evenly filled images
+    for first in range(0, count, width):
+        group = replace(frame, views=frame.views[first : first + width])
+        shown = ", ".join(view.titles[0] for view in group.views)
+        shows = f"Ground truth, {shown}; a detail of each; error maps"
+        yield Picture(f"{frame.stem}-{first}", shows, partial(write_image, group))
 
-    `errors` says what the error maps show. A single view takes two rows, several take three.
+
+def write_image(frame: Frame, path: Path) -> None:
+    """Write a PNG with the ground truth, the views of `frame`, a detail of each, and error maps.
+
+    A single view takes two rows, several take three.
     """
-    pictures = [truth, *(view.rendering for view in views)]
-    maps = [view.error for view in views]
-    titles: list[tuple[str, ...]] = [("ground truth",), *(view.titles for view in views)]
-    enlarged = f"detail, {ZOOM} times enlarged, where {detail.where}"
-    if len(views) == 1:
-        pictures, maps, titles = [*pictures, *maps], [], [*titles, ("error map",)]
-        enlarged += f"; error map: {errors}"
-    bands = [
-        Band("", [_whole(picture, detail) for picture in pictures]),
-        Band(enlarged, [_part(picture, detail) for picture in pictures]),
-    ]
-    if maps:
-        bands.append(Band(f"error maps: {errors}", [None, *(_whole(m, detail) for m in maps)]))
-    _compose(titles, bands).save(path)
-
-
-def _shown(height: int, width: int) -> tuple[int, int]:
-    """Width and height of the panel of a picture."""
+    height, width = frame.truth.shape[:2]
     scale = -(-NARROW_PX // width) if width < NARROW_PX else min(1.0, WIDE_PX / width)
-    return round(width * scale), round(height * scale)
+    size = round(width * scale), round(height * scale)
+    scale = size[0] / width
+    outline = [round(edge * scale) for edge in frame.box]
+
+    def whole(picture: np.ndarray) -> Image.Image:
+        how = Image.Resampling.NEAREST if scale > 1 else Image.Resampling.BOX
+        return _outlined(Image.fromarray(picture).resize(size, how), outline)
+
+    def part(picture: np.ndarray) -> Image.Image:
+        enlarged = Image.fromarray(picture).crop(frame.box).resize(size, Image.Resampling.NEAREST)
+        return _outlined(enlarged, [0, 0, size[0] - 1, size[1] - 1])
+
+    pictures = [frame.truth, *(view.rendering for view in frame.views)]
+    maps = [view.error for view in frame.views]
+    titles: list[tuple[str, ...]] = [("ground truth",), *(view.titles for view in frame.views)]
+    caption = f"detail, {ZOOM} times enlarged, where {frame.where}"
+    if len(frame.views) == 1:
+        pictures, maps, titles = [*pictures, *maps], [], [*titles, ("error map",)]
+        caption += f"; error map: {frame.errors}"
+    bands: list[Band] = [("", list(map(whole, pictures))), (caption, list(map(part, pictures)))]
+    if maps:
+        bands.append((f"error maps: {frame.errors}", [None, *map(whole, maps)]))
+    _compose(titles, bands, size).save(path)
 
 
-def _whole(picture: np.ndarray, detail: Detail) -> Image.Image:
-    size = _shown(*picture.shape[:2])
-    scale = size[0] / picture.shape[1]
-    how = Image.Resampling.NEAREST if scale > 1 else Image.Resampling.BOX
-    panel = Image.fromarray(picture).resize(size, how)
-    _outline(panel, [round(edge * scale) for edge in detail.box])
-    return panel
-
-
-def _part(picture: np.ndarray, detail: Detail) -> Image.Image:
-    """The outlined part, enlarged to the size of the panel without interpolation."""
-    part = Image.fromarray(picture).crop(detail.box)
-    panel = part.resize(_shown(*picture.shape[:2]), Image.Resampling.NEAREST)
-    _outline(panel, [0, 0, panel.width - 1, panel.height - 1])
-    return panel
-
-
-def _outline(panel: Image.Image, box: Sequence[int]) -> None:
+def _outlined(panel: Image.Image, box: Sequence[int]) -> Image.Image:
     ImageDraw.Draw(panel).rectangle(box, outline=MARK, width=2)
+    return panel
 
 
-def _compose(titles: Sequence[Sequence[str]], bands: Sequence[Band]) -> Image.Image:
-    """Arrange panels in rows and columns, with titles above columns and captions above rows."""
-    width, height = next(panel.size for panel in bands[0].panels if panel)
+def _compose(
+    titles: Sequence[Sequence[str]], bands: Sequence[Band], size: tuple[int, int]
+) -> Image.Image:
+    """Arrange panels of this size in rows and columns, below titles and captions."""
+    width, height = size
     heads = max(map(len, titles))
-    captions = sum(bool(band.caption) for band in bands)
-    total = LINE_PX * (heads + captions) + (height + GAP_PX) * len(bands) + 2 * GAP_PX
+    lines = heads + sum(bool(caption) for caption, _ in bands)
+    total = LINE_PX * lines + (height + GAP_PX) * len(bands) + 2 * GAP_PX
     image = Image.new("RGB", (GAP_PX + (width + GAP_PX) * len(titles), total), PAPER)
-    draw = ImageDraw.Draw(image)
     across = [GAP_PX + (width + GAP_PX) * column for column in range(len(titles))]
-    for left, lines in zip(across, titles, strict=True):
-        for row, line in enumerate(lines):
-            _write(draw, (left, GAP_PX + LINE_PX * row), line, width)
+    for left, texts in zip(across, titles, strict=True):
+        for row, text in enumerate(texts):
+            _write(image, (left, GAP_PX + LINE_PX * row), text, width)
     down = GAP_PX + LINE_PX * heads
-    for band in bands:
-        if band.caption:
-            _write(draw, (GAP_PX, down), band.caption, image.width - 2 * GAP_PX)
+    for caption, panels in bands:
+        if caption:
+            _write(image, (GAP_PX, down), caption, image.width - 2 * GAP_PX)
             down += LINE_PX
-        for left, panel in zip(across, band.panels, strict=True):
+        for left, panel in zip(across, panels, strict=True):
             if panel:
                 image.paste(panel, (left, down))
         down += height + GAP_PX
     return image
 
 
-def _write(draw: ImageDraw.ImageDraw, place: tuple[int, int], text: str, room_px: int) -> None:
+def _write(image: Image.Image, place: tuple[int, int], text: str, room_px: int) -> None:
     """Write one line of text, in a smaller size if it does not fit."""
-    size = 16
+    draw, size = ImageDraw.Draw(image), 16
     while size > 8 and draw.textlength(text, font=ImageFont.load_default(size)) > room_px:
         size -= 1
     draw.text(place, text, fill=INK, font=ImageFont.load_default(size))

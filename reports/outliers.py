@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import permutations
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -51,59 +51,45 @@ class Outlier:
 
 def outliers(runs: Sequence[Run]) -> list[Outlier]:
     """The outliers among `runs`, by all rules."""
-    published: Any = OmegaConf.load(REFERENCES)
-    return [
-        *far_from_other_scenes(runs),
-        *far_from_reference(runs, published["psnr"], published["method"], published["resolution"]),
-        *stages_do_not_add_up(runs),
-        *int8_far_from_fp32(runs),
-        *faster_with_more_pixels(runs),
-    ]
+    of_psnr = (*far_from_other_scenes(runs), *far_from_reference(runs), *int8_far_from_fp32(runs))
+    return [*of_psnr, *stages_do_not_add_up(runs), *faster_with_more_pixels(runs)]
 
 
 def far_from_other_scenes(runs: Sequence[Run]) -> Iterator[Outlier]:
     """PSNR far below the median over at least three scenes with the same method and settings."""
     scored = [run for run in runs if math.isfinite(_psnr(run))]
     for group in _grouped(scored, lambda run: _settings(run, "scene", "seed", "method.seed")):
-        scenes: dict[str, list[float]] = {}
-        for run in group:
-            scenes.setdefault(run.facts["scene"], []).append(_psnr(run))
-        usual = median(median(values) for values in scenes.values())
+        scenes = _grouped(group, lambda run: run.facts["scene"])
+        usual = median(median(map(_psnr, of_scene)) for of_scene in scenes)
         for run in group:
             below = usual - _psnr(run)
             if len(scenes) > 2 and below > OTHER_SCENES_DB:
-                yield Outlier(
-                    run.key, f"PSNR {below:.1f} dB below the median of {len(scenes)} scenes"
-                )
+                why = f"PSNR {below:.1f} dB below the median of {len(scenes)} scenes"
+                yield Outlier(run.key, why)
 
 
-def far_from_reference(
-    runs: Sequence[Run], published: Mapping[str, float], method: str, resolution: str
-) -> Iterator[Outlier]:
-    """PSNR after a whole training far below the one `published` for `method` on the same scene, at
-    the same `resolution`."""
+def far_from_reference(runs: Sequence[Run]) -> Iterator[Outlier]:
+    """PSNR after a whole training far below the one published for the same scene and size."""
+    published: Any = OmegaConf.load(REFERENCES)
     for run in runs:
         share = run.record["made_of"]["config"]["method"].get("after", 1)
-        if share < 1 or run.facts["resolution"] != resolution:
-            continue
-        known = published.get(run.facts["scene"], math.nan)
+        known = published["psnr"].get(run.facts["scene"], math.nan)
         below = known - _psnr(run)
-        if below > REFERENCE_DB:
-            yield Outlier(run.key, f"PSNR {below:.1f} dB below the {known} dB of {method}")
+        whole = share == 1 and run.facts["resolution"] == published["resolution"]
+        if whole and below > REFERENCE_DB:
+            why = f"PSNR {below:.1f} dB below the {known} dB of {published['method']}"
+            yield Outlier(run.key, why)
 
 
 def stages_do_not_add_up(runs: Sequence[Run]) -> Iterator[Outlier]:
     """The stages, if they were timed, do not sum up to the frame time."""
     for run in runs:
-        if not run.record["protocol"]["stages"]:
-            continue
         frame = run.values["frame_ms"]
-        named = math.fsum(
-            ms
-            for name, ms in run.values.items()
-            if name.startswith("stage_ms.") and name != "stage_ms.other"
-        )
-        if abs(frame - named) > OUTSIDE_STAGES * frame + OUTSIDE_MS:
+        stages = {name: ms for name, ms in run.values.items() if name.startswith("stage_ms.")}
+        stages.pop("stage_ms.other", None)
+        named = math.fsum(stages.values())
+        off = abs(frame - named) > OUTSIDE_STAGES * frame + OUTSIDE_MS
+        if off and run.record["protocol"]["stages"]:
             yield Outlier(run.key, f"its stages take {named:.2f} ms, its frames {frame:.2f} ms")
 
 
@@ -121,14 +107,12 @@ def int8_far_from_fp32(runs: Sequence[Run]) -> Iterator[Outlier]:
 
 def faster_with_more_pixels(runs: Sequence[Run]) -> Iterator[Outlier]:
     """Faster than the same settings with far fewer pixels; only for frames of one size."""
-    size = ("scene.width", "scene.height", "scene.downscale", "seed", "method.seed")
     sized = [run for run in runs if run.facts["resolution"] != MIXED]
+    size = ("scene.width", "scene.height", "scene.downscale", "seed", "method.seed")
     for group in _grouped(sized, lambda run: (_settings(run, *size), run.computer)):
-        sizes = {run.key: run.facts["resolution"].split("x") for run in group}
-        pixels = {key: math.prod(map(int, text)) for key, text in sizes.items()}
-        for one, other in combinations(sorted(group, key=lambda run: pixels[run.key]), 2):
+        for one, other in permutations(group, 2):
             fewer, more = one.values["frame_ms"], other.values["frame_ms"]
-            if pixels[other.key] >= MORE_PIXELS * pixels[one.key] and more < fewer:
+            if _pixels(other) >= MORE_PIXELS * _pixels(one) and more < fewer:
                 at = f"{more:.1f} ms a frame at {other.facts['resolution']}"
                 yield Outlier(other.key, f"{at}, {fewer:.1f} ms at {one.facts['resolution']}")
 
@@ -148,6 +132,10 @@ def _psnr(run: Run) -> float:
     return run.values.get("psnr", math.nan)
 
 
+def _pixels(run: Run) -> int:
+    return math.prod(map(int, run.facts["resolution"].split("x")))
+
+
 def _grouped(runs: Sequence[Run], key: Callable[[Run], object]) -> list[list[Run]]:
     groups: dict[object, list[Run]] = {}
     for run in runs:
@@ -157,11 +145,10 @@ def _grouped(runs: Sequence[Run], key: Callable[[Run], object]) -> list[list[Run
 
 def _settings(run: Run, *without: str) -> str:
     """A key that is equal for runs with equal settings, ignoring the settings in `without`."""
-    kept = {**run.record["made_of"]["config"]}
+    config = run.record["made_of"]["config"]
+    kept = {name: of for name, of in config.items() if name not in without}
     for name in without:
         group, _, setting = name.partition(".")
-        if not setting:
-            kept.pop(group, None)
-        elif group in kept:
+        if setting and group in kept:
             kept[group] = {key: value for key, value in kept[group].items() if key != setting}
     return content_key(kept)

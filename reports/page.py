@@ -10,11 +10,9 @@ from pathlib import Path
 from bench.results import Store
 from reports import figures
 from reports.comparison import comparison, conditions_of
-from reports.images import MOST_RENDERINGS, frame_section, kept_frames
-from reports.parts import Part, Plot
-from reports.provenance import facts
+from reports.images import MOST_RENDERINGS, Part, Picture, frame_section, kept_frames
 from reports.publish import publish
-from reports.runs import Repeated, Run, load, over_common_frames
+from reports.runs import Repeated, Run, load, missing_figures, over_common_frames
 from reports.tables import Table, run_tables
 
 
@@ -23,22 +21,18 @@ def write_page(
 ) -> Path:
     """Write `folder/report.md` with its pictures, and the same as `report.html`; return the former.
 
-    The page replaces an earlier one only once it is complete.
-
-    Args:
-        store: holds the runs.
-        labels: the name of each run on the page, by key, in the order of the page.
-        folder: created if missing.
-        failures: why a run is missing, by its label.
-
-    Raises:
-        SteerbenchError: a run is not in the store, or `folder` cannot be written to.
+    The page replaces an earlier one only once it is complete. `labels` has the names of the runs on
+    the page, by key and in its order; `failures` says why a run is missing, by its label. Raises
+    SteerbenchError if a run is not in the store or `folder` cannot be written to.
     """
     runs = over_common_frames(load(store, labels))
     parts = [
         *_heading(runs, failures),
         *_tradeoffs(runs),
-        *_time(runs),
+        "## Where the time goes",
+        Picture("stages", "Mean ms of a frame by stages", partial(figures.stage_bars, runs)),
+        "One bar per run: the mean time of a frame, divided into the stages of the method; a stage"
+        " includes the stages inside it. Time outside all stages is `other`.",
         *_pictures(runs),
         *(part for run in runs for part in _figures(run)),
         *_provenance(runs),
@@ -69,38 +63,18 @@ def _heading(runs: Sequence[Run], failures: Mapping[str, str]) -> Iterator[Part]
     yield from missing_figures(runs)
 
 
-def missing_figures(runs: Sequence[Run]) -> list[str]:
-    """Notes about every metric that could not be measured."""
-    notes = (f"{name}: n/a. {why}" for run in runs for name, why in run.record["missing"].items())
-    return list(dict.fromkeys(notes))
-
-
 def _tradeoffs(runs: Sequence[Run]) -> Iterator[Part]:
     """Plots of quality against its costs, if there are runs to compare."""
     lines = [Repeated(run.label, [run]) for run in runs]
-    for title, stem, metric, unit, axis, better in TRADEOFFS:
-        shows = f"PSNR in dB against {axis}, one mark a run"
-        plot = figures.quality_plot(lines, metric, unit, axis, stem, shows)
+    for title, metric, better in (
+        ("Quality against time", "frame_ms", "faster"),
+        ("Quality against memory", "size_bytes.total", "smaller"),
+    ):
+        plot = figures.quality_plot(lines, metric)
         if len(plot.marks) > 1:
             yield f"## {title}"
             yield plot
             yield f"One mark a run: further up is better, further left is {better}."
-
-
-TRADEOFFS = (
-    ("Quality against time", "psnr-ms", "frame_ms", 1.0, "ms a frame", "faster"),
-    ("Quality against memory", "psnr-bytes", "size_bytes.total", 1e6, "MB of the model", "smaller"),
-)
-
-
-def _time(runs: Sequence[Run]) -> Iterator[Part]:
-    yield "## Where the time goes"
-    shows = "Mean time of a frame in ms, one bar per run, divided into stages"
-    yield Plot("stages", shows, partial(figures.stage_bars, runs))
-    yield (
-        "One bar per run: the mean time of a frame, divided into the stages of the method; a stage"
-        " includes the stages inside it. Time outside all stages is `other`."
-    )
 
 
 def _pictures(runs: Sequence[Run]) -> Iterator[Part]:
@@ -127,16 +101,14 @@ def _figures(run: Run) -> Iterator[Part]:
 def _provenance(runs: Sequence[Run]) -> Iterator[Part]:
     """The commands, then facts: one line if all runs share it, otherwise one line per run."""
     commands = "\n".join(dict.fromkeys(run.record["command"] for run in runs))
-    of_runs = [facts(run) for run in runs]
     lines = []
-    for name in of_runs[0]:
-        values = [of_run[name] for of_run in of_runs]
+    for name in runs[0].provenance:
+        values = [run.provenance[name] for run in runs]
         if len(set(values)) == 1:
             lines.append((name, values[0]))
         else:
-            lines += [
-                (f"{name}, {run.label}", value) for run, value in zip(runs, values, strict=True)
-            ]
+            names = (f"{name}, {run.label}" for run in runs)
+            lines += zip(names, values, strict=True)
     yield "## Provenance\n\nEvery figure and picture on this page was made by"
     yield f"```sh\n{commands}\n```"
     yield Table("Provenance", ("", ""), tuple(lines), figures=False)

@@ -14,10 +14,9 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from reports import figures
-from reports.images import frame_section, kept_frames
+from reports.images import Part, Picture, frame_section, kept_frames
 from reports.outliers import Outlier, outlier_table
 from reports.paper_tables import SHARES, Lines, PaperTable, section
-from reports.parts import Part, Plot
 from reports.publish import publish
 from reports.runs import Run
 
@@ -33,19 +32,12 @@ def write_paper_page(
 ) -> Path:
     """Write `folder/report.md` with its pictures, and the same as `report.html`; return the former.
 
-    Args:
-        tables: in the order of the page.
-        lines: the measured lines of the tables, as far as there are any.
-        found: outliers, including runs that the page does not show.
-        folder: created if missing.
-        missing: why scenes of the data set are left out, by name.
-
-    Raises:
-        SteerbenchError: `folder` cannot be written to.
+    The page shows `tables` in this order, with the `lines` that were measured, and the outliers
+    `found` among their runs; `missing` says why scenes are left out, by name. Raises
+    SteerbenchError if `folder` cannot be written to.
     """
-    runs = list(
-        {run.key: run for of in lines.values() for line in of for run in line.measured}.values()
-    )
+    measured = (run for of in lines.values() for line in of for run in line.measured)
+    runs = list({run.key: run for run in measured}.values())
     left_out = "\n".join(f"- missing: {name}: {why}" for name, why in missing.items())
     listed = outlier_table(found, runs)
     sources = "\n".join(f"{run.key}  {run.record['command']}" for run in runs)
@@ -64,28 +56,25 @@ def write_paper_page(
 
 def _plot(plot: Mapping[str, Any], tables: Sequence[PaperTable], lines: Lines) -> Iterator[Part]:
     """A plot with heading and caption, if any of its lines was measured."""
-    stem, title = plot["file"], plot["title"]
+    some: Sequence[Any]
     if "metric" in plot:
         listed = {line.label for table in tables for block in table.blocks for line in block.lines}
-        shown = [
+        some = [
             replace(line, label=label.format(line.label))
             for table, label in plot["tables"].items()
             for line in lines.get(table, ())
             if line.runs and line.label in listed  # but not a point of a curve
         ]
-        axis = plot["metric"], plot["unit"], plot["axis"]
-        drawn = figures.quality_plot(shown, *axis, stem, title)
-        some = bool(shown)
-    elif "curves" in plot:
-        curves = [curve for table in tables for curve in _curves(table, lines)]
-        drawn = Plot(stem, title, partial(figures.quality_over_training, curves))
-        some = bool(curves)
+        drawn = figures.quality_plot(some, plot["metric"])
     else:
-        runs = _chosen(plot["lines"], lines, one_scene=plot.get("one_scene", False))
-        drawn = Plot(stem, title, partial(getattr(figures, plot["draw"]), runs))
-        some = bool(runs)
+        if "lines" in plot:
+            some = _chosen(plot["lines"], lines, one_scene=plot.get("one_scene", False))
+        else:
+            some = [curve for table in tables for curve in _curves(table, lines)]
+        draw = partial(getattr(figures, plot["draw"]), some)
+        drawn = Picture(plot["file"], plot["title"], draw)
     if some:
-        yield from (f"## {title}", drawn, plot["caption"].strip())
+        yield from (f"## {plot['title']}", drawn, plot["caption"].strip())
 
 
 def _curves(table: PaperTable, lines: Lines) -> Iterator[figures.Curve]:
@@ -103,11 +92,10 @@ def _curves(table: PaperTable, lines: Lines) -> Iterator[figures.Curve]:
             yield figures.Curve(table.number, line.label, points)
 
 
-def _steps(run: Run) -> int:
+def _steps(run: Run) -> Any:
     """Steps of stage 2 in the training of `run`."""
     method = run.record["made_of"].get("config", {}).get("method", {})
-    steps: int = method.get("steps") or run.record["budget"]["renderer_steps"]
-    return steps
+    return method.get("steps") or run.record["budget"]["renderer_steps"]
 
 
 def _images(images: Mapping[str, Any], lines: Lines) -> Iterator[Part]:
@@ -119,13 +107,8 @@ def _images(images: Mapping[str, Any], lines: Lines) -> Iterator[Part]:
         yield from frame_section(runs, frames[len(frames) // 2], stem)
 
 
-def _chosen(
-    wanted: Mapping[str, Sequence[str]], lines: Lines, one_scene: bool = False
-) -> list[Run]:
-    """The first run of each measured line in `wanted`, which lists lines by label for each table.
-
-    A run is the mean over all scenes, or with `one_scene` that of the first scene.
-    """
+def _chosen(wanted: Mapping[str, Sequence[str]], lines: Lines, one_scene: bool) -> list[Run]:
+    """The first run, over all scenes or of the first one, of each measured line in `wanted`."""
     known = {(table, line.label): line for table in lines for line in lines[table]}
     found = ((label, known.get((table, line))) for label, (table, line) in wanted.items())
     runs = ((label, line.measured if one_scene else line.runs) for label, line in found if line)

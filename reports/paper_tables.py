@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
 
-from reports.comparison import conditions_of, marked, metric_format
-from reports.page import missing_figures
-from reports.runs import Repeated, Run
-from reports.scenes import scene_table
-from reports.tables import Table
-from reports.trends import Trend, differences, trend_table
+from reports.comparison import COMMON, conditions_of, marked, metric_format, written
+from reports.runs import Repeated, missing_figures
+from reports.tables import NOT_AVAILABLE, Table
+from reports.trends import Trend, differences, signed, trend_table
 
 METHOD = "method"
 AFTER, SHARES = "method.after", (0.125, 0.25, 0.5)
@@ -26,20 +24,15 @@ OF_CURVES = {"protocol.name": "psnr", "protocol.lpips": "[]"}
 ABSENT = "–"
 """Stands for a figure that the paper does not give or that cannot be measured here."""
 
-
 Lines = Mapping[str, Sequence[Repeated]]
 """The measured lines of each table, by table name."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """A line of a table.
+    """A line of a table: `job` has its settings, beside those of all lines; the paper's figures.
 
-    Attributes:
-        label: its name.
-        job: the settings that measure it, beside those of all lines. Without a `method` it is a
-            line of the paper's method.
-        published: the paper's figures by metric, in bytes, ms and dB as in our rows.
+    Without a `method` it is one of the paper's method. Units are bytes, ms and dB, as in our rows.
     """
 
     label: str
@@ -49,22 +42,14 @@ class Line:
 
 @dataclass(frozen=True)
 class PaperTable:
-    """A table of the paper.
+    """A table of the paper, measured by the experiment `name`; `metrics` are its columns.
 
-    Attributes:
-        name: the name of the experiment that measures it.
-        title: what it shows.
-        published_on: scenes, size and machine of the paper's figures.
-        metrics: its columns.
-        lines: in the paper's order.
-        notes: what a reader should know before comparing.
-        trends: what the paper concludes from it.
-        beyond: a method beyond the paper, shown with the same lines as the paper's method, or None.
-        beyond_notes: the notes about `beyond`.
-        scenes: the metrics that are also shown for every scene of a data set; empty: no such table.
-        in_turns: whether the lines of a block are measured in turns, frame by frame, because the
-            table compares times.
-        curve: whether the lines of the paper's method are also shown as curves over the training.
+    `published_on` has scenes, size and machine of the paper's figures. `notes` are what a reader
+    should know before comparing, `trends` what the paper concludes. `beyond` is a method beyond the
+    paper, shown with the same lines as the paper's method and notes of its own. The metrics
+    `scenes` are also shown for every scene of a data set. Where a table compares times, the lines
+    of a block are measured `in_turns`, frame by frame. With `curve`, the lines of the paper's
+    method are also shown as curves over the training.
     """
 
     name: str
@@ -87,10 +72,7 @@ class PaperTable:
 
     @property
     def marks(self) -> dict[tuple[str, float], Line]:
-        """The additional lines measured for the curves.
-
-        Keys are the label of a line and the share of the training after which it is rendered.
-        """
+        """The lines added for curves, by the label of a line and the share of its training."""
         return {
             (line.label, share): Line(
                 f"{line.label}, after {share}", {**line.job, AFTER: str(share), **OF_CURVES}
@@ -102,10 +84,7 @@ class PaperTable:
 
     @property
     def blocks(self) -> list[PaperTable]:
-        """The table, then the same for the method beyond the paper, if there is one.
-
-        The latter has the lines of the paper's method, without published figures, and the trends.
-        """
+        """The table, then the lines and trends of the paper's method for the one beyond it."""
         if self.beyond is None:
             return [self]
         of_paper = [line for line in self.lines if METHOD not in line.job]
@@ -130,6 +109,10 @@ class PaperTable:
         first, *further = self.blocks
         return [first, *(x for x in further if any(line.label in measured for line in x.lines))]
 
+    def measured(self, known: Mapping[str, Repeated]) -> list[Repeated]:
+        """Its lines of `known`, by label; those that are not there have no runs."""
+        return [known.get(line.label, Repeated(line.label, ())) for line in self.lines]
+
 
 def paper_tables(folder: Path) -> list[PaperTable]:
     """The tables that the experiments in `folder` declare, in the paper's order."""
@@ -140,49 +123,67 @@ def paper_tables(folder: Path) -> list[PaperTable]:
 def _table(path: Path) -> PaperTable:
     """What an experiment declares below `table`; what its lines leave out follows from its grid.
 
-    The method beyond the paper is the one that the grid has besides that of the experiment and
-    those that lines name.
+    Without jobs of their own, there is a line for each value of the grid. The method beyond the
+    paper is the one that the grid has besides that of the experiment and those that lines name.
     """
     experiment: Any = OmegaConf.to_container(OmegaConf.load(path))
     content = experiment["table"]
     params = experiment["hydra"]["sweeper"]["params"]
     grid = {name: str(values).split(",") for name, values in params.items()}
     _, *further = grid.pop(METHOD, [""])
-    label = content.pop("label", "{}")
-    lines = list(_lines(content.pop("lines"), content["metrics"], label, grid))
+    declared, label = content.pop("lines"), content.pop("label", "{}")
+    jobs = [line["job"] for line in declared if "job" in line] or [
+        {name: value} for name, values in grid.items() for value in values
+    ]
+    lines = []
+    for line, job in zip(declared, jobs, strict=True):
+        paper = zip(content["metrics"], line.get("published", ()), strict="published" in line)
+        figures = {metric: figure for metric, figure in paper if figure is not None}
+        lines.append(Line(line.get("label") or label.format(*job.values()), job, figures))
     trends = [Trend(metric, labels) for metric, labels in content.pop("rising").items()]
-    named = {line.job.get(METHOD) for line in lines}
+    named = {job.get(METHOD) for job in jobs}
     beyond = next((method for method in further if method not in named), None)
     return PaperTable(path.stem, lines=lines, trends=trends, beyond=beyond, **content)
 
 
-def _lines(
-    declared: Sequence[Mapping[str, Any]],
-    metrics: Sequence[str],
-    label: str,
-    grid: Mapping[str, Sequence[str]],
-) -> Iterator[Line]:
-    """The lines of a table. Without jobs of their own, there is one for each value of the grid."""
-    jobs = [line["job"] for line in declared if "job" in line] or [
-        {name: value} for name, values in grid.items() for value in values
-    ]
-    for line, job in zip(declared, jobs, strict=True):
-        published = zip(metrics, line.get("published", ()), strict="published" in line)
-        figures = {metric: figure for metric, figure in published if figure is not None}
-        yield Line(line.get("label") or label.format(*job.values()), job, figures)
+def section(table: PaperTable, lines: Sequence[Repeated]) -> list[str | Table]:
+    """A table as parts of a page: the paper's lines, those of a method beyond it, each scene."""
+    measured = {line.label: line for line in lines}
+    parts: list[str | Table] = []
+    for block in table.shown(measured):
+        first = block is table
+        parts.append(f"## {table.number}: {table.title}" if first else f"### {block.title}")
+        parts += _block(block, measured, f"Paper: {table.published_on}." if first else "")
+    if table.scenes and len({scene for line in lines for scene in line.by_scene}) > 1:
+        parts += ["### Each scene", _scenes(table.scenes, lines)]
+    return parts
+
+
+def _block(
+    table: PaperTable, measured: Mapping[str, Repeated], published: str
+) -> list[str | Table]:
+    """Conditions of the measured and the published figures, then the figures, trends, notes."""
+    figures = {line.label: line.published for line in table.lines}
+    runs = [run for line in table.measured(measured) for run in line.runs]
+    machines = [run.record["machine"] for run in runs]
+    on = dict.fromkeys(f"{each['cpu']} with {each['threads']} threads" for each in machines)
+    facts = conditions_of(runs, (*COMMON, "method", "seed", "commit"))
+    where = f"Measured: {facts}, on {' / '.join(on)}." if runs else ""
+    grown = [each for trend in table.trends for each in differences(trend, measured, figures)]
+    trends = trend_table(grown) if grown else ""
+    notes = dict.fromkeys((*table.notes, *missing_figures(runs)))
+    listed = "\n".join(f"- {note}" for note in notes)
+    shown = with_published(table, measured)
+    return [part for part in (where, published, shown, trends, listed) if part]
 
 
 def with_published(table: PaperTable, measured: Mapping[str, Repeated]) -> Table:
-    """A table of measured figures, the paper's figures and their differences.
+    """A table of measured figures (lines by label), the paper's figures and their differences.
 
     Among measured figures under the same conditions, the best of a column is bold and, of at least
     three, the second best is italic.
-
-    Args:
-        table: a table of the paper.
-        measured: lines by label; some may be missing.
     """
-    lines = [measured.get(line.label, Repeated(line.label, ())) for line in table.lines]
+    lines = table.measured(measured)
     beside = any(line.published for line in table.lines)
     columns = []
     for metric in table.metrics:
@@ -200,44 +201,20 @@ def with_published(table: PaperTable, measured: Mapping[str, Repeated]) -> Table
     return Table(table.title, heads, cells, sources=tuple(line.keys for line in lines))
 
 
-def section(table: PaperTable, lines: Sequence[Repeated]) -> list[str | Table]:
-    """A table as parts of a page: the paper's lines, those of a method beyond it, each scene."""
-    measured = {line.label: line for line in lines}
-    parts: list[str | Table] = []
-    for block in table.shown(measured):
-        first = block is table
-        parts.append(f"## {table.number}: {table.title}" if first else f"### {block.title}")
-        parts += _block(block, measured, f"Paper: {table.published_on}." if first else "")
-    if table.scenes and len({scene for line in lines for scene in line.by_scene}) > 1:
-        each = scene_table(table.scenes, lines)
-        parts += [f"### {each.title}", each]
-    return parts
-
-
-def _block(
-    table: PaperTable, measured: Mapping[str, Repeated], published: str
-) -> list[str | Table]:
-    """Conditions of the measured and the published figures, then the figures, trends, notes."""
-    figures = {line.label: line.published for line in table.lines}
-    runs = [run for label in figures if label in measured for run in measured[label].runs]
-    where = f"Measured: {conditions_of(runs)}, {_origin(runs)}." if runs else ""
-    grown = [each for trend in table.trends for each in differences(trend, measured, figures)]
-    trends = trend_table(grown) if grown else ""
-    notes = dict.fromkeys((*table.notes, *missing_figures(runs)))
-    listed = "\n".join(f"- {note}" for note in notes)
-    shown = with_published(table, measured)
-    return [part for part in (where, published, shown, trends, listed) if part]
-
-
-def _origin(runs: Sequence[Run]) -> str:
-    machines = [run.record["machine"] for run in runs]
-    origin = {
-        "method": [run.facts["method"] for run in runs],
-        "seed": [str(run.facts["seed"]) for run in runs],
-        "commit": [run.facts["commit"] for run in runs],
-        "on": [f"{each['cpu']} with {each['threads']} threads" for each in machines],
-    }
-    return ", ".join(f"{name} {' / '.join(dict.fromkeys(of))}" for name, of in origin.items())
+def _scenes(metrics: Sequence[str], lines: Sequence[Repeated]) -> Table:
+    """Means over seeds, one line per scene and line."""
+    shown = [
+        (f"{scene}: {line.label}", Repeated(line.label, line.by_scene[scene]))
+        for scene in sorted({scene for line in lines for scene in line.by_scene})
+        for line in lines
+        if scene in line.by_scene
+    ]
+    cells = tuple(
+        (name, *(written(of_scene, metric) or NOT_AVAILABLE for metric in metrics))
+        for name, of_scene in shown
+    )
+    heads = ("measured", *(metric_format(metric)[0] for metric in metrics))
+    return Table("Each scene", heads, cells, sources=tuple(of_scene.keys for _, of_scene in shown))
 
 
 def _beside(text: str, measured: float | None, published: float | None, metric: str) -> str:
@@ -247,6 +224,5 @@ def _beside(text: str, measured: float | None, published: float | None, metric: 
     _, write = metric_format(metric)
     texts = [text, ABSENT if published is None else write(published)]
     if measured is not None and published is not None and not math.isnan(measured):
-        sign = "-" if measured < published else "+"
-        texts.append(f"{sign}{write(abs(measured - published))}")
+        texts.append(signed(measured - published, write))
     return " / ".join(texts)

@@ -17,13 +17,9 @@ from reports.tables import QUALITY, Table
 
 @dataclass(frozen=True)
 class Limit:
-    """How much worse a metric may become.
+    """How much worse a metric may become: `absolute` in its unit, `relative` to the old figure.
 
-    Attributes:
-        better: 1 where more is better, -1 where less is.
-        absolute: in the unit of the metric.
-        relative: share of the old figure.
-        here: it depends on the machine and is compared on the same one only.
+    `better` is 1 where more is better, else -1. With `here`, it is compared on one machine only.
     """
 
     better: int
@@ -50,15 +46,12 @@ LIMITS: Mapping[str, Limit] = {
 
 @dataclass(frozen=True)
 class Figures:
-    """The figures of a run that later runs are compared with.
+    """The figures of a run that later runs are compared with: its headline `values`, by metric.
 
-    Attributes:
-        values: of its headline, by metric.
-        frames: the figures that the headline averages, by metric and by number and name of the
-            frame, in the order of the path. Qualities have steady frames with ground truth, other
-            metrics all steady frames.
-        machine: names of its processor and graphics processors.
-        views: equal for the same frames of the same scene under one protocol.
+    `frames` has the figures that the headline averages, by metric and by number and name of the
+    frame, in the order of the path: of qualities the steady frames with ground truth, of other
+    metrics all steady frames. `machine` names its processors. `views` is equal for the same frames
+    of the same scene under one protocol.
     """
 
     values: Mapping[str, float]
@@ -69,23 +62,20 @@ class Figures:
     @classmethod
     def of(cls, run: Run, limits: Mapping[str, Limit] = LIMITS) -> Figures:
         """The figures of `run` that have a limit."""
-        values = {
-            metric: run.values[metric]
-            for metric in limits
-            if not math.isnan(run.values.get(metric, math.nan))
-        }
+        every = {metric: run.values.get(metric, math.nan) for metric in limits}
+        values = {metric: value for metric, value in every.items() if not math.isnan(value)}
         steady = run.frames[run.frames["phase"] == STEADY]
         steady = steady if len(steady) else run.frames
-        scored = steady.dropna(subset=["psnr"])
         frames = {}
         for metric in values:
-            if metric in run.frames and metric != "peak_bytes":  # older runs have that column
-                averaged = scored if metric in QUALITY else steady
-                if metric == "flicker":  # the first frame of a path has none
-                    averaged = averaged.dropna(subset=[metric])
-                names = averaged["frame"].astype(str) + ": " + averaged["name"].fillna("")
-                if averaged[metric].notna().all():
-                    frames[metric] = dict(zip(names, averaged[metric].astype(float), strict=True))
+            if metric not in steady or metric == "peak_bytes":  # older runs have that column
+                continue
+            averaged = steady.dropna(subset=["psnr"]) if metric in QUALITY else steady
+            if metric == "flicker":  # the first frame of a path has none
+                averaged = averaged.dropna(subset=[metric])
+            names = averaged["frame"].astype(str) + ": " + averaged["name"].fillna("")
+            if averaged[metric].notna().all():
+                frames[metric] = dict(zip(names, averaged[metric].astype(float), strict=True))
         machine = run.record["machine"]
         views = ", ".join(map(str, (*run.views, run.facts["protocol"])))
         return cls(values, frames, ", ".join((machine["cpu"], *machine["gpus"])), views)
@@ -93,16 +83,12 @@ class Figures:
 
 @dataclass(frozen=True)
 class Change:
-    """The change of one metric.
+    """The change of one metric from `old` to `new`, which is nan if the new run lacks it.
 
-    Attributes:
-        old, new: `new` is nan if the new run lacks the metric.
-        by: new less old; the mean over the frames that both runs have, where frames are known, and
-            over the seeds.
-        interval: 95 % interval of that mean, over the seeds; with one seed over its frames; None
-            where only two figures are known.
-        verdict: "worse" by more than its limit and not by chance, "missing" if it or a frame is
-            gone, else "".
+    `by` is new less old: the mean over the frames that both runs have, where frames are known, and
+    over the seeds. `interval` is the 95 % interval of that mean, over the seeds, with one seed over
+    its frames; None where only two figures are known. The `verdict` is "worse" (by more than its
+    limit and not by chance), "missing" (it or a frame is gone) or "".
     """
 
     metric: str
@@ -119,12 +105,10 @@ def changes(
     """The change of every metric of `old` that has a limit, over runs with the same seeds.
 
     A change beyond its limit is chance where its interval contains 0, unless one frame alone moves
-    the mean beyond the limit. Then that frame is broken; but a time may be long by chance. With
-    several seeds the interval is that over the seeds. It holds what rounding does to a training
-    where another processor adds in another order; that over the frames of one training does not.
-
-    Raises:
-        SteerbenchError: the runs rendered other frames.
+    the mean beyond the limit. Then that frame is broken; but a time may be long by chance. The
+    interval over several seeds holds what rounding does to a training where another processor adds
+    in another order; that over the frames of one training does not. Raises SteerbenchError if the
+    runs rendered other frames.
     """
     pairs = list(zip(old, new, strict=True))
     for before, after in pairs:
@@ -141,13 +125,9 @@ def changes(
 
 def _change(metric: str, limit: Limit, pairs: Sequence[tuple[Figures, Figures]]) -> Change:
     values = np.array([[run.values.get(metric, math.nan) for run in pair] for pair in pairs])
-    frames = [_frames_apart(metric, *pair) for pair in pairs]
-    by_seed = np.array(
-        [
-            each.mean() if len(each) > 1 else _apart(*pair)
-            for each, pair in zip(frames, values, strict=True)
-        ]
-    )
+    frames = [frames_apart(metric, *pair) for pair in pairs]
+    pairwise = zip(frames, values, strict=True)
+    by_seed = np.array([x.mean() if len(x) > 1 else _apart(*pair) for x, pair in pairwise])
     before, after = map(float, values.mean(axis=0))
     allowed = limit.absolute + (limit.relative and limit.relative * abs(before))
     by, interval, certain = float(by_seed.mean()), None, True
@@ -157,16 +137,14 @@ def _change(metric: str, limit: Limit, pairs: Sequence[tuple[Figures, Figures]])
         moved = [(-limit.better * each).max() / len(each) for each in frames if len(each) > 1]
         broken = not limit.here and max(moved, default=0) / len(pairs) > allowed
         certain = broken or -limit.better * by - half > 0
-    worse = certain and -limit.better * by > allowed
-    gone = math.isnan(after) or any(
-        one.frames.get(metric, {}).keys() - other.frames.get(metric, {}) for one, other in pairs
-    )
-    return Change(
-        metric, before, after, by, interval, "missing" if gone else "worse" if worse else ""
-    )
+    verdict = "worse" if certain and -limit.better * by > allowed else ""
+    gone = (one.frames.get(metric, {}).keys() - of.frames.get(metric, {}) for one, of in pairs)
+    if math.isnan(after) or any(gone):
+        verdict = "missing"
+    return Change(metric, before, after, by, interval, verdict)
 
 
-def _frames_apart(metric: str, old: Figures, new: Figures) -> np.ndarray:
+def frames_apart(metric: str, old: Figures, new: Figures) -> np.ndarray:
     """New less old of the frames that both have, in the order of the path."""
     one, other = old.frames.get(metric, {}), new.frames.get(metric, {})
     return np.array([_apart(one[name], other[name]) for name in one if name in other])
@@ -179,16 +157,10 @@ def _apart(old: float, new: float) -> float:
 
 def change_table(title: str, found: Sequence[Change]) -> Table:
     """The changes `found`, a line each."""
-    lines = (
-        (
-            change.metric,
-            f"{change.old:.6g}",
-            f"{change.new:.6g}",
-            f"{change.by:+.4g}",
-            " – ".join(f"{end:+.4g}" for end in change.interval or ()),
-            change.verdict,
-        )
-        for change in found
-    )
+    lines = []
+    for change in found:
+        interval = " – ".join(f"{end:+.4g}" for end in change.interval or ())
+        figures = (f"{change.old:.6g}", f"{change.new:.6g}", f"{change.by:+.4g}", interval)
+        lines.append((change.metric, *figures, change.verdict))
     columns = ("metric", "was", "is", "change", "95 % interval", "")
     return Table(title, columns, tuple(lines))

@@ -14,22 +14,22 @@ import pandas as pd
 
 from bench.errors import SteerbenchError
 from bench.intervals import half_interval
-from bench.results import STEADY, WHOLE, Store, unreadable
+from bench.neighbours import Neighbours
+from bench.results import COLD, STEADY, WHOLE, Store, content_key, unreadable
 from bench.run import phase_rows
-from reports.tables import headline, phases, run_tables, suffix
+from reports.tables import phases, run_tables
+
+FIGURES = ("metric", "unit", "phase", "value", "n", "lo", "hi")
+"""The columns of rows that are not facts about the whole run."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One run of the store.
+    """One run of the store, by its `key`; `label` is its name in a table or figure.
 
-    Attributes:
-        key: its key in the store.
-        label: its name in a table or figure.
-        rows: one metric per row.
-        read_frames: reads `frames` on demand: few reports need them, and they are most of a run.
-        record: what the figures mean, and where they come from.
-        pictures: folder of ground truths, renderings and error maps.
+    `rows` has one metric per row. `read_frames` reads the frames on demand: few reports need them,
+    and they are most of a run. `record` says what the figures mean and where they come from;
+    `pictures` is the folder of ground truths, renderings and error maps.
     """
 
     key: str
@@ -47,7 +47,9 @@ class Run:
     @cached_property
     def headline(self) -> pd.DataFrame:
         """One row per metric, for the steady frames, or the cold ones if there are no others."""
-        return headline(self.rows).set_index("metric")
+        steady = (self.rows["phase"] == STEADY).any()
+        rows = self.rows[self.rows["phase"] != COLD] if steady else self.rows
+        return rows.set_index("metric")
 
     @cached_property
     def values(self) -> dict[str, float]:
@@ -58,8 +60,8 @@ class Run:
         """The run once per phase, with only the figures of that phase."""
         whole = self.rows[self.rows["phase"] == WHOLE]
         return [
-            replace(self, label=self.label + suffix(phase), rows=pd.concat([of_phase, whole]))
-            for phase, of_phase in phases(self.rows)
+            replace(self, label=self.label + suffix, rows=pd.concat([of_phase, whole]))
+            for suffix, of_phase in phases(self.rows)
         ]
 
     def _repr_markdown_(self) -> str:
@@ -90,16 +92,45 @@ class Run:
         phase = self.headline["phase"].iloc[0]
         return (*self.views, phase, self.facts["protocol"], *self.computer)
 
+    @property
+    def provenance(self) -> dict[str, str]:
+        """Where the figures come from, except the command and the settings."""
+        machine, record, row = self.record["machine"], self.record, self.facts
+        memory = f"{machine['memory_bytes'] / 2**30:.0f} GiB"
+        computed = {name: row[name] for name in ("device", "backend", "engine", "precision")}
+        seen = record.get("neighbours")  # older runs and scores have none
+        return {
+            "run": self.key,
+            "scene": f"{row['scene']}, digest {record['scene']['digest'][:16]}",
+            "frames": f"{row['trajectory']} at {row['resolution']}",
+            "protocol": _listed(record["protocol"]),
+            "budget": _listed(record["budget"]),
+            "seed": str(row["seed"]),
+            "commit": row["commit"],
+            "computed on": _listed(computed),
+            "peak memory": record["peak_bytes"],
+            "machine": f"{machine['cpu']}, {machine['threads']} threads, {memory}",
+            "beside it": str(Neighbours(**seen)) if seen else "not recorded",
+            "GPU": ", ".join(machine["gpus"]) or "none",
+            "system": f"{machine['system']}, Python {machine['python']}",
+            "versions": _listed(record["made_of"].get("libraries", {})),
+        }
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """The settings of the method by the names that one types; none for scored pictures."""
+        method = self.record["made_of"].get("config", {}).get("method", {})
+        found = pd.json_normalize({"method": method}).to_dict("records")
+        named = [(str(name), str(value)) for each in found for name, value in each.items()]
+        return dict(pair for pair in named if "._" not in pair[0])  # Hydra's own, as `_target_`
+
 
 @dataclass(frozen=True)
 class Repeated:
-    """Runs that differ only in their seed. Figures are means over them.
+    """A table line with the `label`: runs that differ only in their seed. Figures are their means.
 
-    Attributes:
-        label: name of the table line that they fill.
-        runs: one for each measured seed; for a data set, each is a mean over scenes.
-        gaps: why other runs are missing.
-        by_scene: for a data set, all measured runs by scene; first the scenes in the means.
+    `gaps` says why other runs are missing. For a data set, each of `runs` is a mean over scenes;
+    `by_scene` has all measured runs by scene, first the scenes in the means.
     """
 
     label: str
@@ -117,15 +148,6 @@ class Repeated:
         """The keys of the stored runs behind the figures."""
         return tuple(run.key for run in self.measured)
 
-    @cached_property
-    def values(self) -> dict[str, float]:
-        """Means by metric, for the metrics that all runs have."""
-        if not self.runs:
-            return {}
-        tables = [run.values for run in self.runs]
-        names = [name for name in tables[0] if all(name in table for table in tables)]
-        return {name: float(np.mean([table[name] for table in tables])) for name in names}
-
     @property
     def conditions(self) -> tuple[object, ...]:
         """See `Run.conditions`."""
@@ -141,7 +163,6 @@ class Repeated:
         return half_interval(np.array(self._figures(metric)))
 
     def _figures(self, metric: str) -> list[float]:
-        """The metric of every run that has it; a stage includes its nested stages."""
         of_runs = (
             [
                 value
@@ -153,13 +174,49 @@ class Repeated:
         return [math.fsum(figures) for figures in of_runs if figures]
 
 
+def readable(store: Store, keys: Collection[str] | None = None) -> list[Run]:
+    """Every readable run, or those in `keys`, labelled with its key, in the order of storing."""
+    rows = store.rows(report=lambda unreadable: None, keys=keys)
+    runs = [
+        Run(
+            folder.name,
+            folder.name,
+            of_run,
+            cache(partial(store.frames, folder.name)),
+            store.record(folder.name),
+            folder / "pictures",
+        )
+        for key, of_run in rows.groupby("run")
+        if (folder := store.find(str(key)))
+    ]
+    return sorted(runs, key=lambda run: (store.folder / run.key).stat().st_mtime)
+
+
+def load(store: Store, labels: Mapping[str, str]) -> list[Run]:
+    """Load the runs whose keys are in `labels`, in its order.
+
+    Raises SteerbenchError if one is not in the store, or has a schema that cannot be read.
+    """
+    runs = {run.key: run for run in readable(store, labels)}
+    for key in labels:
+        if key not in runs:
+            schema = store.record(key).get("schema_version")
+            raise SteerbenchError(f"{store.folder / key}: {unreadable(schema)}")
+    return [replace(runs[key], label=label) for key, label in labels.items()]
+
+
+def missing_figures(runs: Sequence[Run]) -> list[str]:
+    """Notes about every metric that could not be measured."""
+    notes = (f"{name}: n/a. {why}" for run in runs for name, why in run.record["missing"].items())
+    return list(dict.fromkeys(notes))
+
+
 def over_common_frames(runs: Sequence[Run]) -> list[Run]:
     """The same runs, with steady figures recomputed over the frames that are steady in all of them.
 
-    "All" means the runs that render the same views. A method with memory has fewer steady ones, and
-    the first frames of a path are not typical, so that means over different frames would mislead.
-
-    Runs without steady frames stay unchanged, and so do runs without any common steady frame.
+    "All" are those of the same views. A method with memory has fewer steady frames, and the first
+    frames of a path are not typical: means over different frames would mislead. Runs without steady
+    frames, or without a common one, stay unchanged.
     """
     steady = [set(run.frames.loc[run.frames["phase"] == STEADY, "frame"]) for run in runs]
     common: dict[tuple[object, ...], set[int]] = {}
@@ -184,36 +241,63 @@ def _over(run: Run, kept: Collection[int]) -> Run:
     return replace(run, rows=rows)
 
 
-def load(store: Store, labels: Mapping[str, str]) -> list[Run]:
-    """Load the runs whose keys are in `labels`, in its order.
+def over_scenes(runs: Sequence[Run]) -> Run:
+    """Average runs of different scenes into one run.
 
-    Raises:
-        SteerbenchError: a run is not in the store, or has a schema that cannot be read.
+    Its rows are means of their headline rows, for the metrics that all of them have; its frames are
+    the frames of all. A stage or a work that a run lacks did not occur in it and counts as 0.
     """
-    records = {key: store.record(key) for key in labels}
-    by_run = _rows_by_run(store, labels)
-    for key in labels:
-        if key not in by_run:
-            schema = records[key].get("schema_version")
-            raise SteerbenchError(f"{store.folder / key}: {unreadable(schema)}")
-    return [_run(store, key, label, by_run[key], records[key]) for key, label in labels.items()]
+    if len(runs) == 1:
+        return runs[0]
+    found = pd.concat([run.headline.reset_index() for run in runs])
+    complete = found.groupby("metric")["value"].transform("size") == len(runs)
+    found = found[complete | found["metric"].str.startswith(("stage_ms.", "work."))]
+    rows = found.groupby("metric", sort=False).agg(
+        unit=("unit", "first"),
+        phase=("phase", "first"),
+        value=("value", lambda values: values.sum(skipna=False) / len(runs)),
+        n=("n", "sum"),
+    )
+    names = [name for name in map(str, runs[0].rows) if name not in FIGURES]
+    facts = {name: _joined([run.facts[name] for run in runs]) for name in names}
+    facts["scene"] = f"mean of {', '.join(str(run.facts['scene']) for run in runs)}"
+    key = facts["run"] = content_key({"mean of": [run.key for run in runs]})[:16]
+    rows = rows.reset_index().assign(lo=math.nan, hi=math.nan, **facts)
+    return Run(key, runs[0].label, rows, partial(_frames, runs), _record(runs), runs[0].pictures)
 
 
-def readable(store: Store) -> list[Run]:
-    """Every run that this version can read, labelled with its key, in the order of storing."""
-    by_run = _rows_by_run(store)
-    folders = [folder for folder in map(store.find, by_run) if folder]
-    folders.sort(key=lambda folder: folder.stat().st_mtime)
-    keys = [folder.name for folder in folders]
-    return [_run(store, key, key, by_run[key], store.record(key)) for key in keys]
+def _frames(runs: Sequence[Run]) -> pd.DataFrame:
+    """The frames of all scenes, with the scene's name added to their names."""
+    named = (
+        run.frames.assign(name=f"{run.facts['scene']}/" + run.frames["name"].fillna(""))
+        for run in runs
+    )
+    return pd.concat(named, ignore_index=True)
 
 
-def _run(store: Store, key: str, label: str, rows: pd.DataFrame, record: Mapping[str, Any]) -> Run:
-    frames = cache(partial(store.frames, key))
-    return Run(key, label, rows, frames, record, store.folder / key / "pictures")
+def _record(runs: Sequence[Run]) -> dict[str, Any]:
+    """The record of the first run, with the scenes, machines and missing figures of all."""
+    records = [run.record for run in runs]
+    machines = [record["machine"] for record in records]
+    machine = {name: _joined([of[name] for of in machines]) for name in ("cpu", "threads")}
+    gpus = list(dict.fromkeys(gpu for of in machines for gpu in of["gpus"]))
+    digest = content_key({"mean of": [record["scene"]["digest"] for record in records]})
+    return {
+        **records[0],
+        "machine": {**machines[0], **machine, "gpus": gpus},
+        "scene": {**records[0]["scene"], "digest": digest},
+        "missing": {name: why for record in records for name, why in record["missing"].items()},
+    }
 
 
-def _rows_by_run(store: Store, keys: Collection[str] | None = None) -> dict[str, pd.DataFrame]:
-    """The rows of every readable run, or only of those in `keys`, without a word of others."""
-    rows = store.rows(report=lambda unreadable: None, keys=keys)
-    return {str(run): of_run for run, of_run in rows.groupby("run")}
+def _joined(values: Sequence[Any]) -> Any:
+    """The value if all are equal, otherwise all of them as text."""
+    distinct = list(dict.fromkeys(values))
+    return distinct[0] if len(distinct) == 1 else " / ".join(map(str, distinct))
+
+
+def _listed(values: Mapping[str, Any]) -> str:
+    return ", ".join(
+        f"{name} {' + '.join(value) if isinstance(value, list) else value}"
+        for name, value in values.items()
+    )

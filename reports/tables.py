@@ -1,10 +1,7 @@
 """Tables of text for the terminal and for pages, and the format of figures in them.
 
-Units are dB, milliseconds and MB = 10^6 bytes. Every LPIPS column names its network. A missing
-figure is shown as `n/a`.
-
-The headline figures of a run are those of its steady frames. Cold frames, which have fewer
-preceding frames than the method can use, are listed separately.
+Units are dB, milliseconds and MB = 10^6 bytes. Every LPIPS column names its network. Cold frames,
+which have fewer preceding frames than the method can use, are listed separately.
 """
 
 from __future__ import annotations
@@ -17,7 +14,6 @@ import pandas as pd
 from bench.results import COLD, STEADY
 
 NOT_AVAILABLE = "n/a"
-
 DENSE = ".dense"
 """Suffix of a work counter for the work of a method that skips nothing."""
 
@@ -34,12 +30,10 @@ QUALITY = {
 
 @dataclass(frozen=True)
 class Table:
-    """Lines of text under columns.
+    """Lines of text under columns: a label, then figures, or text if `figures` is False.
 
-    Attributes:
-        columns: the first is a label; the others are figures, or text if `figures` is False.
-        bold: line and column, both from 0, of every bold cell.
-        sources: the keys of the runs behind each line; empty: no line has any.
+    `bold` has line and column, both from 0, of every bold cell; `sources` has the keys of the runs
+    behind each line, or is empty.
     """
 
     title: str
@@ -51,16 +45,12 @@ class Table:
 
     def markdown(self) -> str:
         """The table in GitHub's Markdown, without its title."""
-        rule = ("---", *("---:" if self.figures else "---" for _ in self.columns[1:]))
-        lines = [
-            [self._cell(text, (row, column)) for column, text in enumerate(line)]
-            for row, line in enumerate(self.lines)
-        ]
-        return "\n".join(f"| {' | '.join(line)} |" for line in (self.columns, rule, *lines))
-
-    def _cell(self, text: str, place: tuple[int, int]) -> str:
-        escaped = text.replace("|", "\\|")
-        return f"**{escaped}**" if place in self.bold else escaped
+        rows = [self.columns, ("---", *["---:" if self.figures else "---"] * len(self.columns[1:]))]
+        for row, line in enumerate(self.lines):
+            texts = [text.replace("|", "\\|") for text in line]
+            bold = ((row, column) in self.bold for column in range(len(line)))
+            rows.append(tuple(f"**{x}**" if b else x for x, b in zip(texts, bold, strict=True)))
+        return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
 def spread(low: float, high: float, decimals: int = 1) -> str:
@@ -85,21 +75,13 @@ def share(part: float, whole: float) -> str:
     return f"{decimal(100 * part / whole, 1)} %" if whole else NOT_AVAILABLE
 
 
-def headline(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows of whole runs and of steady frames; of cold frames for runs without steady ones."""
-    steady = set(rows.loc[rows["phase"] == STEADY, "run"])
-    return rows[(rows["phase"] != COLD) | ~rows["run"].isin(steady)]
-
-
 def phases(rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
-    """The rows of one run by phase, steady first, without rows about the whole run."""
-    by_phase = [(phase, rows[rows["phase"] == phase]) for phase in (STEADY, COLD)]
-    return [(phase, of_phase) for phase, of_phase in by_phase if len(of_phase)]
+    """The rows of one run by phase, steady first, without rows about the whole run.
 
-
-def suffix(phase: str) -> str:
-    """Suffix of a label for figures of `phase`; empty for steady frames."""
-    return "" if phase == STEADY else f", {phase}"
+    Each has the suffix of labels for its figures; that of steady frames is empty.
+    """
+    by_phase = {"": rows[rows["phase"] == STEADY], ", cold": rows[rows["phase"] == COLD]}
+    return [(suffix, of_phase) for suffix, of_phase in by_phase.items() if len(of_phase)]
 
 
 def run_tables(rows: pd.DataFrame) -> list[Table]:
@@ -108,46 +90,40 @@ def run_tables(rows: pd.DataFrame) -> list[Table]:
     For pictures that were only scored, there is only quality.
     """
     tables = [
-        table(of_phase, suffix(phase))
-        for phase, of_phase in phases(rows)
+        table(of_phase, suffix)
+        for suffix, of_phase in phases(rows)
         for table in (_quality, _time, _work)
     ]
     return [table for table in (*tables, _memory(rows)) if table.lines]
 
 
-def _values(rows: pd.DataFrame, prefix: str = "", column: str = "value") -> dict[str, float]:
+def _values(rows: pd.DataFrame, prefix: str = "") -> dict[str, float]:
     """Figures of one run by metric, for metrics with `prefix`, which is removed from the names."""
-    return {
-        metric.removeprefix(prefix): figure
-        for metric, figure in zip(rows["metric"], rows[column], strict=True)
-        if metric.startswith(prefix)
-    }
+    some = rows[rows["metric"].str.startswith(prefix)]
+    return dict(zip(some["metric"].str.removeprefix(prefix), some["value"], strict=True))
 
 
 def _quality(rows: pd.DataFrame, suffix: str) -> Table:
-    value, low, high, frames = (_values(rows, column=name) for name in ("value", "lo", "hi", "n"))
+    figures = rows.set_index("metric")
     lines = []
     for metric, (label, decimals) in QUALITY.items():
-        if metric in value:
-            ends = low[metric], high[metric]
-            interval = spread(*ends, decimals) if math.isfinite(ends[0]) else ""
-            lines.append((label, decimal(value[metric], decimals), interval))
-    title = f"Quality{suffix}, mean of {frames['psnr']} frames"
+        if metric in figures.index:
+            value, low, high = figures.loc[metric, ["value", "lo", "hi"]]
+            interval = spread(low, high, decimals) if math.isfinite(low) else ""
+            lines.append((label, decimal(value, decimals), interval))
+    title = f"Quality{suffix}, mean of {figures['n']['psnr']} frames"
     return Table(title, ("metric", "mean", "95 % interval"), tuple(lines))
 
 
 def _time(rows: pd.DataFrame, suffix: str) -> Table:
     value, stages = _values(rows), _values(rows, "stage_ms.")
-    if "frame_ms" not in value:
-        return Table("Time", (), ())
-    total = value["frame_ms"]
-    lines = [(name, decimal(ms, 2), share(ms, total)) for name, ms in stages.items()]
-    lines.append(("frame", decimal(total, 2), share(sum(stages.values()), total)))
-    lines += [
-        (f"frame, {quantile}", decimal(value[f"frame_ms.{quantile}"], 2), "")
-        for quantile in ("p50", "p95", "p99")
-    ]
-    lines.append(("FPS", decimal(value["fps"], 2), ""))
+    lines = []
+    if total := value.get("frame_ms"):
+        lines = [(name, decimal(ms, 2), share(ms, total)) for name, ms in stages.items()]
+        lines.append(("frame", decimal(total, 2), share(sum(stages.values()), total)))
+        for each in ("p50", "p95", "p99"):
+            lines.append((f"frame, {each}", decimal(value[f"frame_ms.{each}"], 2), ""))
+        lines.append(("FPS", decimal(value["fps"], 2), ""))
     return Table(f"Time of a frame{suffix}", ("stage", "mean ms", "share"), tuple(lines))
 
 
@@ -166,9 +142,8 @@ def _work(rows: pd.DataFrame, suffix: str) -> Table:
 
 def _memory(rows: pd.DataFrame) -> Table:
     sizes = _values(rows, "size_bytes.")
-    if not sizes:
-        return Table("Memory", (), ())
-    sizes["model"] = sizes.pop("total")
-    sizes["peak, rendering"] = _values(rows)["peak_bytes"]
+    if sizes:
+        sizes["model"] = sizes.pop("total")
+        sizes["peak, rendering"] = _values(rows)["peak_bytes"]
     lines = tuple((name, megabytes(size)) for name, size in sizes.items())
     return Table("Memory", ("component", "MB"), lines)

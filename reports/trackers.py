@@ -1,8 +1,7 @@
 """Sends a run of the store to an experiment tracker, under the run's key.
 
-There is one function per tracker. Each sends the figures of every frame as a series, the headline
-figures as a summary, the pictures and the provenance. A run already sent under the same key is
-replaced or kept.
+Each tracker gets the figures of every frame as a series, the headline figures as a summary, the
+pictures and the provenance. A run already sent under the same key is replaced or kept.
 """
 
 from __future__ import annotations
@@ -18,9 +17,6 @@ from PIL import Image
 from bench.errors import SteerbenchError, Unavailable, install_command
 from reports.runs import Run
 
-PROJECT = "steerbench"
-"""The name of the project or experiment in a tracker."""
-
 FACTS = ("method", "scene", "resolution", "trajectory", "budget", "protocol", "seed", "device")
 """Columns of the rows that say what was measured."""
 
@@ -31,7 +27,7 @@ def to_wandb(run: Run, outputs: Path) -> None:
 
     facts = settings(run)
     begun = wandb.init(
-        project=PROJECT, id=run.key, name=run.label, config=facts, dir=outputs, resume="allow"
+        project="steerbench", id=run.key, name=run.label, config=facts, dir=outputs, resume="allow"
     )
     with begun as sent:
         for frame, figures in series(run):
@@ -60,20 +56,12 @@ def to_tensorboard(run: Run, outputs: Path) -> None:
                 writer.add_image(name, np.asarray(image.convert("RGB")), dataformats="HWC")
 
 
-TRACKERS: dict[str, Callable[[Run, Path], None]] = {
-    "wandb": to_wandb,
-    "tensorboard": to_tensorboard,
-}
+TRACKERS = {"wandb": to_wandb, "tensorboard": to_tensorboard}
 """What sends a run from the store in the folder `outputs`, by the tracker's name and package."""
 
 
 def tracker(name: str) -> Callable[[Run, Path], None]:
-    """What sends a run to the tracker called `name`.
-
-    Raises:
-        SteerbenchError: there is no such tracker.
-        Unavailable: its package is not installed.
-    """
+    """What sends a run to the tracker called `name`; raises if it is unknown or not installed."""
     if name not in TRACKERS:
         raise SteerbenchError(f"tracker: expected one of {', '.join(TRACKERS)}, got {name!r}")
     if find_spec(name) is None:

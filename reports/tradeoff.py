@@ -15,7 +15,7 @@ from bench.errors import explained
 from bench.provenance import commit, machine
 from bench.sharing import whole
 from reports.figures import frontier_plot
-from reports.parts import Part, Plot
+from reports.images import Part, Picture
 from reports.publish import publish
 from reports.tables import Table, decimal, spread
 
@@ -32,14 +32,21 @@ ON_FRONTIER = "— (frontier)"
 
 def experiment_table(rows: Sequence[Row]) -> Table:
     """A table of all settings of all experiments; first lines show the observed order."""
-    lines = []
+    lines: list[tuple[str, ...]] = []
     for subject, some in groupby(rows, lambda row: row["subject"]):
-        for number, row in enumerate(some):
-            first = (subject, row["knob"], _order(row)) if number == 0 else ("", "", "")
-            figures = (_setting(row["setting"]), f"{row['error']:.1e}", decimal(row["ms"], 2))
-            lines.append((*first[:2], *figures, first[2]))
+        first, *others = some
+        order = ""
+        if first["order"] is not None:
+            ends = f"{_setting(first['order_from'])} to {_setting(first['order_to'])}"
+            order = f"{first['order']:.2f} ({ends})"
+        lines.append((subject, first["knob"], *_trial(first), order))
+        lines += [("", "", *_trial(row), "") for row in others]
     title = "Kernels: run time against error, where the exact answer is known"
     return Table(title, EXPERIMENTS, tuple(lines))
+
+
+def _trial(row: Row) -> tuple[str, str, str]:
+    return _setting(row["setting"]), f"{row['error']:.1e}", decimal(row["ms"], 2)
 
 
 def setting_table(rows: Sequence[Row]) -> Table:
@@ -58,9 +65,8 @@ def setting_table(rows: Sequence[Row]) -> Table:
     )
     bold = frozenset((line, 0) for line, text in enumerate(lines) if text[-1] == ON_FRONTIER)
     where = ", ".join(str(rows[0][name]) for name in ("scene", "trajectory", "resolution"))
-    return Table(
-        f"Settings: run time against error of a frame, {where}", SETTINGS, lines, bold=bold
-    )
+    title = f"Settings: run time against error of a frame, {where}"
+    return Table(title, SETTINGS, lines, bold=bold)
 
 
 def write_tradeoff(
@@ -68,35 +74,24 @@ def write_tradeoff(
 ) -> Path:
     """Write `folder/report.md` and `report.html`, with the plot and all rows as CSV beside them.
 
-    Returns the path of report.md.
-
-    Args:
-        experiments: rows of kernels, for `experiment_table`.
-        settings: rows of methods, for `setting_table` and `frontier_plot`; if empty, both are left
-            out.
-        command: the command line.
-
-    Raises:
-        SteerbenchError: `folder` cannot be written to.
+    `experiments` are rows of kernels; `settings` are rows of methods, and may be missing. Returns
+    the path of report.md; raises SteerbenchError if `folder` cannot be written to.
     """
     tables = [experiment_table(experiments)]
+    made = f"```sh\n{command}\n```\n\nCommit {commit()}, {machine()['cpu']}."
+    parts: list[Part] = ["# Run time against error", made]
+    if settings:
+        shows = "Error of a frame against its time, one point a setting"
+        parts.append(Picture("frontier", shows, partial(frontier_plot, settings)))
+        tables.insert(0, setting_table(settings))
+    parts += [part for table in tables for part in (f"## {table.title}", table)]
     with explained(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        _write_csv(experiments, folder / "kernels.csv")
-        made = f"```sh\n{command}\n```\n\nCommit {commit()}, {machine()['cpu']}."
-        parts: list[Part] = ["# Run time against error", made]
-        if settings:
-            _write_csv(settings, folder / "settings.csv")
-            shows = "Error of a frame against its time, one point a setting"
-            parts.append(Plot("frontier", shows, partial(frontier_plot, settings)))
-            tables.insert(0, setting_table(settings))
-    parts += [part for table in tables for part in (f"## {table.title}", table)]
+        for name, rows in (("kernels", experiments), ("settings", settings)):
+            if rows:
+                with whole(folder / f"{name}.csv") as new:
+                    pd.DataFrame(rows).to_csv(new, index=False)
     return publish(parts, folder)
-
-
-def _write_csv(rows: Sequence[Row], path: Path) -> None:
-    with whole(path) as new:
-        pd.DataFrame(rows).to_csv(new, index=False)
 
 
 def _setting(value: float | str) -> str:
@@ -106,9 +101,3 @@ def _setting(value: float | str) -> str:
     if 0 < value < 1 and math.frexp(value)[0] == 0.5:
         return f"1/{1 / value:.0f}"
     return f"{value:g}"
-
-
-def _order(row: Row) -> str:
-    if row["order"] is None:
-        return ""
-    return f"{row['order']:.2f} ({_setting(row['order_from'])} to {_setting(row['order_to'])})"

@@ -11,7 +11,7 @@ import numpy as np
 
 from bench.intervals import half_interval, path_interval
 from reports.comparison import Write, metric_format
-from reports.regression import LIMITS, Figures
+from reports.regression import LIMITS, Figures, frames_apart
 from reports.runs import Repeated
 from reports.tables import Table
 
@@ -19,8 +19,6 @@ HOLDS, FAILS, OPEN = "holds", "does not hold", "cannot be told"
 SMALLER = "smaller than in the paper"
 SEEN, REVERSED = "agrees, by one seed", "opposite, by one seed"
 """Verdicts from the frames of one seed; another training may reverse them."""
-
-COMPUTED = "computed, not sampled"
 
 
 @dataclass(frozen=True)
@@ -35,12 +33,9 @@ class Trend:
 class Difference:
     """The growth of a metric from one line of a trend to the next.
 
-    Attributes:
-        paper: the difference in the paper; nan if the paper does not give both figures.
-        by: the mean difference here.
-        half: half its 95 % interval; nan if unknown.
-        over: the samples that `by` averages, in words.
-        proves: whether the interval accounts for differences between trainings.
+    `paper` is that in the paper (nan if the paper does not give both figures), `by` the mean here,
+    over what `over` says, and `half` half its 95 % interval (nan if unknown). `proves` says whether
+    the interval accounts for differences between trainings.
     """
 
     metric: str
@@ -66,19 +61,13 @@ class Difference:
 def differences(
     trend: Trend, lines: Mapping[str, Repeated], published: Mapping[str, Mapping[str, float]]
 ) -> Iterator[Difference]:
-    """Every difference of `trend` between two measured lines.
-
-    Args:
-        lines: the measured lines, by label.
-        published: the paper's figures, by label and metric.
-    """
+    """Every difference of `trend` between two measured `lines`; in the paper: `published`."""
     for smaller, larger in pairwise(trend.rising):
         one, other = lines.get(smaller), lines.get(larger)
         here = _growth(one, other, trend.metric) if one and other else None
         if here is not None:
-            below, above = (
-                published.get(label, {}).get(trend.metric, math.nan) for label in (smaller, larger)
-            )
+            figures = (published.get(label, {}) for label in (smaller, larger))
+            below, above = (figure.get(trend.metric, math.nan) for figure in figures)
             yield Difference(trend.metric, smaller, larger, above - below, *here)
 
 
@@ -87,7 +76,7 @@ def _growth(one: Repeated, other: Repeated, metric: str) -> tuple[float, float, 
 
     With several seeds, a pair has the same seed; with one seed, a pair is the same frame.
     """
-    anywhere = not (metric in LIMITS and LIMITS[metric].here)
+    here = metric in LIMITS and LIMITS[metric].here
     pairs = [
         (run, twin)
         for run in one.runs
@@ -95,18 +84,17 @@ def _growth(one: Repeated, other: Repeated, metric: str) -> tuple[float, float, 
         if run.facts["seed"] == twin.facts["seed"]
         and metric in run.values
         and metric in twin.values
-        and (anywhere or run.computer == twin.computer)
+        and (not here or run.computer == twin.computer)
     ]
     if not pairs:
         return None
     by_seed = np.array([twin.values[metric] - run.values[metric] for run, twin in pairs])
     by = float(by_seed.mean())
     if metric.startswith("size_bytes"):
-        return by, 0.0, COMPUTED, True
+        return by, 0.0, "computed, not sampled", True
     if len(pairs) > 1:
         return by, half_interval(by_seed), f"{len(pairs)} seeds", True
-    frames, others = (Figures.of(run).frames.get(metric, {}) for run in pairs[0])
-    by_frame = np.array([others[name] - frames[name] for name in frames if name in others])
+    by_frame = frames_apart(metric, *map(Figures.of, pairs[0]))
     if len(by_frame) > 1:
         over = f"{len(by_frame)} frames of one seed"
         return float(by_frame.mean()), path_interval(by_frame), over, False
@@ -115,21 +103,17 @@ def _growth(one: Repeated, other: Repeated, metric: str) -> tuple[float, float, 
 
 def trend_table(differences: Sequence[Difference]) -> Table:
     """A table of `differences`, one line each."""
+    lines = []
+    for each in differences:
+        label, write = metric_format(each.metric)
+        half = f" ± {write(each.half)}" if each.half > 0 else ""
+        name = f"{label.rstrip(' ↑↓')}: {each.smaller} < {each.larger}"
+        paper = "" if math.isnan(each.paper) else signed(each.paper, write)
+        lines.append((name, paper, signed(each.by, write) + half, each.over, each.verdict))
     columns = ("difference", "paper", "here", "over", "verdict")
-    return Table("Trends", columns, tuple(map(_line, differences)))
+    return Table("Trends", columns, tuple(lines))
 
 
-def _line(each: Difference) -> tuple[str, ...]:
-    label, write = metric_format(each.metric)
-    half = f" ± {write(each.half)}" if each.half > 0 else ""
-    return (
-        f"{label.rstrip(' ↑↓')}: {each.smaller} < {each.larger}",
-        "" if math.isnan(each.paper) else _signed(each.paper, write),
-        _signed(each.by, write) + half,
-        each.over,
-        each.verdict,
-    )
-
-
-def _signed(by: float, write: Write) -> str:
+def signed(by: float, write: Write) -> str:
+    """A difference with its sign."""
     return ("-" if by < 0 else "+") + write(abs(by))

@@ -9,8 +9,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from bench.results import Store
-from reports.runs import Repeated, Run, over_common_frames, readable
-from reports.scenes import over_scenes
+from reports.runs import Repeated, Run, over_common_frames, over_scenes, readable
 from sweeps import failures
 from sweeps.configured import scene_digest, scene_folder
 from sweeps.identity import job_key

@@ -80,14 +80,14 @@ class GpuTensor(Tensor):
 
     def backward(self, *args: Any, **kwargs: Any) -> None:
         """Outside of `__torch_function__`: what Python makes on the way is not made by C++."""
-        with _gpu.differentiating():
+        _gpu.differentiating = True
+        try:
             torch.autograd.backward(self, *args, **kwargs)
+        finally:
+            _gpu.differentiating = False
 
     def numpy(self, *args: object, **kwargs: object) -> Any:
-        raise TypeError(
-            "can't convert cuda:0 device type tensor to numpy. Use Tensor.cpu() to copy the tensor "
-            "to host memory first."
-        )
+        raise TypeError("can't convert cuda:0 device type tensor to numpy")
 
     __array__ = numpy
 
@@ -140,16 +140,7 @@ class PretendedGpu(TorchDispatchMode):
         self.sync_debug_mode = self.waited = 0
         self.graph: Graph | None = None
         self.inside = False  # a function that works on the GPU: what C++ makes belongs there
-        self._differentiating = False  # the same of C++ alone, but not of Python that it calls
-
-    @contextmanager
-    def differentiating(self) -> Iterator[None]:
-        """A backward pass."""
-        self._differentiating = True
-        try:
-            yield
-        finally:
-            self._differentiating = False
+        self.differentiating = False  # the same of C++ alone, but not of Python that it calls
 
     @contextmanager
     def capturing(self, graph: Graph, **options: object) -> Iterator[None]:
@@ -165,16 +156,12 @@ class PretendedGpu(TorchDispatchMode):
         self.waited += 1
         if self.graph is not None:
             raise RuntimeError("CUDA error: operation not permitted when stream is capturing")
+        message = "called a synchronizing CUDA operation"
         if self.sync_debug_mode == 2:
-            raise RuntimeError("called a synchronizing CUDA operation")
+            raise RuntimeError(message)
         if self.sync_debug_mode == 1:
             frame = _caller(TORCH)
-            warnings.warn_explicit(
-                "called a synchronizing CUDA operation",
-                UserWarning,
-                frame.f_code.co_filename,
-                frame.f_lineno,
-            )
+            warnings.warn_explicit(message, UserWarning, frame.f_code.co_filename, frame.f_lineno)
 
     def moved(self, tensor: Tensor, device: torch.device, waits: bool = True) -> Tensor:
         """A copy of `tensor` on the other device."""
@@ -193,7 +180,9 @@ class PretendedGpu(TorchDispatchMode):
         if ours:
             others = [x for x in tensors if not isinstance(x, GpuTensor)]
             self._refuse_or_wait(func, args, kwargs, others)
-        self._check_generator(kwargs.get("generator"), on_gpu)
+        generator = kwargs.get("generator")
+        if generator is not None and (generator._cdata in self.generators) != on_gpu:
+            raise RuntimeError("the random numbers and their generator are on two devices")
         if _kind(kwargs.get("device")) == "cuda":
             kwargs = {**kwargs, "device": CPU}
         inputs = {id(_held(x)): x for x in tensors}
@@ -214,12 +203,8 @@ class PretendedGpu(TorchDispatchMode):
         if _kind(device) != "cpu":
             return bool(ours) if device is None else _kind(device) == "cuda"
         # Python asks for the CPU where it says nothing, C++ where it saw the tensors that we hold.
-        inside = self.inside or (self._differentiating and _caller().f_code.co_filename == AUTOGRAD)
+        inside = self.inside or (self.differentiating and _caller().f_code.co_filename == AUTOGRAD)
         return inside and (bool(ours) or not tensors)
-
-    def _check_generator(self, generator: torch.Generator | None, on_gpu: bool) -> None:
-        if generator is not None and (generator._cdata in self.generators) != on_gpu:
-            raise RuntimeError("the random numbers and their generator are on two devices")
 
     def _refuse_or_wait(self, func: Any, args: Any, kwargs: Any, others: list[Tensor]) -> None:
         """What an operation of our tensors does with `others`, of the CPU, and for the host."""
@@ -238,10 +223,7 @@ class PretendedGpu(TorchDispatchMode):
             others = self._wait_for_indices(args, others)
         changed = func._schema.is_mutable and isinstance(first, Tensor) and _held(first) is first
         if changed or any(x.dim() or name in ("cat", "stack") for x in others):
-            raise RuntimeError(
-                "Expected all tensors to be on the same device, but found at least two devices, "
-                f"cuda:0 and cpu! (when computing {func})"
-            )
+            raise RuntimeError(f"Expected all tensors to be on the same device: {func}")
         return None
 
     def _wait_for_indices(self, args: Any, others: list[Tensor]) -> list[Tensor]:
@@ -303,15 +285,7 @@ def pretended_gpu() -> Iterator[PretendedGpu]:
     with pytest.MonkeyPatch.context() as patch:
         for name, what in _of_torch_cuda(_gpu).items():
             patch.setattr(torch.cuda, name, what)
-        for name, what in _of_tensors(_gpu).items():
-            patch.setattr(Tensor, name, what)
-        patch.setattr(torch, "tensor", _tensor(torch.tensor))
-        patch.setattr(torch, "Generator", _generator(_gpu))
-        # So that a module moves to the GPU and back in place, as it does on a real one.
-        patch.setattr(torch.__future__, "get_swap_module_params_on_conversion", lambda: True)
-        patch.setattr(torch.autocast, "__init__", _autocast(torch.autocast.__init__))
-        groups = "_group_tensors_by_device_and_dtype"
-        patch.setattr(clip_grad, groups, _grouped(getattr(clip_grad, groups)))
+        _patch_torch(patch, _gpu)
         _patch_triton(patch)
         for cached in (availability, multiplies_bf16):
             cached.cache_clear()
@@ -349,8 +323,10 @@ def _of_torch_cuda(gpu: PretendedGpu) -> dict[str, Any]:
     }
 
 
-def _of_tensors(gpu: PretendedGpu) -> dict[str, Any]:
-    convert = Tensor.to
+def _patch_torch(patch: pytest.MonkeyPatch, gpu: PretendedGpu) -> None:
+    """What makes and moves tensors, and what asks C++, which sees the CPU, for their device."""
+    convert, make, lower = Tensor.to, torch.tensor, torch.autocast.__init__
+    group = clip_grad._group_tensors_by_device_and_dtype
 
     def to(self, *args, copy=False, **kwargs):
         if args and isinstance(args[0], Tensor):
@@ -362,23 +338,11 @@ def _of_tensors(gpu: PretendedGpu) -> dict[str, Any]:
             return new if device is None or device.type != "meta" else convert(new, device)
         return gpu.moved(new, device, waits=not non_blocking)
 
-    return {
-        "to": to,
-        "cuda": lambda self, *args, **kwargs: self.to(GPU),
-        "cpu": lambda self, *args, **kwargs: self.to(CPU),
-    }
-
-
-def _tensor(make: Callable[..., Tensor]) -> Callable[..., Tensor]:
     def tensor(data, *, device=None, **kwargs):
         if _kind(device) == "cuda":
             return make(data, **kwargs).to(GPU)
         return make(data, device=device, **kwargs)
 
-    return tensor
-
-
-def _generator(gpu: PretendedGpu) -> type:
     class Generator(torch.Generator):
         device = property(lambda self: GPU if self._cdata in gpu.generators else CPU)
 
@@ -388,26 +352,21 @@ def _generator(gpu: PretendedGpu) -> type:
                 gpu.generators[new._cdata] = new
             return new
 
-    return Generator
-
-
-def _autocast(begin: Callable[..., None]) -> Callable[..., None]:
-    """C++, which sees the CPU, lowers what it would lower there."""
-
-    def init(self, device_type, *args, **kwargs):
-        begin(self, "cpu", *args, **kwargs)
-
-    return init
-
-
-def _grouped(group: Callable[..., dict]) -> Callable[..., dict]:
-    """C++, which sees the CPU, would say that the gradients to be clipped are there."""
+    def autocast(self, device_type, *args, **kwargs):
+        lower(self, "cpu", *args, **kwargs)
 
     def grouped(*args):
-        found = group(*args)
-        return {(x[0][0][0].device, dtype): x for (_, dtype), x in found.items()}
+        return {(x[0][0][0].device, dtype): x for (_, dtype), x in group(*args).items()}
 
-    return grouped
+    patch.setattr(Tensor, "to", to)
+    patch.setattr(Tensor, "cuda", lambda self, *args, **kwargs: self.to(GPU))
+    patch.setattr(Tensor, "cpu", lambda self, *args, **kwargs: self.to(CPU))
+    patch.setattr(torch, "tensor", tensor)
+    patch.setattr(torch, "Generator", Generator)
+    # So that a module moves to the GPU and back in place, as it does on a real one.
+    patch.setattr(torch.__future__, "get_swap_module_params_on_conversion", lambda: True)
+    patch.setattr(torch.autocast, "__init__", autocast)
+    patch.setattr(clip_grad, "_group_tensors_by_device_and_dtype", grouped)
 
 
 def _patch_triton(patch: pytest.MonkeyPatch) -> None:

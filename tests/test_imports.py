@@ -27,21 +27,16 @@ REACHES = {
 """What measures and lists parts of methods reaches them directly; methods only through
 `_target_`."""
 
+FIELD = {"kernels", "rendering", "training", "instant_ngp"}
 STANDS_ON = {
     "kernels": set(),
-    "engines": {"kernels"},
-    "rendering": {"kernels"},
-    "training": {"kernels"},
+    **{name: {"kernels"} for name in ("engines", "rendering", "training")},
     "instant_ngp": {"kernels", "rendering", "training"},
-    "gaussians": {"kernels", "rendering", "training", "instant_ngp"},
-    "students": {"kernels", "rendering", "training", "instant_ngp"},
-    "nerf": {"kernels", "rendering", "training", "instant_ngp", "students"},
-    "nsvf": {"kernels", "rendering", "training", "instant_ngp", "students"},
-    "kilonerf": {"kernels", "rendering", "training", "instant_ngp", "students"},
-    "plenoctree": {"kernels", "rendering", "training", "instant_ngp", "students"},
-    "diver": {"kernels", "rendering", "training", "instant_ngp", "students"},
-    "steernerf": {"kernels", "engines", "rendering", "training", "instant_ngp"},
-    "steernerf_lean": {"kernels", "engines", "rendering", "training", "instant_ngp", "steernerf"},
+    "gaussians": FIELD,
+    "students": FIELD,
+    **{name: {*FIELD, "students"} for name in ("nerf", "nsvf", "kilonerf", "plenoctree", "diver")},
+    "steernerf": {*FIELD, "engines"},
+    "steernerf_lean": {*FIELD, "engines", "steernerf"},
 }
 """The folders of `methods` from which each may import, beside itself; `methods/checks.py` stands
 above them all."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from functools import partial
 
 import torch
 
@@ -29,14 +29,7 @@ from methods.steernerf_lean.options import LeanJointOptions, LeanRendering, Lean
 from methods.steernerf_lean.pipeline import LeanPipeline
 
 SMALL_GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=16)
-MODEL = Model(
-    channels=4,
-    frames=2,
-    scale=4,
-    step=8.0,
-    stop=STOP,
-    feature_background=0.5,
-)
+MODEL = Model(channels=4, frames=2, scale=4, step=8.0, stop=STOP, feature_background=0.5)
 RENDERING = Rendering(8.0, STOP, EVERYWHERE, Skips(empty=True, hidden=True))
 MOTION = MotionOptions(degrees=(0.0, 2.5), length=4, least=0, pool=12, uses=16, longer=0.75)
 JOINT = JointOptions(
@@ -58,49 +51,30 @@ JOINT = JointOptions(
 )
 
 
-def small_model(**others: Any) -> Model:
-    """K = 4, L = 2, s = 4, long steps; `others` replace fields."""
-    return replace(MODEL, **others)
+small_model = partial(replace, MODEL)
+"""K = 4, L = 2, s = 4, long steps; options replace fields, here and below."""
 
+small_rendering = partial(replace, RENDERING)
+"""As `small_model()` is trained."""
 
-def small_rendering(**others: Any) -> Rendering:
-    """As `small_model()` is trained; `others` replace fields."""
-    return replace(RENDERING, **others)
+small_motion = partial(replace, MOTION)
+"""0 to 4 frames before a view."""
 
+small_joint = partial(replace, JOINT)
+"""Two patches of at most 32 x 32 a step."""
 
-def small_motion(**others: Any) -> MotionOptions:
-    """0 to 4 frames before a view; `others` replace fields."""
-    return replace(MOTION, **others)
+lean_model = partial(replace, MODEL, frames=1)
+"""K = 4, L = 1, s = 4, long steps."""
 
+LEAN_SKIPS = LeanSkips(empty=True, hidden=True, background=True)
+LEAN_RENDERING = {"skip": LEAN_SKIPS, "overlap": 0.0, "refined": 0.0, "refined_step": 1.0}
+lean_rendering = partial(replace, LeanRendering(**vars(RENDERING) | LEAN_RENDERING))
+"""As `lean_model()` is trained, but without refinement."""
 
-def small_joint(**others: Any) -> JointOptions:
-    """Two patches of at most 32 x 32 a step; `others` replace fields."""
-    return replace(JOINT, **others)
-
-
-def lean_model(**others: Any) -> Model:
-    """K = 4, L = 1, s = 4, long steps; `others` replace fields."""
-    return replace(MODEL, **{"frames": 1} | others)
-
-
-def lean_rendering(**others: Any) -> LeanRendering:
-    """As `lean_model()` is trained, but without refinement; `others` replace fields."""
-    skip = LeanSkips(empty=True, hidden=True, background=True)
-    own = {"skip": skip, "overlap": 0.0, "refined": 0.0, "refined_step": 1.0}
-    return replace(LeanRendering(**vars(RENDERING) | own), **others)
-
-
-def lean_joint(**others: Any) -> LeanJointOptions:
-    """Two patches a step, refinement with steps of 2; `others` replace fields."""
-    own = {
-        "error_weight": 1e-4,
-        "refined": 0.2,
-        "refined_step": 2.0,
-        "refined_rays": 2048,
-        "clip": 1.0,
-        "average": 0.999,
-    }
-    return replace(LeanJointOptions(**vars(JOINT) | own), **others)
+REFINED = {"refined": 0.2, "refined_step": 2.0, "refined_rays": 2048}
+LEAN_JOINT = {**REFINED, "error_weight": 1e-4, "clip": 1.0, "average": 0.999}
+lean_joint = partial(replace, LeanJointOptions(**vars(JOINT) | LEAN_JOINT))
+"""Two patches a step, refinement with steps of 2."""
 
 
 def shell() -> Occupancy:

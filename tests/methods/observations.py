@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -132,8 +132,8 @@ def doubled(observation: AnyObservation) -> AnyObservation:
     """In float64, for the backend that takes it."""
 
     def twice(part):
-        if isinstance(part, Tensor):
-            return part.double() if part.is_floating_point() else part
+        if isinstance(part, Tensor) and part.is_floating_point():
+            return part.double()
         if isinstance(part, list):
             return [twice(one) for one in part]
         if isinstance(part, tuple):
@@ -154,14 +154,10 @@ def cut(observation: LeanObservation, rows: slice, columns: slice) -> LeanObserv
     def inside(part: Tensor, otherwise: float = 0) -> Tensor:
         return everywhere(part, observation, otherwise)[rows, columns].flatten(0, 1)[cells]
 
+    values, depth = frame.values[rows, columns], frame.depth[rows, columns]
     return replace(
         observation,
-        frame=replace(
-            frame,
-            values=frame.values[rows, columns],
-            depth=frame.depth[rows, columns],
-            alpha=alpha,
-        ),
+        frame=replace(frame, values=values, depth=depth, alpha=alpha),
         cells=cells,
         history=history and (inside(history[0]), inside(history[1])),
         surface=replace(surface, index=inside(surface.index, -1)),
@@ -187,11 +183,11 @@ def features_of(observation: Observation | LeanObservation) -> Iterator[Tensor]:
 
 
 def new_renderer(
-    channels: int = 6, scale: int = 4, *, history: bool = True, width: int = 16, blocks: int = 2
+    channels: int = 6, scale: int = 4, *, history: bool = True, **others: Any
 ) -> LeanRenderer:
-    """An untrained lean renderer."""
-    size = channels, int(history), scale
-    return LeanRenderer(*size, width=width, blocks=blocks, init="scratch")
+    """An untrained lean renderer; `others` replace options."""
+    options = {"width": 16, "blocks": 2, "init": "scratch"} | others
+    return LeanRenderer(channels, int(history), scale, **options)
 
 
 def to_picture(blocks: Tensor, scale: int) -> Tensor:
@@ -201,15 +197,11 @@ def to_picture(blocks: Tensor, scale: int) -> Tensor:
     return parts.reshape(height * scale, width * scale, channels)
 
 
-def shown_by(points: Points) -> tuple[Tensor, Tensor]:
-    """[..., C] and [...]: what each pixel shows, and whether."""
-    return points.values[points.index.clamp(min=0).long()], (points.index >= 0).to(points.values)
-
-
 def at_surface(observation: LeanObservation, scale: int) -> tuple[Tensor, Tensor]:
     """[H, W, K + 1] and [H, W]: what each pixel shows of the surface, and whether."""
-    parts = shown_by(observation.surface)
-    values, known = (everywhere(part, observation) for part in parts)
+    points, index = observation.surface.values, observation.surface.index
+    shown = points[index.clamp(min=0).long()], (index >= 0).to(points)
+    values, known = (everywhere(part, observation) for part in shown)
     return to_picture(values, scale), to_picture(known[..., None], scale)[..., 0]
 
 

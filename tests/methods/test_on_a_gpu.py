@@ -69,15 +69,15 @@ from tests.methods.trainings import killed
 from tests.pretended_gpu import PretendedGpu, pretended_gpu
 
 pytestmark = pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+needs_triton = pytest.mark.skipif(
+    bool(availability()["gpu"]), reason="Triton has no build for this platform"
+)
 
 BUDGET = Budget("test", steps=4, samples=512, renderer_steps=2)
 GRID = HashGrid(levels=4, log2_table=10, n_min=4, n_max=32)
 STAGE1 = TrainingOptions(march_step=8.0, grid_samples=4096, max_rays=64)
 MOTION = small_motion(pool=1, length=2, least=2, uses=3, longer=0.0)
 FEW: dict[str, Any] = {"batch": 1, "patch": 4, "distilled_views": 1, "motion": MOTION}
-
-
-EXPECTED = RangeReduction("paper", 0.03, "expected")
 
 
 def steernerf(field: str, **others: Any) -> Method:
@@ -95,11 +95,12 @@ def steernerf(field: str, **others: Any) -> Method:
 
 
 def steernerf_lean(**where: Any) -> Method:
+    reduction = RangeReduction("paper", 0.03, "expected")
     return SteerNerfLean(
         grid=GRID,
         training=STAGE1,
         model=lean_model(),
-        rendering=lean_rendering(range=EXPECTED, refined=0.1, overlap=0.1),
+        rendering=lean_rendering(range=reduction, refined=0.1, overlap=0.1),
         renderer=partial(LeanRenderer, width=8, blocks=1, init="scratch"),
         joint=lean_joint(refined=0.1, refined_rays=64, **FEW),
         engine=TorchEngine(),
@@ -112,10 +113,6 @@ def student(make: Callable[..., Method], device: str, backend: str, **options: A
     return make(teacher=teacher, **options)
 
 
-def gaussians(**where: Any) -> GaussianSplatting:
-    return GaussianSplatting(grid=GRID, training=STAGE1, count=40, fitting=Fitting(), **where)
-
-
 NETWORK = FieldLessons(max_rays=64)
 EXTRACTION = Extraction(resolution=128, degree=1, rays=200, points=1, directions=4)
 METHODS: Mapping[str, Callable[..., Method]] = {
@@ -123,7 +120,9 @@ METHODS: Mapping[str, Callable[..., Method]] = {
     "steernerf": partial(steernerf, "joint"),
     "steernerf, frozen": partial(steernerf, "frozen"),
     "steernerf_lean": steernerf_lean,
-    "gaussians": gaussians,
+    "gaussians": partial(
+        GaussianSplatting, grid=GRID, training=STAGE1, count=40, fitting=Fitting()
+    ),
     "plenoctree": partial(
         student, PlenOctree, extraction=EXTRACTION, training=OctreeLessons(samples=512)
     ),
@@ -140,7 +139,7 @@ def fitted(name: str, device: str, scene: Scene, folder: Path) -> Method:
     """On a GPU with the usual backend, which is the reference there."""
     backend = "auto" if device == "cuda" else "reference"
     method = METHODS[name](device=device, backend=backend)
-    method.fit(scene, BUDGET, ConsoleLog(folder, quiet=True))
+    method.fit(scene, BUDGET, ConsoleLog(folder / device, quiet=True))
     return method
 
 
@@ -151,15 +150,17 @@ def frames(method: Method, scene: Scene) -> list[torch.Tensor]:
     return [part.cpu() for x in found for part in (x.rgb, x.depth, x.alpha)]
 
 
-def equal(some: list[torch.Tensor], others: list[torch.Tensor]) -> bool:
-    return all(torch.equal(x, y) for x, y in zip(some, others, strict=True))
+def here_and_there(compute: Callable[[str], Any]) -> tuple[Any, Any]:
+    """What `compute` returns for the CPU, and for the pretended GPU."""
+    here = compute("cpu")
+    with pretended_gpu():
+        return here, compute("cuda")
 
 
-def alike(some: list[torch.Tensor], others: list[torch.Tensor]) -> bool:
-    """Whether all numbers differ by no more than a few roundings of values up to 1. On a CPU with
-    AVX-512 colours differed in the last bit; which operation rounds in another way is not known."""
-    pairs = zip(some, others, strict=True)
-    return all(torch.allclose(x, y, rtol=0, atol=1e-6, equal_nan=True) for x, y in pairs)
+assert_equal = partial(torch.testing.assert_close, rtol=0, atol=0)
+assert_alike = partial(torch.testing.assert_close, rtol=0, atol=1e-6)
+"""But for a few roundings of values up to 1. On a CPU with AVX-512 colours differed in the last
+bit; which operation rounds in another way is not known."""
 
 
 def fewer(split: Split, count: int, side: int = 16) -> Split:
@@ -192,48 +193,39 @@ def one_round(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("name", METHODS)
 def test_it_trains_and_renders_as_on_the_cpu(name: str, scene: Scene, tmp_path: Path) -> None:
-    here = frames(fitted(name, "cpu", scene, tmp_path / "cpu"), scene)
-    with pretended_gpu():
-        there = frames(fitted(name, "cuda", scene, tmp_path / "cuda"), scene)
-    assert alike(here, there)
-
-
-def rows(method: Method, scene: Scene, folder: Path) -> pd.DataFrame:
-    """All but times and peak memory."""
-    protocol = EvaluationProtocol(name="quick", lpips=(), warmup=0)
-    task = Task(scene, from_split(scene), protocol, BUDGET, seed=0)
-    found = measure([method], task, ConsoleLog(folder, quiet=True))[0].rows
-    timed = found["metric"].str.startswith(("frame_ms", "fps", "stage_ms", "train_s", "peak"))
-    assert timed.any()
-    return found[~timed]
+    drawn = here_and_there(lambda device: frames(fitted(name, device, scene, tmp_path), scene))
+    assert_alike(*drawn)
 
 
 def test_with_products_of_bfloat16_it_trains_and_renders_as_on_the_cpu(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def drawn(device: str) -> list[torch.Tensor]:
+        assert multiplies_bf16(device)
+        return frames(fitted("steernerf_lean", device, scene, tmp_path), scene)
+
     capabilities = {**torch.cpu.get_capabilities(), "avx512_bf16": True}
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities)
     multiplies_bf16.cache_clear()
     try:
-        here = frames(fitted("steernerf_lean", "cpu", scene, tmp_path / "cpu"), scene)
-        with pretended_gpu():
-            assert multiplies_bf16("cuda")
-            there = frames(fitted("steernerf_lean", "cuda", scene, tmp_path / "cuda"), scene)
+        assert_alike(*here_and_there(drawn))
     finally:
         multiplies_bf16.cache_clear()
-    assert alike(here, there)
 
 
 def test_its_rows_are_those_of_the_cpu(scene: Scene, tmp_path: Path) -> None:
-    def of(device: str) -> pd.DataFrame:
+    def rows(device: str) -> pd.DataFrame:
+        """All but times and peak memory."""
         method = METHODS["ngp"](device=device, backend="reference")
-        return rows(method, scene, tmp_path / device)
+        protocol = EvaluationProtocol(name="quick", lpips=(), warmup=0)
+        task = Task(scene, from_split(scene), protocol, BUDGET, seed=0)
+        found = measure([method], task, ConsoleLog(tmp_path / device, quiet=True))[0].rows
+        timed = found["metric"].str.startswith(("frame_ms", "fps", "stage_ms", "train_s", "peak"))
+        assert timed.any()
+        return found[~timed]
 
-    here = of("cpu")
-    with pretended_gpu():
-        there = of("cuda")
-    differing = [name for name in here if not here[name].equals(there[name])]
-    assert differing == ["device"]
+    here, there = here_and_there(rows)
+    assert [name for name in here if not here[name].equals(there[name])] == ["device"]
     assert set(there["device"]) == {"cuda"}
 
 
@@ -243,8 +235,8 @@ def test_killed_in_stage_2_it_goes_on_as_if_it_had_not_been(
     whole = frames(fitted("steernerf", "cuda", scene, tmp_path / "whole"), scene)
     with killed(JointTraining, 1):
         fitted("steernerf", "cuda", scene, tmp_path / "killed")
-    assert list((tmp_path / "killed").glob("stages/steernerf-*/checkpoint.safetensors"))
-    assert equal(whole, frames(fitted("steernerf", "cuda", scene, tmp_path / "killed"), scene))
+    assert list((tmp_path / "killed").glob("cuda/stages/steernerf-*/checkpoint.safetensors"))
+    assert_equal(whole, frames(fitted("steernerf", "cuda", scene, tmp_path / "killed"), scene))
 
 
 @pytest.mark.parametrize("places", [("cuda", "cpu"), ("cpu", "cuda")])
@@ -347,7 +339,7 @@ def smallest(name: str, **where: Any) -> Method:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(bool(availability()["gpu"]), reason="Triton has no build for this platform")
+@needs_triton
 @pytest.mark.parametrize("name", ["ngp", "steernerf"])
 def test_by_triton_it_trains_and_renders_as_on_the_cpu(
     name: str, ball_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -361,16 +353,14 @@ def test_by_triton_it_trains_and_renders_as_on_the_cpu(
     tiny = replace(ball_scene, splits=splits)
     budget = replace(BUDGET, steps=1, samples=64, renderer_steps=1)
 
-    def shown(device: str) -> list[torch.Tensor]:
+    def drawn(device: str) -> list[torch.Tensor]:
         method = smallest(name, device=device, backend="gpu")
         method.fit(tiny, budget, ConsoleLog(tmp_path / device, quiet=True))
         return frames(method, tiny)
 
-    here = shown("cpu")
-    with pretended_gpu():
-        there = shown("cuda")
+    here, there = here_and_there(drawn)
     assert here[0].std() > 0
-    assert equal(here, there)
+    assert_equal(here, there)
 
 
 GO_ON = [
@@ -393,19 +383,17 @@ def preparation(which: tuple[str, str]) -> Prepare:
     return case.error.prepare
 
 
-@pytest.mark.skipif(bool(availability()["gpu"]), reason="Triton has no build for this platform")
+@needs_triton
 @pytest.mark.parametrize("which", [*GO_ON, *WAIT], ids=" ".join)
 def test_a_case_of_a_kernel_of_triton_is_computed_there_as_on_the_cpu(
     which: tuple[str, str],
 ) -> None:
     prepare = preparation(which)
-    here = prepare("cpu")("gpu")
-    with pretended_gpu():
-        there = prepare("cuda")("gpu")
-        assert all(torch.equal(x.cpu(), y) for x, y in zip(there, here, strict=True))
+    here, there = here_and_there(lambda device: [x.cpu() for x in prepare(device)("gpu")])
+    assert_equal(here, there)
 
 
-@pytest.mark.skipif(bool(availability()["gpu"]), reason="Triton has no build for this platform")
+@needs_triton
 @pytest.mark.parametrize("which", GO_ON, ids=" ".join)
 def test_while_a_kernel_of_triton_computes_the_host_goes_on(which: tuple[str, str]) -> None:
     prepare = preparation(which)

@@ -1,9 +1,13 @@
-"""Rows whose figures are known, and several runs."""
+"""Rows whose figures are known, several runs, and runs with other figures."""
 
 from __future__ import annotations
 
 import json
+import math
 import shutil
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,34 +16,37 @@ from matplotlib.figure import Figure
 
 from bench.results import COLUMNS, Store
 from reports.runs import Run, load
+from sweeps.plan import chosen
+
+TABLES = {table.name: table for table in chosen(None, [])}
+"""Those of the paper."""
 
 FIGURES = {
     "psnr": (30.456, 29.5, 31.5),
     "ssim": (0.98765, 0.98, 0.99),
-    "lpips_alex": (float("nan"),) * 3,
+    "lpips_alex": (math.nan, math.nan, math.nan),
     "frame_ms": (200.0, 190.0, 210.0),
-    "frame_ms.p50": (199.0, float("nan"), float("nan")),
-    "frame_ms.p95": (220.0, float("nan"), float("nan")),
-    "frame_ms.p99": (230.0, float("nan"), float("nan")),
+    "frame_ms.p50": (199.0, math.nan, math.nan),
+    "frame_ms.p95": (220.0, math.nan, math.nan),
+    "frame_ms.p99": (230.0, math.nan, math.nan),
     "fps": (5.0, 4.76, 5.26),
     "stage_ms.field": (150.0, 140.0, 160.0),
     "stage_ms.other": (50.0, 45.0, 55.0),
-    "size_bytes.table": (25_000_000.0, float("nan"), float("nan")),
-    "size_bytes.total": (25_200_000.0, float("nan"), float("nan")),
-    "peak_bytes": (1e9, float("nan"), float("nan")),
-    "train_s": (61.0, float("nan"), float("nan")),
+    "size_bytes.table": (25_000_000.0, math.nan, math.nan),
+    "size_bytes.total": (25_200_000.0, math.nan, math.nan),
+    "peak_bytes": (1e9, math.nan, math.nan),
+    "train_s": (61.0, math.nan, math.nan),
 }
 
 
 @pytest.fixture
 def rows() -> pd.DataFrame:
     """The rows of one run."""
-    lines = [
-        {"metric": metric, "value": value, "lo": low, "hi": high}
-        for metric, (value, low, high) in FIGURES.items()
-    ]
-    table = pd.DataFrame(lines).assign(
-        run="0123456789abcdef", method="ngp", scene="totem", resolution="64x48", n=7
+    table = pd.DataFrame.from_dict(FIGURES, "index", columns=["value", "lo", "hi"])
+    table = (
+        table.rename_axis("metric")
+        .reset_index()
+        .assign(run="0123456789abcdef", method="ngp", scene="totem", resolution="64x48", n=7)
     )
     whole = table["metric"].str.match("size_bytes|peak_bytes|train_s")
     table["phase"] = np.where(whole, "all", "steady")
@@ -57,6 +64,31 @@ def rows_with_cold(rows: pd.DataFrame) -> pd.DataFrame:
     return pd.concat([rows, cold], ignore_index=True)
 
 
+def run_of(rows: pd.DataFrame, label: str = "run", **record: object) -> Run:
+    """A run that has nothing but `rows` and a `record`."""
+    return Run(label, label, rows, pd.DataFrame, record, Path())
+
+
+def changed(run: Run, figures: Mapping[str, float], **facts: object) -> Run:
+    """`run` with other `figures`, by metric, and other `facts` in all rows."""
+    rows = run.rows.assign(**facts)
+    value = rows["value"].mask(rows["metric"].isin(figures), rows["metric"].map(figures))
+    return replace(run, rows=rows.assign(value=value))
+
+
+def elsewhere(run: Run) -> Run:
+    """`run` on another machine."""
+    machine = {**run.record["machine"], "cpu": "another"}
+    return replace(run, record={**run.record, "machine": machine})
+
+
+def shifted(run: Run, by: float | list[float], **facts: object) -> Run:
+    """`run` with a PSNR larger by so much, in the mean and `by` frame, and other `facts`."""
+    frames = run.frames.assign(psnr=run.frames["psnr"] + by)
+    moved = changed(run, {"psnr": run.values["psnr"] + np.mean(by)}, **facts)
+    return replace(moved, read_frames=lambda: frames)
+
+
 @pytest.fixture
 def run(store: Store, stored_run: str) -> Run:
     """A run of six scored frames, three of them pictured."""
@@ -72,6 +104,15 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
     return figures
 
 
+def rewrite(store: Store, key: str, **others: object) -> None:
+    """Change the record of a stored run; `machine` and `scene` are changed in part."""
+    path = store.folder / key / "record.json"
+    record = json.loads(path.read_text())
+    for name, value in others.items():
+        record[name] = {**record[name], **value} if isinstance(value, dict) else value
+    path.write_text(json.dumps(record))
+
+
 @pytest.fixture
 def several(store: Store, stored_run: str) -> tuple[Store, dict[str, str]]:
     """A store with six runs of the same frames, and what each is called.
@@ -82,11 +123,8 @@ def several(store: Store, stored_run: str) -> tuple[Store, dict[str, str]]:
     for number in range(5):
         key = f"{number}{stored_run[1:]}"
         folder = shutil.copytree(store.folder / stored_run, store.folder / key)
-        for file in ("rows.csv", "record.json"):
-            text = (folder / file).read_text().replace(stored_run, key)
-            (folder / file).write_text(text)
+        for file in (folder / "rows.csv", folder / "record.json"):
+            file.write_text(file.read_text().replace(stored_run, key))
         labels[key] = f"copy {number}"
-    record = json.loads((folder / "record.json").read_text())
-    record["machine"]["cpu"] = "another"
-    (folder / "record.json").write_text(json.dumps(record))
+    rewrite(store, key, machine={"cpu": "another"})
     return store, labels

@@ -3,29 +3,25 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from pathlib import Path
 
-import pandas as pd
 import pytest
 
 from bench.errors import SteerbenchError
 from reports.comparison import comparison, metric_format
 from reports.runs import Run
+from tests.reports.conftest import changed, elsewhere, run_of
 
 FACTS = dict.fromkeys(("split", "trajectory", "budget", "protocol", "device"), "same")
-MACHINE = {"cpu": "EPYC", "gpus": []}
 
 
 @pytest.fixture
 def make(rows):
     """Makes a run with the figures of `rows`, some of them changed."""
 
-    def make_run(label: str, *, cpu: str = "EPYC", digest: str = "d", **changed: float) -> Run:
-        kept = rows["value"].where(~rows["metric"].isin(list(changed)), rows["metric"].map(changed))
-        own = rows.assign(value=kept, **FACTS)
-        record = {"machine": {**MACHINE, "cpu": cpu}, "scene": {"digest": digest}}
-        return Run(label, label, own, pd.DataFrame, record, Path())
+    def make_run(label: str, rows=rows, digest: str = "d", **figures: float) -> Run:
+        machine, scene = {"cpu": "EPYC", "gpus": []}, {"digest": digest}
+        run = run_of(rows.assign(**FACTS), label, machine=machine, scene=scene)
+        return changed(run, figures)
 
     return make_run
 
@@ -53,17 +49,12 @@ def test_the_best_is_the_highest_or_the_lowest_as_the_arrow_says(make):
 def test_figures_that_read_alike_are_equally_good(make):
     table = comparison([make("a", psnr=31.001), make("b", psnr=31.002)], {})
     assert {("a", "PSNR, dB ↑"), ("b", "PSNR, dB ↑")} <= bold(table)
-
-
-def test_what_could_not_be_had_is_never_the_best(make):
-    table = comparison([make("a"), make("b")], {})
-    assert "LPIPS alex ↓" not in {column for _, column in bold(table)}
+    assert "LPIPS alex ↓" not in {column for _, column in bold(table)}  # not available
 
 
 def test_one_run_or_runs_of_different_kinds_have_no_best(make):
-    other_protocol = make("c")
-    other_protocol = replace(other_protocol, rows=other_protocol.rows.assign(protocol="quick"))
-    runs = [make("a"), make("b", cpu="Xeon"), other_protocol, make("d", digest="other")]
+    other = changed(make("c"), {}, protocol="quick")
+    runs = [make("a"), elsewhere(make("b")), other, make("d", digest="other")]
     assert bold(comparison(runs, {})) == set()
 
 
@@ -74,9 +65,7 @@ def test_a_failure_is_a_line_with_its_reason(make):
 
 
 def test_cold_frames_have_a_line_of_their_own_and_compete_among_themselves(make, rows_with_cold):
-    runs = [make("a"), make("b"), make("c")]
-    runs[1:] = [replace(run, rows=rows_with_cold.assign(**FACTS)) for run in runs[1:]]
-    table = comparison(runs, {})
+    table = comparison([make("a"), *(make(label, rows_with_cold) for label in "bc")], {})
     assert [line[0] for line in table.lines] == ["a", "b", "b, cold", "c", "c, cold"]
     assert [line[1] for line in table.lines] == ["30.46", "30.46", "27.46", "30.46", "27.46"]
     assert table.lines[2][-4:] == ("400.0", "2.50", "25.20", "61")

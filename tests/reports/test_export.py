@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from dataclasses import replace
 
 import pandas as pd
 import pytest
@@ -11,7 +10,7 @@ import pytest
 from reports import export
 from reports.paper_tables import Line, PaperTable
 from reports.runs import Repeated, Run
-from sweeps.plan import chosen
+from tests.reports.conftest import TABLES, changed
 
 TABLE = PaperTable(
     name="table9",
@@ -24,7 +23,6 @@ TABLE = PaperTable(
         Line("mine_1", {"method": "c"}),
         Line("not yet", {"method": "d"}, {"psnr": 30.0}),
     ],
-    notes=[],
 )
 
 
@@ -32,18 +30,11 @@ TABLE = PaperTable(
 def lines(run: Run) -> dict[str, list[Repeated]]:
     """Three measured lines; two of them differ by less than the decimals show."""
     figures = {
-        "T = 2^19": (30.456, 0.9512, 25.24e6),
-        "K = 3": (30.461, 0.9514, 25.0e6),
-        "mine_1": (29.0, 0.9, 3e6),
+        "T = 2^19": {"psnr": 30.456, "ssim": 0.9512, "size_bytes.total": 25.24e6},
+        "K = 3": {"psnr": 30.461, "ssim": 0.9514, "size_bytes.total": 25.0e6},
+        "mine_1": {"psnr": 29.0, "ssim": 0.9, "size_bytes.total": 3e6},
     }
-    return {"table9": [Repeated(label, [of(run, *values)]) for label, values in figures.items()]}
-
-
-def of(run: Run, psnr: float, ssim: float, size: float) -> Run:
-    values = {"psnr": psnr, "ssim": ssim, "size_bytes.total": size}
-    rows = run.rows[run.rows["metric"].isin(values)].copy()
-    rows["value"] = rows["metric"].map(values)
-    return replace(run, rows=rows)
+    return {"table9": [Repeated(label, [changed(run, of)]) for label, of in figures.items()]}
 
 
 def cells(text: str) -> dict[str, list[str]]:
@@ -61,13 +52,10 @@ def test_latex_has_the_decimals_of_the_paper_and_marks_the_best(lines):
     assert found["$K = 3$"] == [r"\textbf{30.46}", r"\textbf{0.951}", r"\underline{25.0}"]
     assert found["not yet"] == ["--", "--", "--"]  # not measured
     assert found[r"mine\_1"] == [r"\underline{29.00}", r"\underline{0.900}", r"\textbf{3.0}"]
-
-
-def test_latex_of_several_seeds_has_their_interval(lines):
-    (line, *_) = lines["table9"]
-    runs = [of(line.runs[0], psnr, 0.95, 1e6) for psnr in (29.0, 31.0)]
-    found = cells(export.latex([TABLE], {"table9": [replace(line, runs=runs)]}))
-    assert found["$T = 2^{19}$"][0] == r"30.00 $\pm$ 12.71"  # t(0.975, 1) = 12.71
+    # Of several seeds, half of the interval: t(0.975, 1) = 12.71.
+    runs = [changed(lines["table9"][0].runs[0], {"psnr": psnr}) for psnr in (29.0, 31.0)]
+    found = cells(export.latex([TABLE], {"table9": [Repeated("K = 3", runs)]}))
+    assert found["$K = 3$"][0] == r"30.00 $\pm$ 12.71"
 
 
 def test_latex_is_escaped_and_of_booktabs(lines):
@@ -80,15 +68,13 @@ def test_latex_is_escaped_and_of_booktabs(lines):
 
 
 def test_a_rule_stands_before_what_is_beyond_the_paper(lines):
-    (table,) = (table for table in chosen(None, []) if table.name == "table5")
-    run = lines["table9"][0].runs[0]
-    labels = [line.label for block in table.blocks for line in block.lines]
-    both = export.latex([table], {"table5": [Repeated(label, [run]) for label in labels]})
+    table, run = TABLES["table5"], lines["table9"][0].runs[0]
+    measured = [Repeated(x.label, [run]) for block in table.blocks for x in block.lines]
+    both = export.latex([table], {"table5": measured})
     first, second = both.split("\\midrule\n")[1:]
     assert "lean" not in first
     assert second.count("lean") == 2
-    alone = export.latex([table], {"table5": [Repeated(label, [run]) for label in labels[:2]]})
-    assert "lean" not in alone
+    assert "lean" not in export.latex([table], {"table5": measured[:2]})
 
 
 def test_csv_has_a_figure_a_row_as_it_was_measured(lines):

@@ -13,27 +13,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from markdown_it import MarkdownIt
 from PIL import Image
 
 from bench.results import Store
-from reports import html
+from reports import publish
+from reports.images import Frame, View
 from reports.page import write_page
-from reports.parts import Detail, Frame, View
 from reports.tables import Table
+from tests.reports.conftest import rewrite
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 FIRST = re.compile(r"first: tiny, .*, frame 1 of 6")
-MARKS = {"strong": "**", "em": "*"}
 
 
 class Parsed(HTMLParser):
-    """The tables of a page as Markdown writes their cells, and the attributes of its elements."""
+    """The elements of a page, each with its attributes."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
-        self.tables: list[list[list[str]]] = []
         self.elements: list[tuple[str, dict[str, str]]] = []
-        self.cell = False
         self.feed(text)
 
     def of(self, tag: str) -> list[dict[str, str]]:
@@ -46,33 +45,11 @@ class Parsed(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.elements.append((tag, {name: value or "" for name, value in attrs}))
-        if tag == "table":
-            self.tables.append([])
-        elif tag == "tr":
-            self.tables[-1].append([])
-        elif tag in ("td", "th"):
-            self.tables[-1][-1].append("")
-            self.cell = True
-        self.handle_data(MARKS.get(tag, ""))
-
-    def handle_endtag(self, tag: str) -> None:
-        self.handle_data(MARKS.get(tag, ""))
-        self.cell = self.cell and tag not in ("td", "th")
-
-    def handle_data(self, data: str) -> None:
-        if self.cell:
-            self.tables[-1][-1][-1] += data
 
 
-def tables_of(text: str) -> list[list[list[str]]]:
-    """The tables of a Markdown page by their cells, without the lines below the heads."""
-    found = []
-    for block in re.findall(r"(?:^\|.*\|\n)+", text, re.MULTILINE):
-        lines = [re.split(r" ?(?<!\\)\| ?", line)[1:-1] for line in block.splitlines()]
-        found.append(
-            [[cell.replace("\\|", "|") for cell in line] for line in lines[:1] + lines[2:]]
-        )
-    return found
+def cells(page: str) -> list[str]:
+    """The cells of all tables, without the links in them."""
+    return re.findall(r"<t[hd](?: [^>]*)?>(.*?)</t[hd]>", re.sub(r"</?a[^>]*>", "", page))
 
 
 @pytest.fixture(scope="module")
@@ -94,10 +71,10 @@ def parsed(page: Path) -> Parsed:
     return Parsed((page / "report.html").read_text())
 
 
-def test_every_table_of_the_markdown_page_is_there_with_its_figures_and_marks(page, parsed):
-    written = tables_of((page / "report.md").read_text())
-    assert any(cell.startswith("**") for table in written for line in table for cell in line)
-    assert parsed.tables == written
+def test_every_table_of_the_markdown_page_is_there_with_its_figures_and_marks(page):
+    markdown = MarkdownIt("commonmark").enable("table").render((page / "report.md").read_text())
+    assert any(cell.startswith("<strong>") for cell in cells(markdown))
+    assert cells((page / "report.html").read_text()) == cells(markdown)
 
 
 def test_nothing_is_loaded_from_elsewhere(page, parsed):
@@ -124,11 +101,11 @@ def test_pictures_lose_nothing(several, stored_run, parsed):
 
 def test_a_page_with_large_pictures_says_that_they_are_compressed(monkeypatch):
     grey = np.full((8, 8, 3), 99, np.uint8)
-    detail = Detail((0, 0, 2, 2), "nothing differs")
-    frame = Frame("ball, 0", "frame", grey, [View(("a", "b"), grey, grey)], detail, "no error")
-    assert "compressed" not in html.html_page(["# Title", frame], [])
-    monkeypatch.setattr(html, "LOSSLESS_PIXELS", 63)
-    assert "compressed for this page: WebP, quality 90" in html.html_page(["# Title", frame], [])
+    views = [View(("a", "b"), grey, grey)]
+    frame = Frame("ball, 0", "frame", grey, views, (0, 0, 2, 2), "nothing differs", "no error")
+    assert "compressed" not in publish.html_page(["# Title", frame], [])
+    monkeypatch.setattr(publish, "LOSSLESS_PIXELS", 63)
+    assert "compressed for this page: WebP, quality 90" in publish.html_page(["# Title", frame], [])
 
 
 def test_every_line_and_every_mark_leads_to_its_run(several, parsed):
@@ -156,10 +133,7 @@ HOSTILE = "<script>x</script>![](http://a/b.png)"
 def test_names_are_text_and_nothing_else(store, stored_run, tmp_path):
     rows = store.folder / stored_run / "rows.csv"
     rows.write_text(rows.read_text().replace(",tiny,", f",{HOSTILE},"))
-    record = store.folder / stored_run / "record.json"
-    facts = json.loads(record.read_text())
-    facts |= {"command": HOSTILE, "error_map": HOSTILE}
-    record.write_text(json.dumps(facts))
+    rewrite(store, stored_run, command=HOSTILE, error_map=HOSTILE)
     write_page(store, {stored_run: HOSTILE}, tmp_path / "page", {HOSTILE: HOSTILE})
     text = (tmp_path / "page" / "report.html").read_text()
     assert "<script>x" not in text
@@ -222,7 +196,7 @@ def test_a_click_on_a_head_sorts_numbers_as_numbers_the_best_above_and_the_missi
         ("e", "**9.60**", "900.0"),
     )
     table = Table("t", ("name", "PSNR, dB ↑", "ms ↓"), lines)
-    found = in_browser(html.html_page(["# Title", table], []), SORT, tmp_path)
+    found = in_browser(publish.html_page(["# Title", table], []), SORT, tmp_path)
     assert found["sorted"] == [
         ["descending", "ceadb"],
         ["ascending", "daecb"],
@@ -258,7 +232,7 @@ def test_rows_of_a_long_table_are_laid_out_apart_below_their_heads(tmp_path):
         Table(name, ("name", "PSNR, dB ↑", "ms"), lines[:rows])
         for name, rows in (("a", 50), ("b", 300))
     ]
-    short, long = in_browser(html.html_page(["# Title", *tables], []), LONG, tmp_path)["found"]
+    short, long = in_browser(publish.html_page(["# Title", *tables], []), LONG, tmp_path)["found"]
     assert (short["apart"], long["apart"]) == (False, True)
     for one, rows in ((short, 50), (long, 300)):
         assert one["aligned"]

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from reports.images import MOST_FRAMES, find_detail, kept_frames, write_image
-from reports.parts import View
+from reports.images import MOST_FRAMES, Frame, View, find_detail, kept_frames, write_image
 
 HEIGHT, WIDTH = 64, 96
 
@@ -18,39 +17,35 @@ def flat(level: int) -> np.ndarray:
     return np.full((HEIGHT, WIDTH, 3), level, dtype=np.uint8)
 
 
-def with_spot(level: int, top: int, left: int) -> np.ndarray:
-    """A flat picture with 4 x 4 pixels of another level."""
-    picture = flat(level)
-    picture[top : top + 4, left : left + 4] = 255 - level
+def with_spot(top: int, left: int) -> np.ndarray:
+    """A black picture with 4 x 4 white pixels."""
+    picture = flat(0)
+    picture[top : top + 4, left : left + 4] = 255
     return picture
 
 
 @pytest.mark.parametrize(("top", "left"), [(30, 50), (0, 0), (60, 92)])
 def test_the_detail_holds_what_differs_and_stays_within_the_picture(top, left):
-    detail = find_detail(flat(255), [flat(0), with_spot(0, top, left)])
-    x0, y0, x1, y1 = detail.box
+    (x0, y0, x1, y1), where = find_detail(flat(255), [flat(0), with_spot(top, left)])
     assert 0 <= x0 <= left < left + 4 <= x1 <= WIDTH
     assert 0 <= y0 <= top < top + 4 <= y1 <= HEIGHT
     assert (x1 - x0, y1 - y0) == (WIDTH // 4, HEIGHT // 4)
-    assert "renderings differ" in detail.where
+    assert "renderings differ" in where
 
 
-def test_of_a_single_rendering_the_detail_is_where_it_is_wrong():
-    detail = find_detail(flat(0), [with_spot(0, 30, 50)])
-    assert detail.box[0] <= 50 < detail.box[2]
-    assert "error" in detail.where
-
-
-def test_where_nothing_differs_the_detail_is_the_middle():
-    box = find_detail(flat(9), [flat(0), flat(0)]).box
+def test_of_one_rendering_the_detail_is_where_it_is_wrong_and_of_equal_ones_in_the_middle():
+    box, where = find_detail(flat(0), [with_spot(30, 50)])
+    assert box[0] <= 50 < box[2]
+    assert "error" in where
+    box, _ = find_detail(flat(9), [flat(0), flat(0)])
     assert (box[0] + box[2], box[1] + box[3]) == (WIDTH, HEIGHT)
 
 
 @pytest.mark.parametrize(("runs", "columns", "lines"), [(1, 3, 2), (2, 3, 3), (4, 5, 3)])
 def test_an_image_has_a_place_for_every_picture(tmp_path, runs, columns, lines):
     views = [View(("a", "b"), flat(50 * number), flat(7)) for number in range(runs)]
-    detail = find_detail(flat(255), [view.rendering for view in views])
-    write_image(flat(255), views, detail, "absolute error", tmp_path / "image.png")
+    frame = Frame("ball", "ball", flat(255), views, (0, 0, 24, 16), "they differ", "error")
+    write_image(frame, tmp_path / "image.png")
     with Image.open(tmp_path / "image.png") as image:
         pixels = np.asarray(image)
     panel = (3 * HEIGHT, 3 * WIDTH)  # small pictures are enlarged by a whole number

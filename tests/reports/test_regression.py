@@ -17,9 +17,14 @@ OLD = Figures(
 )
 
 
-def change(metric: str, value: float, old: Figures = OLD) -> Change | None:
-    new = replace(old, values={**old.values, metric: value})
-    return next((found for found in changes([old], [new]) if found.metric == metric), None)
+def change(metric: str, old: list[Figures], new: list[Figures]) -> Change:
+    (found,) = (found for found in changes(old, new) if found.metric == metric)
+    return found
+
+
+def with_frames(metric: str, *figures: float) -> Figures:
+    """`OLD` with so many frames."""
+    return replace(OLD, frames={metric: {str(i): value for i, value in enumerate(figures)}})
 
 
 @pytest.mark.parametrize(
@@ -35,14 +40,19 @@ def change(metric: str, value: float, old: Figures = OLD) -> Change | None:
     ],
 )
 def test_worse_is_what_passes_the_limit_in_the_wrong_direction(metric, value, worse):
-    found = change(metric, value)
-    assert found is not None
+    found = change(metric, [OLD], [replace(OLD, values={**OLD.values, metric: value})])
     assert found.verdict == ("worse" if worse else "")
 
 
 def test_what_depends_on_the_machine_is_compared_on_the_same_one_only():
-    other = replace(OLD, machine="another machine", values={**OLD.values, "frame_ms": 500.0})
-    assert {found.metric for found in changes([OLD], [other])} == {"psnr", "size_bytes.total"}
+    values = {**OLD.values, "frame_ms": 500.0, "work.samples": 1.06e6}
+    old = replace(OLD, values={**OLD.values, "work.samples": 1e6})
+    found = changes([old], [replace(OLD, machine="another machine", values=values)])
+    assert {each.metric: each.verdict for each in found} == {
+        "psnr": "",
+        "size_bytes.total": "",
+        "work.samples": "worse",
+    }
 
 
 @pytest.mark.parametrize(
@@ -55,56 +65,39 @@ def test_what_depends_on_the_machine_is_compared_on_the_same_one_only():
     ],
 )
 def test_frames_that_both_have_are_compared_in_pairs(by, verdict):
-    before = {str(i): 20.0 + 5 * i for i in range(len(by))}
-    after = {name: value + by[int(name)] for name, value in before.items()} | {"more": 99.0}
-    old, new = (replace(OLD, frames={"psnr": frames}) for frames in (before, after))
-    found = next(found for found in changes([old], [new]) if found.metric == "psnr")
+    before = [20.0 + 5 * i for i in range(len(by))]
+    after = [*(value + each for value, each in zip(before, by, strict=True)), 99.0]
+    found = change("psnr", [with_frames("psnr", *before)], [with_frames("psnr", *after)])
     half = path_interval(np.array(by))
     assert found.by == pytest.approx(np.mean(by))
     assert found.interval == pytest.approx((found.by - half, found.by + half))
     assert found.verdict == verdict
 
 
-@pytest.mark.parametrize("metric", ["work.samples", "work.products"])
-def test_more_work_is_worse_on_any_machine(metric):
-    old = replace(OLD, values={metric: 1e6})
-    found = [
-        next(changes([old], [replace(old, values={metric: work}, machine="another")])).verdict
-        for work in (1.04e6, 1.06e6)
-    ]
-    assert found == ["", "worse"]
-
-
 def test_frames_without_an_error_hide_no_others():
     """Equal pictures have an infinite PSNR, before and after."""
-    before = {str(i): 30.0 for i in range(9)} | {"9": math.inf}
-    after = {str(i): 20.0 for i in range(9)} | {"9": math.inf}
-    values = {**OLD.values, "psnr": math.inf}
-    old, new = (Figures(values, {"psnr": psnr}, "one", "views") for psnr in (before, after))
-    found = next(each for each in changes([old], [new]) if each.metric == "psnr")
-    assert found.by == pytest.approx(-9)
-    assert found.verdict == "worse"
-    assert next(changes([old], [old])).verdict == ""
+    old, new = (
+        replace(with_frames("psnr", *[psnr] * 9, math.inf), values={"psnr": math.inf})
+        for psnr in (30.0, 20.0)
+    )
+    found = change("psnr", [old], [new])
+    assert (found.by, found.verdict) == (pytest.approx(-9), "worse")
+    assert change("psnr", [old], [old]).verdict == ""
 
 
 def test_one_slow_frame_among_many_is_chance():
-    times = {str(i): 100.0 for i in range(24)}
-    old = replace(OLD, frames={"frame_ms": times})
-    new = replace(OLD, frames={"frame_ms": {**times, "11": 2000.0}})
-    found = next(each for each in changes([old], [new]) if each.metric == "frame_ms")
+    new = with_frames("frame_ms", *[100.0] * 11, 2000.0, *[100.0] * 12)
+    found = change("frame_ms", [with_frames("frame_ms", *[100.0] * 24)], [new])
     assert found.by > 25
     assert found.verdict == ""
 
 
-def seeds(*by: float, metric: str = "psnr") -> Change:
+def seeds(*by: float) -> Change:
     """PSNR of a run with so many seeds, each of which changed by so much in all of its frames."""
-    before = [{str(i): 25.0 + seed + i for i in range(6)} for seed in range(len(by))]
-    after = [
-        {name: value + each for name, value in frames.items()}
-        for frames, each in zip(before, by, strict=True)
-    ]
-    old, new = ([replace(OLD, frames={metric: x}) for x in runs] for runs in (before, after))
-    return next(found for found in changes(old, new) if found.metric == metric)
+    before = [np.arange(25.0 + seed, 31.0 + seed) for seed in range(len(by))]
+    old = [with_frames("psnr", *frames) for frames in before]
+    new = [with_frames("psnr", *frames + each) for frames, each in zip(before, by, strict=True)]
+    return change("psnr", old, new)
 
 
 def test_seeds_of_which_some_became_better_have_changed_by_chance():
@@ -118,23 +111,16 @@ def test_seeds_of_which_some_became_better_have_changed_by_chance():
 
 
 def test_one_broken_frame_of_one_seed_is_worse():
-    whole = replace(OLD, frames={"psnr": {str(i): 30.0 for i in range(6)}})
-    broken = replace(OLD, frames={"psnr": {**whole.frames["psnr"], "3": 10.0}})
-    found = next(changes([whole] * 3, [whole, broken, whole]))
-    assert found.verdict == "worse"
-
-
-def test_a_metric_that_one_seed_lacks_is_missing():
-    lacking = replace(OLD, values={"frame_ms": 100.0})
-    assert next(changes([OLD, OLD], [OLD, lacking])).verdict == "missing"
+    whole, broken = with_frames("psnr", *[30.0] * 6), with_frames("psnr", *[30.0] * 5, 10.0)
+    assert change("psnr", [whole] * 3, [whole, broken, whole]).verdict == "worse"
 
 
 def test_a_metric_or_a_frame_that_is_gone_is_missing():
     gone = replace(OLD, values={"frame_ms": 100.0, "size_bytes.total": 1000.0})
-    assert {found.metric: found.verdict for found in changes([OLD], [gone])}["psnr"] == "missing"
-    old = replace(OLD, frames={"psnr": {"0": 30.0, "1": 30.0, "2": 30.0}})
-    new = replace(OLD, frames={"psnr": {"0": 30.0, "1": 30.0}})
-    assert next(changes([old], [new])).verdict == "missing"
+    assert change("psnr", [OLD], [gone]).verdict == "missing"
+    assert change("psnr", [OLD, OLD], [OLD, gone]).verdict == "missing"
+    old, new = with_frames("psnr", 30.0, 30.0, 30.0), with_frames("psnr", 30.0, 30.0)
+    assert change("psnr", [old], [new]).verdict == "missing"
 
 
 def test_figures_of_other_frames_are_not_compared():

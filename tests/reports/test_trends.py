@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Mapping
 
 import numpy as np
 import pytest
@@ -22,23 +22,18 @@ from reports.trends import (
     differences,
     trend_table,
 )
-
-TREND = Trend("psnr", ["one", "two"])
-
-
-def changed(run: Run, by: float | list[float], seed: int = 5) -> Run:
-    """`run` with a PSNR larger by so much, of every frame and in the mean, with another seed."""
-    rows = run.rows.assign(seed=seed)
-    rows.loc[rows["metric"] == "psnr", "value"] += np.mean(by)
-    frames = run.frames.assign(psnr=run.frames["psnr"] + by)
-    return replace(run, rows=rows, read_frames=lambda: frames)
+from tests.reports.conftest import changed, elsewhere, shifted
 
 
-def only(one: list[Run], two: list[Run]):
-    (difference,) = differences(
-        TREND, {"one": Repeated("one", one), "two": Repeated("two", two)}, {}
-    )
-    return difference
+def between(
+    one: list[Run],
+    two: list[Run],
+    metric: str = "psnr",
+    published: Mapping[str, Mapping[str, float]] = {},
+) -> list[Difference]:
+    """The difference between two lines, if there is one."""
+    lines = {"one": Repeated("one", one), "two": Repeated("two", two)}
+    return list(differences(Trend(metric, ["one", "two"]), lines, published))
 
 
 def difference_of(by: float, half: float, paper: float, proves: bool = True) -> Difference:
@@ -54,7 +49,7 @@ def difference_of(by: float, half: float, paper: float, proves: bool = True) -> 
     ],
 )
 def test_one_seed_is_compared_frame_by_frame(run, apart, verdict):
-    difference = only([run], [changed(run, apart)])
+    (difference,) = between([run], [shifted(run, apart)])
     assert difference.over == "6 frames of one seed"
     assert difference.by == pytest.approx(np.mean(apart))
     assert difference.half == pytest.approx(path_interval(np.array(apart)))
@@ -65,9 +60,9 @@ def test_one_seed_is_compared_frame_by_frame(run, apart, verdict):
 def test_several_seeds_are_compared_seed_by_seed(run, by, verdict):
     """Seeds differ by a decibel, the lines by about a tenth with each of them."""
     apart = [by - 0.01, by, by + 0.01]
-    one = [changed(run, seed, seed) for seed in (0, 1, 2)]
-    two = [changed(run, seed + apart[seed], seed) for seed in (2, 0, 1)]
-    difference = only(one, two)
+    one = [shifted(run, seed, seed=seed) for seed in (0, 1, 2)]
+    two = [shifted(run, seed + apart[seed], seed=seed) for seed in (2, 0, 1)]
+    (difference,) = between(one, two)
     assert difference.over == "3 seeds"
     assert difference.by == pytest.approx(by)
     assert difference.half == pytest.approx(half_interval(np.array(apart)))
@@ -75,33 +70,29 @@ def test_several_seeds_are_compared_seed_by_seed(run, by, verdict):
 
 
 @pytest.mark.parametrize(
-    ("by", "half", "verdict"),
+    ("by", "half", "paper", "proves", "verdict"),
     [
-        (0.5, 0.4, HOLDS),
-        (0.5, 0.5, OPEN),  # up to 1.0, as in the paper
-        (0.4, 0.5, SMALLER),  # at most 0.9
-        (-0.1, 0.2, SMALLER),
-        (-0.5, 0.4, FAILS),
-        (0.0, 0.0, FAILS),
-        (0.5, math.nan, OPEN),
+        (0.5, 0.4, 1.0, True, HOLDS),
+        (0.5, 0.5, 1.0, True, OPEN),  # up to 1.0, as in the paper
+        (0.4, 0.5, 1.0, True, SMALLER),  # at most 0.9
+        (-0.1, 0.2, 1.0, True, SMALLER),
+        (-0.1, 0.2, 1.0, False, OPEN),  # only several seeds show that
+        (-0.1, 0.2, math.nan, True, OPEN),
+        (-0.5, 0.4, 1.0, True, FAILS),
+        (0.0, 0.0, 1.0, True, FAILS),
+        (0.5, math.nan, 1.0, True, OPEN),
     ],
 )
-def test_several_seeds_against_a_difference_of_one_decibel_in_the_paper(by, half, verdict):
-    assert difference_of(by, half, paper=1.0).verdict == verdict
-
-
-def test_only_several_seeds_show_that_a_difference_is_smaller_than_a_published_one():
-    assert difference_of(-0.1, 0.2, paper=math.nan).verdict == OPEN
-    assert difference_of(-0.1, 0.2, paper=1.0, proves=False).verdict == OPEN
+def test_a_verdict_is_that_of_the_whole_interval(by, half, paper, proves, verdict):
+    assert difference_of(by, half, paper, proves).verdict == verdict
 
 
 def test_the_papers_difference_is_known_where_both_its_figures_are(run):
-    lines = {name: Repeated(name, [run]) for name in ("one", "two")}
     published = {"one": {"psnr": 31.0}, "two": {"psnr": 31.5}}
-    (difference,) = differences(TREND, lines, published)
-    assert difference.paper == pytest.approx(0.5)
-    (difference,) = differences(TREND, lines, {**published, "two": {}})
-    assert math.isnan(difference.paper)
+    (known,) = between([run], [run], published=published)
+    assert known.paper == pytest.approx(0.5)
+    (unknown,) = between([run], [run], published={**published, "two": {}})
+    assert math.isnan(unknown.paper)
 
 
 def test_a_line_of_the_table_has_both_differences_in_the_unit_of_the_metric():
@@ -115,33 +106,20 @@ def test_a_line_of_the_table_has_both_differences_in_the_unit_of_the_metric():
 
 
 def test_seeds_that_only_one_line_has_are_left_out(run):
-    difference = only([changed(run, 0, 0), changed(run, 9, 1)], [changed(run, 1, 0)])
+    one = [shifted(run, 0, seed=0), shifted(run, 9, seed=1)]
+    (difference,) = between(one, [shifted(run, 1, seed=0)])
     assert difference.over == "6 frames of one seed"
     assert difference.by == pytest.approx(1)
 
 
-def test_a_figure_without_frames_alone_tells_nothing(run):
-    trend = Trend("fps", ["one", "two"])
-    lines = {name: Repeated(name, [run]) for name in ("one", "two")}
-    (difference,) = differences(trend, lines, {})
+def test_a_figure_without_frames_alone_tells_nothing_but_bytes_are_computed(run):
+    larger = changed(run, {"size_bytes.total": run.values["size_bytes.total"] + 1})
+    (difference,) = between([run], [larger], "fps")
     assert difference.verdict == OPEN
-
-
-def test_bytes_are_computed_and_need_no_interval(run):
-    larger = replace(run, rows=run.rows.assign(value=run.rows["value"] + 1))
-    lines = {"one": Repeated("one", [run]), "two": Repeated("two", [larger])}
-    (difference,) = differences(Trend("size_bytes.total", ["one", "two"]), lines, {})
+    (difference,) = between([run], [larger], "size_bytes.total")
     assert (difference.half, difference.verdict) == (0.0, HOLDS)
 
 
-def test_a_line_that_was_not_measured_has_no_difference(run):
-    lines = {"one": Repeated("one", [run]), "two": Repeated("two", [])}
-    assert list(differences(TREND, lines, {})) == []
-
-
-def test_times_of_different_machines_tell_nothing(run):
-    machine = {**run.record["machine"], "cpu": "another"}
-    elsewhere = replace(run, record={**run.record, "machine": machine})
-    lines = {"one": Repeated("one", [run]), "two": Repeated("two", [elsewhere])}
-    assert not list(differences(Trend("frame_ms", ["one", "two"]), lines, {}))
-    assert list(differences(TREND, lines, {}))
+def test_a_line_not_measured_has_no_difference_nor_have_times_of_different_machines(run):
+    assert between([run], []) == between([run], [elsewhere(run)], "frame_ms") == []
+    assert between([run], [elsewhere(run)])

@@ -1,0 +1,123 @@
+"""Runs over the frames that are steady in all of them, and means of runs of several scenes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pandas as pd
+import pytest
+
+from bench.results import COLD, STEADY
+from bench.run import phase_rows
+from reports.paper_tables import Line, PaperTable, section
+from reports.publish import markdown
+from reports.runs import Repeated, Run, over_common_frames, over_scenes
+from reports.trends import SEEN, Trend, differences
+from tests.reports.conftest import elsewhere, run_of, shifted
+
+PSNR = [20.0, 26.0, 29.0, 30.0, 31.0, 30.0]
+"""Of the frames of a path: the first are harder, for every method alike."""
+
+
+def remembering(memory: int, scene: str = "one") -> Run:
+    """A run whose first `memory` frames are cold."""
+    ms = [10.0 + k for k in range(6)]
+    frames = pd.DataFrame(
+        {
+            "frame": range(6),
+            "name": [f"r_{k}" for k in range(6)],
+            "phase": [COLD] * memory + [STEADY] * (6 - memory),
+            "psnr": PSNR,
+            "flicker": [math.nan] + [0.1] * 5,
+            "frame_ms": ms,
+            "stage_ms.other": ms,
+        }
+    )
+    rows = [
+        row | {"phase": phase}
+        for phase, of_phase in frames.groupby("phase")
+        for row in phase_rows(of_phase)
+    ]
+    facts = {"run": "key", "split": "test", "trajectory": "orbit", "resolution": "8x8"}
+    run = run_of(pd.DataFrame(rows).assign(**facts), scene={"digest": scene})
+    return replace(run, read_frames=lambda: frames)
+
+
+def test_equal_pictures_have_equal_figures_whatever_the_method_remembers():
+    runs = over_common_frames([remembering(memory) for memory in (0, 1, 3)])
+    for run in runs:
+        assert run.values["psnr"] == pytest.approx(sum(PSNR[3:]) / 3)
+        assert run.values["frame_ms"] == run.values["stage_ms.other"] == pytest.approx(14)
+        assert run.values["fps"] == pytest.approx(1000 / 14)
+        assert run.headline["n"]["psnr"] == 3
+    cold = runs[1].rows[runs[1].rows["phase"] == COLD].set_index("metric")["value"]
+    assert cold["psnr"] == PSNR[0]
+
+
+def test_runs_of_other_views_and_runs_without_a_steady_frame_do_not_count():
+    cold = remembering(6)
+    alone, other, same = over_common_frames([remembering(0), remembering(3, scene="another"), cold])
+    assert alone.values["psnr"] == pytest.approx(sum(PSNR) / 6)
+    assert other.values["psnr"] == pytest.approx(sum(PSNR[3:]) / 3)
+    assert same is cold
+
+
+def test_the_headline_is_steady_where_a_run_has_steady_frames(rows, rows_with_cold):
+    assert run_of(rows_with_cold).values == pytest.approx(run_of(rows).values, nan_ok=True)
+    cold = run_of(rows_with_cold[rows_with_cold["phase"] != "steady"])
+    assert cold.values["psnr"] == pytest.approx(27.456)
+    assert cold.values["train_s"] == 61
+
+
+def of_scene(run: Run, scene: str, by: float = 0.0, **facts: object) -> Run:
+    """`run` as that of another scene, with a PSNR larger by so much."""
+    other = shifted(run, by, scene=scene, **facts)
+    record = {**run.record, "scene": {**run.record["scene"], "digest": scene}}
+    return replace(other, key=f"{run.key}-{scene}", record=record)
+
+
+def test_figures_are_means_and_facts_that_differ_are_listed(run):
+    mean = over_scenes([of_scene(run, "a"), of_scene(run, "b", 4.0, resolution="8x8")])
+    assert mean.values["psnr"] == pytest.approx(run.values["psnr"] + 2.0)
+    assert mean.values["size_bytes.total"] == run.values["size_bytes.total"]
+    assert mean.facts["scene"] == "mean of a, b"
+    assert mean.facts["resolution"] == "40x32 / 8x8"
+    assert mean.facts["seed"] == run.facts["seed"]
+    assert over_scenes([run]) is run
+
+
+def test_a_figure_that_one_scene_lacks_has_no_mean_but_time_and_work_are_0_there(run):
+    missing = run.rows["metric"].isin(["ssim", "stage_ms.look-up", "work.pixels"])
+    less = replace(run, rows=run.rows[~missing])
+    mean = over_scenes([of_scene(run, "a"), of_scene(less, "b", math.nan)])
+    assert "ssim" not in mean.values
+    assert math.isnan(mean.values["psnr"])
+    for metric in ("stage_ms.look-up", "work.pixels"):
+        assert mean.values[metric] == run.values[metric] / 2
+
+
+def test_other_scenes_and_other_machines_are_other_conditions(run):
+    a, b, c = (of_scene(run, name) for name in "abc")
+    assert over_scenes([a, b]).conditions == over_scenes([a, b]).conditions
+    assert over_scenes([a, b]).conditions != over_scenes([a, c]).conditions
+    assert over_scenes([a, elsewhere(b)]).computer != run.computer
+
+
+def test_one_seed_is_compared_over_the_frames_of_all_scenes(run):
+    one = over_scenes([of_scene(run, "a"), of_scene(run, "b")])
+    other = over_scenes([of_scene(run, "a", 1.0), of_scene(run, "b", 2.0)])
+    lines = {"one": Repeated("one", [one]), "two": Repeated("two", [other])}
+    (found,) = differences(Trend("psnr", ["one", "two"]), lines, {})
+    assert (found.over, found.verdict) == ("12 frames of one seed", SEEN)
+    assert found.by == pytest.approx(1.5)
+
+
+@pytest.mark.parametrize("scenes", ["ab", "a"])
+def test_each_scene_has_its_line_where_there_are_several(run, scenes, tmp_path):
+    table = PaperTable("table9", "t", "p", ["psnr"], [Line("x", {})], [], scenes=["psnr"])
+    by_scene = {name: [of_scene(run, name, place)] for place, name in enumerate(scenes)}
+    mean = over_scenes([of_one for (of_one,) in by_scene.values()])
+    shown = markdown(section(table, [Repeated("x", [mean], by_scene=by_scene)]), tmp_path)
+    lines = [f"| {name}: x | {run.values['psnr'] + place:.2f} |" for place, name in enumerate("ab")]
+    assert all((line in shown) == (len(scenes) > 1) for line in lines)
