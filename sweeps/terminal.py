@@ -1,4 +1,4 @@
-"""What commands print: tables, rows, figures of a run, and how long the rest takes."""
+"""What commands print: tables, rows, figures of a run, pages, and how long the rest takes."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 import sys
 from collections.abc import Iterable, Mapping
 from datetime import timedelta
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.columns import Columns
@@ -16,7 +17,8 @@ from rich.table import Table as RichTable
 
 from reports.tables import Table, run_tables
 
-if TYPE_CHECKING:  # it loads torch, which `steerbench list` does without
+if TYPE_CHECKING:  # these load torch, which `steerbench list` does without
+    from bench.results import Store
     from reports.runs import Run
 
 PIPE_WIDTH = 200
@@ -52,6 +54,21 @@ def say_missing(runs: Iterable[Run]) -> None:
     reasons = (f"{name}: n/a. {why}" for run in runs for name, why in run.record["missing"].items())
     for reason in dict.fromkeys(reasons):
         console().print(reason, markup=False, soft_wrap=True)
+
+
+def write_page(
+    report: str | None, store: Store, labels: Mapping[str, str], failed: Mapping[str, str] = {}
+) -> None:
+    """Write a page into the folder `report`, if there is to be one, and print where it is.
+
+    Args:
+        labels: the names of its runs, by key; without any, there is no page.
+        failed: why other jobs failed, by name.
+    """
+    if report and labels:
+        from reports import page  # loads matplotlib, which only a page needs
+
+        print(f"report: {page.write_page(store, labels, Path(report), failed)}", file=sys.stderr)
 
 
 def print_rows(rows: Any) -> None:

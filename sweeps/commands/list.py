@@ -10,9 +10,7 @@ from typing import Any
 
 from bench.errors import SteerbenchError, Unavailable
 from reports.tables import Table
-from sweeps.build import engine_kinds
-from sweeps.overrides import choices
-from sweeps.plug_ins import PlugIn, installed
+from sweeps.overrides import PlugIn, choices, engine_kinds, plug_ins
 from sweeps.terminal import console, show
 
 GROUPS = ("method", "engine", "scene", "trajectory", "protocol", "budget", "experiment")
@@ -30,8 +28,8 @@ def main(options: argparse.Namespace) -> int:
         for name, about in described(group, words).items()
     ]
     _show("Choices", ("choice", "what it is"), files)
-    plug_ins = [(each.name, _brings(each, words)) for each in installed()]
-    _show("Installed plug-ins", ("plug-in", "what it brings"), plug_ins)
+    installed = [(each.name, _brings(each, words)) for each in plug_ins()]
+    _show("Installed plug-ins", ("plug-in", "what it brings"), installed)
     if not options.here:
         console().print("Backends and engines that this machine can use: steerbench list --here")
         return 0
@@ -40,9 +38,7 @@ def main(options: argparse.Namespace) -> int:
 
     backends = [(name, why or "usable") for name, why in availability().items()]
     _show("Backends of the kernels", ("backend", "here"), backends)
-    engines = [
-        (name, _state(name, kind)) for name, kind in engine_kinds(choices("engine", words)).items()
-    ]
+    engines = [(name, _state(name, kind)) for name, kind in engine_kinds(words).items()]
     _show("Engines of the networks", ("engine", "here"), engines)
     return 0
 
@@ -53,8 +49,13 @@ def _show(title: str, columns: tuple[str, str], lines: Sequence[tuple[str, str]]
 
 
 def described(group: str, words: Sequence[str] = ()) -> dict[str, str]:
-    """Every choice of `group`, including folders named in `words`, with its description."""
-    return {name: _comment(path.read_text()) for name, path in choices(group, words).items()}
+    """Every choice of `group`, including folders named in `words`, with its description: the first
+    comment that is not a Hydra directive (`# @package`)."""
+    comments = {}
+    for name, path in choices(group, words).items():
+        lines = (line.removeprefix("#").strip() for line in path.open() if line.startswith("#"))
+        comments[name] = next((line for line in lines if not line.startswith("@")), "")
+    return comments
 
 
 def _brings(plug_in: PlugIn, words: Sequence[str]) -> str:
@@ -76,9 +77,3 @@ def _state(name: str, kind: Any) -> str:
     with suppress(metadata.PackageNotFoundError):  # an engine's name may differ from its library's
         return f"usable (version {metadata.version(name)})"
     return "usable"
-
-
-def _comment(text: str) -> str:
-    """The first comment that is not a Hydra directive (`# @package`)."""
-    lines = (line.removeprefix("#").strip() for line in text.splitlines() if line.startswith("#"))
-    return next((line for line in lines if not line.startswith("@")), "")

@@ -22,8 +22,7 @@ from bench.scoring import check_frame
 from bench.trajectories import MIXED
 from bench.types import Camera, Method, NullProbe
 from bench.video import recorded
-from sweeps.build import build
-from sweeps.configured import scene_of, trained
+from sweeps.configured import build, scene_of, trained
 from sweeps.overrides import beside, composed, setting
 
 

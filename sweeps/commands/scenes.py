@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bench.console import ConsoleLog
+from bench.errors import unknown
 from bench.published import Published, get, published, verify
-from sweeps.names import unknown
 
 SHOWN = 5
 """Missing or extra files to print by name, because there may be hundreds."""
@@ -17,14 +17,10 @@ SHOWN = 5
 def main(options: argparse.Namespace) -> int:
     """Do what `options.action` says; return 1 if a file differs from the release or none exists."""
     log = ConsoleLog(Path("outputs"))
-    if options.action == "get":
-        return _get(options.name, options.to, log)
-    return _verify(Path(options.name), log)
-
-
-def _get(name: str, to: Path, log: ConsoleLog) -> int:
-    data, scenes = _found(name)
-    folder = to / data.name if len(data.scenes) > 1 else to
+    if options.action == "verify":
+        return _verify(Path(options.name), log)
+    data, scenes = _found(options.name)
+    folder = options.to / data.name if len(data.scenes) > 1 else options.to
     for scene in scenes:
         path = get(data, scene, folder, log)
         print(f"{path}: scene={data.layout} scene.path={path}")

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from sweeps import arguments, cli, overrides
+from sweeps import cli, overrides
 from sweeps.overrides import choices, composed, swept
 from sweeps.plan import chosen, plan
 from sweeps.variants import METHOD
@@ -183,7 +183,7 @@ def test_every_command_of_a_document_can_be_typed(document, words, monkeypatch, 
             return
     else:
         options = captured(monkeypatch, words)
-        studied = arguments.COMMANDS[words[0]]["group"] == "studies of a method"
+        studied = cli.COMMANDS[words[0]]["group"] == "studies of a method"
         usual = [METHOD] if studied else []
         settings = [*usual, *getattr(options, "overrides", [])]
     settings = [word for word in settings if not word.startswith(ELSEWHERE)]
@@ -196,7 +196,7 @@ def test_every_command_of_a_document_can_be_typed(document, words, monkeypatch, 
 
 def test_every_command_there_is_has_an_example():
     examples = {words[0] for words in commands(DOCS / "commands.md")}
-    assert examples == set(arguments.COMMANDS)
+    assert examples == set(cli.COMMANDS)
 
 
 GROUPS = ("method", "scene", "trajectory", "protocol", "budget", "engine")

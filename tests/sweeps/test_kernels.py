@@ -1,15 +1,19 @@
-"""`steerbench kernels`: a table, then JSON; a kernel that is wrong fails the command."""
+"""`steerbench kernels`: a table, then JSON; a kernel that is wrong fails it, and `compile`."""
 
 from __future__ import annotations
 
 import fcntl
 import json
+import sys
+from types import SimpleNamespace
 
 import pytest
 
 from bench.case import Case
+from bench.errors import Unavailable
 from bench.types import Log
-from sweeps.device_lock import lock_file
+from sweeps.commands.kernels import wrong_of
+from sweeps.processes import lock_file
 
 RIGHT = {
     "kernel": "encode", "case": "view", "backend": "cpu", "dtype": "float32", "error": 1e-7,
@@ -75,3 +79,37 @@ def test_what_a_kernel_brings_has_a_line_for_each_that_a_method_calls(steerbench
         assert row["method"] == "ngp"
         assert min(row["frame_ms"], row["training_s"], row["training_s_reference"]) > 0
     assert rows["march"]["frame_ms_reference"] > 0
+
+
+@pytest.mark.parametrize(
+    ("error", "slow", "cells", "wrong"),
+    [
+        (0.0, False, [("cpu", "fp32")], []),  # what is not compiled is left out
+        (0.5, False, [("cpu", "fp32")], ["march: empty"]),
+        (0.5, True, [], []),
+        (Unavailable("no such products"), False, [("cpu", "fp32")], []),
+    ],
+)
+def test_compiled_kernels_compute_their_quick_cases(monkeypatch, error, slow, cells, wrong):
+    computed = []
+
+    def measure(backend: str, device: str, precision: str) -> float:
+        computed.append((backend, precision))
+        if isinstance(error, Unavailable):
+            raise error
+        return error
+
+    tolerances = {("cpu", "fp32"): 0.1, ("reference", "fp32"): 0.1}
+    case = Case("march", "empty", "", "", tolerances, measure, slow=slow)
+    monkeypatch.setitem(sys.modules, "stand_in", SimpleNamespace(cases=lambda: [case]))
+    assert wrong_of("stand_in") == wrong
+    assert computed == cells
+
+
+@pytest.mark.slow
+def test_compile_computes_the_cases_of_all_modules_in_processes(steerbench, monkeypatch):
+    monkeypatch.setattr("methods.checks.modules", lambda name: ["methods.kernels.spherical.cases"])
+    assert steerbench("compile").status == 0
+    monkeypatch.setattr("methods.checks.modules", lambda name: ["methods.kernels.spherical"])
+    with pytest.raises(AttributeError, match="has no attribute 'cases'"):
+        steerbench("compile")

@@ -6,7 +6,7 @@ import pytest
 
 from bench.results import Store
 from bench.types import Scene
-from sweeps.identity import described
+from sweeps.measurement import described
 from sweeps.overrides import composed
 from sweeps.plan import chosen, plan
 from tests.sweeps.conftest import STAND_INS

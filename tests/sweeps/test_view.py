@@ -16,7 +16,7 @@ from PIL import Image
 
 from sweeps import cli
 from sweeps.commands import view
-from sweeps.viewer import AS_GIVEN, Viewer
+from sweeps.commands.view import AS_GIVEN, Viewer
 
 from .conftest import STAND_INS
 
@@ -81,7 +81,7 @@ class Page:
 @contextmanager
 def browser(viewer: Viewer) -> Iterator[Page]:
     protocol = f"viser-v{viser.__version__}"
-    address = f"ws://127.0.0.1:{viewer.port}"
+    address = f"ws://127.0.0.1:{viewer.server.get_port()}"
     with client.connect(address, subprotocols=[protocol], max_size=None) as socket:
         yield Page(viewer, socket)
 

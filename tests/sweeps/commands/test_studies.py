@@ -62,14 +62,9 @@ def test_accuracy_renders_a_method_without_knobs_as_it_is_and_says_so(study):
 
 def test_skips_shows_the_work_with_each_skip_alone(study):
     found = {row["skipped"]: row for row in rows(study("skips", "shades"))}
-    halves = {name: row["halves"] for name, row in found.items()}
-    assert halves == {
-        "nothing": 2,
-        "left half": 1,
-        "right half": 1,
-        "all of these": 0,
-        "and half as bright": 0,
-    }
+    halves = {"nothing": 2, "left half": 1, "right half": 1}
+    halves |= {"all of these": 0, "and half as bright": 0}
+    assert {name: row["halves"] for name, row in found.items()} == halves
     assert found["and half as bright"]["lost"] > 0
 
 
@@ -169,13 +164,10 @@ def test_scaling_has_pixels_and_threads_for_every_method(study):
 @pytest.mark.parametrize(
     ("stage", "part"),
     [
-        ("field", "field"),
         ("field/march", "field"),
         ("renderer", "renderer"),
-        ("renderer/network", "network"),
         ("renderer/network/layer", "network"),
         ("renderer/other", "renderer"),
-        ("some stage", "some stage"),
         ("some stage/inside", "some stage/inside"),
     ],
 )

@@ -14,10 +14,8 @@ ABSENT = 0.9
 
 
 @pytest.fixture
-def trained(monkeypatch: pytest.MonkeyPatch, tmp_path) -> list[float]:
+def trained(elsewhere: None, monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The levels of the greys that were fitted."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(HERE)
     import stand_ins
 
     levels: list[float] = []
@@ -38,8 +36,8 @@ def greys(*levels: float, more: tuple[str, ...] = ()) -> dict[str, list[str]]:
 
 
 def test_what_cannot_be_used_is_left_out(trained):
-    with fitted(greys(0.1, ABSENT, 0.3), 2) as each:
-        assert list(each.methods) == ["0.1", "0.3"]
+    with fitted(greys(0.1, ABSENT, 0.3), 2) as (methods, _, _):
+        assert list(methods) == ["0.1", "0.3"]
     assert trained == [0.1, 0.3]
 
 
@@ -63,6 +61,6 @@ def test_what_cannot_be_compared_is_refused_at_once(trained, monkeypatch, memory
 
 
 def test_pictures_too_small_for_lpips_are_not_refused_where_it_is_not_computed(trained):
-    with fitted(greys(0.1, more=("protocol=steerbench-1",)), 1) as each:
-        assert len(each.trajectory.steps) == 1
-        assert each.protocol.lpips == ()
+    with fitted(greys(0.1, more=("protocol=steerbench-1",)), 1) as (_, ground, _):
+        assert len(ground.trajectory.steps) == 1
+        assert ground.protocol.lpips == ()

@@ -13,8 +13,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from bench.errors import SteerbenchError
-from sweeps.build import build, check_settings, target_of
-from sweeps.overrides import composed
+from sweeps.configured import build, check_settings
+from sweeps.overrides import composed, target_of
 
 
 @dataclass
@@ -49,16 +49,16 @@ class Outer:
 @pytest.fixture(autouse=True)
 def targets(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make the classes above importable by name."""
-    module = ModuleType("targets_of_build")
+    module = ModuleType("targets")
     module.Inner, module.Outer = Inner, Outer
-    monkeypatch.setitem(sys.modules, "targets_of_build", module)
+    monkeypatch.setitem(sys.modules, "targets", module)
 
 
 def built(*overrides: str) -> Outer:
     """`Outer` from a configuration with `overrides`."""
     node = {
-        "_target_": "targets_of_build.Outer",
-        "inner": {"_target_": "targets_of_build.Inner", "size": 3},
+        "_target_": "targets.Outer",
+        "inner": {"_target_": "targets.Inner", "size": 3},
     }
     config = OmegaConf.merge({"thing": node}, OmegaConf.from_dotlist(list(overrides)))
     return build(config, "thing", "from the caller", log="a log")
@@ -112,7 +112,7 @@ def test_a_setting_that_does_not_fit_is_named_in_full(override, message):
 
 
 def test_a_dataclass_may_have_fields_of_types_that_only_the_module_of_its_base_knows(monkeypatch):
-    base = ModuleType("base_of_build")
+    base = ModuleType("base_of_targets")
     source = """
 from __future__ import annotations
 from dataclasses import dataclass

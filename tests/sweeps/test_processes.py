@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import tempfile
 import threading
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,55 +13,34 @@ import pytest
 import torch
 
 from bench.console import ConsoleLog
-from sweeps import device_lock
-from sweeps.device_lock import lock_file
+from sweeps.processes import LOCKS, device_lock, lock_file
 
 PATIENCE_S = 60.0
 """A test that waits longer has failed."""
 
 
-class Heard(ConsoleLog):
-    """A log that keeps its messages in a queue."""
-
-    def __init__(self, root: Path) -> None:
-        super().__init__(root, quiet=True)
-        self.messages: queue.Queue[str] = queue.Queue()
-
-    def info(self, message: str) -> None:
-        self.messages.put(message)
-
-
 @pytest.fixture(autouse=True)
 def locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(device_lock.FOLDER, str(tmp_path))
+    monkeypatch.setenv(LOCKS, str(tmp_path))
 
 
-def waiting(outputs: Path, device: str) -> tuple[threading.Thread, Heard, threading.Event]:
-    """A second thread that wants the lock: its log, and whether it had the lock."""
-    log, had = Heard(outputs), threading.Event()
+@pytest.mark.parametrize("ending", [None, KeyError])
+def test_a_device_that_is_locked_is_waited_for_until_its_work_ends_or_fails(tmp_path, ending):
+    messages: queue.Queue[str] = queue.Queue()
+    log, had = ConsoleLog(tmp_path), threading.Event()
+    log.info = messages.put
 
     def other() -> None:
-        with device_lock.device_lock(device, log):
+        with device_lock("cpu", log):
             had.set()
 
     thread = threading.Thread(target=other, daemon=True)
-    thread.start()
-    return thread, log, had
-
-
-def test_a_device_that_is_locked_is_waited_for(tmp_path):
-    with device_lock.device_lock("cpu", Heard(tmp_path)):
-        thread, log, had = waiting(tmp_path / "elsewhere", "cpu")
-        assert "waiting: another process measures on cpu" in log.messages.get(timeout=PATIENCE_S)
+    with pytest.raises(ending) if ending else nullcontext(), device_lock("cpu", log):
+        thread.start()
+        assert "waiting: another process measures on cpu" in messages.get(timeout=PATIENCE_S)
         assert not had.is_set()
-    thread.join(PATIENCE_S)
-    assert had.is_set()
-
-
-def test_a_failure_releases_the_lock(tmp_path):
-    with pytest.raises(KeyError), device_lock.device_lock("cpu", Heard(tmp_path)):
-        raise KeyError
-    thread, _, had = waiting(tmp_path, "cpu")
+        if ending:
+            raise ending
     thread.join(PATIENCE_S)
     assert had.is_set()
 
@@ -77,7 +57,7 @@ def test_gpus_are_told_apart_by_their_uuid(tmp_path, monkeypatch):
 
 
 def test_locks_lie_where_every_job_and_user_of_the_machine_sees_them(tmp_path, monkeypatch):
-    monkeypatch.delenv(device_lock.FOLDER)
+    monkeypatch.delenv(LOCKS)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "of this job"))
     assert lock_file("cpu").parent == Path("/var/tmp")
 
