@@ -31,18 +31,9 @@ from pathlib import Path
 import pandas as pd
 
 from bench.console import ConsoleLog
+from bench.errors import SteerbenchError
 from bench.results import Store
-from bench.types import (
-    Budget,
-    Camera,
-    Frame,
-    Method,
-    NullProbe,
-    Probe,
-    Scene,
-    Split,
-    SteerbenchError,
-)
+from bench.types import Budget, Camera, Frame, Method, NullProbe, Probe, Scene, Split
 from reports.runs import Run, load
 from sweeps import configured
 from sweeps.commands.list import described

@@ -53,13 +53,9 @@ REFUSALS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, 
 def main() -> None:
     """Run the command line and exit with its status."""
     set_up()
-    signal.signal(signal.SIGTERM, _terminate)
+    # Exit through every `finally`, so that checkpoints are saved and temporary files removed.
+    signal.signal(signal.SIGTERM, lambda signum, _: sys.exit(128 + signum))
     sys.exit(guard(dispatch, sys.argv[1:]))
-
-
-def _terminate(signum: int, frame: object) -> NoReturn:
-    """Exit through every `finally`, so that checkpoints are saved and temporary files removed."""
-    sys.exit(128 + signum)
 
 
 def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:

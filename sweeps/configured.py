@@ -29,9 +29,6 @@ from sweeps.overrides import VALIDATION, target_of
 STANDS_FOR = {"Path": str, "tuple": list, "Sequence": list, "Mapping": dict, "float": float | int}
 """By the name of a type in a signature: the type that a configuration holds instead."""
 
-HELD_OUT = 8
-"""One in this many training pictures is held out if a trajectory renders held-out pictures."""
-
 USUAL_THREADS = torch.get_num_threads()
 """Number of threads that torch uses by default."""
 
@@ -89,8 +86,8 @@ def trained(config: DictConfig, log: Log) -> Method:
 def scene_of(config: DictConfig) -> Scene:
     """The scene that `config` describes.
 
-    If its trajectory renders held-out training pictures, these are removed from the training split,
-    so that a model is never scored on pictures that it was trained on.
+    If its trajectory renders held-out training pictures, these, one in eight, are removed from the
+    training split, so that a model is never scored on pictures that it was trained on.
     """
     return _scene(*_contents(config))
 
@@ -122,7 +119,7 @@ def _scene(node: str, root: Path, held_out: bool) -> Scene:
     """Cached for the next job of a sweep."""
     config = OmegaConf.create({"scene": OmegaConf.create(node)})
     scene = build(config, "scene", log=ConsoleLog(root))
-    return hold_out(scene, VALIDATION, HELD_OUT) if held_out else scene
+    return hold_out(scene, VALIDATION, 8) if held_out else scene
 
 
 # Anything that has a `_target_`
@@ -169,7 +166,9 @@ def check_settings(
     names = [name for name in parameters if name not in given]
     if not settings.get("_partial_"):
         for name in names:  # ~name removes a default of the configurations
-            if _required(parameters[name]) and name not in settings:
+            one = parameters[name]
+            several = one.kind in (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+            if one.default is inspect.Parameter.empty and not several and name not in settings:
                 raise SteerbenchError(f"{prefix}{name} is not set: give {prefix}{name}=...")
     for name, value in settings.items():
         if name.startswith("_"):  # Hydra's own: _target_, _convert_
@@ -181,11 +180,6 @@ def check_settings(
         elif not _fits(value, hints.get(name, Any)):
             wanted = " or ".join(map(str, _choices(hints[name]))) or parameters[name].annotation
             raise unexpected(f"{prefix}{name}", wanted, repr(value))
-
-
-def _required(parameter: inspect.Parameter) -> bool:
-    several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    return parameter.default is inspect.Parameter.empty and parameter.kind not in several
 
 
 def _choices(hint: Any) -> tuple[object, ...]:

@@ -11,7 +11,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
-from concurrent.futures import Future, as_completed
+from concurrent.futures import as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -40,9 +40,6 @@ from sweeps.overrides import CONFIGS, composed, explain, setting, target_of
 from sweeps.processes import device_lock, on_gpu, processes, set_up
 from sweeps.terminal import time_left
 
-SUFFIX = ".job.json"
-"""Of the files that record how jobs ended."""
-
 OF_MEASUREMENT = ("engine", "precision", "protocol", "pictures")
 """Settings of run.yaml that no training depends on."""
 
@@ -57,10 +54,8 @@ R = TypeVar("R")
 class Launcher:
     """Where work is done.
 
-    Attributes:
-        words: the settings of Hydra among those of a command (`hydra/launcher=joblib`), and the
-            folders with further choices.
-        outputs: the folder of the store; notes on the work go below it.
+    `words` are the settings of Hydra among those of a command (`hydra/launcher=joblib`), and the
+    folders with further choices. Notes on the work go below `outputs`, the folder of the store.
     """
 
     words: Sequence[str]
@@ -155,13 +150,13 @@ class Ended:
 
     def write(self, folder: Path) -> None:
         """Write the record to `folder`, atomically."""
-        with explained(folder), whole(folder / f"{self.number}{SUFFIX}") as new:
+        with explained(folder), whole(folder / f"{self.number}.job.json") as new:
             new.write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
 
 
 def read(folder: Path) -> list[Ended]:
     """Read the records of all jobs that have ended, in the order of the sweep."""
-    texts = (path.read_text(encoding="utf-8") for path in folder.glob(f"*{SUFFIX}"))
+    texts = (path.read_text(encoding="utf-8") for path in folder.glob("*.job.json"))
     return sorted((Ended(**json.loads(text)) for text in texts), key=lambda job: job.number)
 
 
@@ -244,7 +239,9 @@ def train_ahead(jobs: Sequence[Job], measured: Collection[str]) -> None:
         names = {pool.submit(_train, job.config): job.name for job in todo.values()}
         for number, ended in enumerate(as_completed(names), 1):
             left = time_left(time.monotonic() - begun, number, len(todo) - number)
-            print(f"{_said(ended)}: {names[ended]}{left}", file=sys.stderr)
+            error = ended.exception()
+            how = f"failed: {reason(error)}" if error else f"trained in {ended.result():.0f} s"
+            print(f"{how}: {names[ended]}{left}", file=sys.stderr)
 
 
 def room(config: DictConfig) -> int:
@@ -268,8 +265,3 @@ def _training(job: Job) -> str:
 def _train(config: DictConfig) -> float:
     """Train, or load the training, in a worker process; return the seconds it took."""
     return trained(config, ConsoleLog(Path(config.outputs), quiet=True)).train_s
-
-
-def _said(ended: Future[float]) -> str:
-    error = ended.exception()
-    return f"trained in {ended.result():.0f} s" if error is None else f"failed: {reason(error)}"

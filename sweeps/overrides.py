@@ -10,7 +10,6 @@ import pkgutil
 import re
 import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from importlib import metadata, util
 from itertools import pairwise
@@ -106,9 +105,6 @@ def setting(name: str, text: str) -> str:
     return f"{name}='{escaped}'"
 
 
-# Errors
-
-
 def of_hydra(error: Exception) -> bool:
     """Whether the error comes from Hydra.
 
@@ -177,9 +173,6 @@ def holds(word: str, configs: Iterable[DictConfig]) -> bool:
     )
 
 
-# Choices and their folders
-
-
 def choices(group: str, words: Sequence[str] = ()) -> dict[str, Path]:
     """The file of every choice of `group` by name, including folders named in `words`."""
     found = {
@@ -218,7 +211,7 @@ def _overrides(words: Sequence[str]) -> list[str]:
 
 def _folders(words: Sequence[str]) -> list[Path]:
     """Our configurations, the folders named in `words`, and those of installed plug-ins."""
-    return [CONFIGS, *_typed(words), *(each.folder for each in plug_ins() if each.folder)]
+    return [CONFIGS, *_typed(words), *(x for x in plug_ins().values() if isinstance(x, Path))]
 
 
 def _typed(words: Sequence[str]) -> list[Path]:
@@ -231,34 +224,25 @@ def _typed(words: Sequence[str]) -> list[Path]:
     return further
 
 
-@dataclass(frozen=True)
-class PlugIn:
-    """An entry point with its distribution, "mine (mine-renderers 1.0)", and the folder it names.
-
-    The folder contains one of YAML files for each group. None: it cannot be used, `fault` says why.
-    """
-
-    name: str
-    folder: Path | None
-    fault: str = ""
-
-
 @cache
-def plug_ins() -> tuple[PlugIn, ...]:
-    """All plug-ins of this environment, including unusable ones."""
-    entries = sorted(metadata.entry_points(group=PLUG_INS), key=lambda entry: entry.name)
-    return tuple(map(_plug_in, entries))
+def plug_ins() -> dict[str, Path | str]:
+    """The plug-ins of this environment by name, "mine (mine-renderers 1.0)": the folder that holds
+    one of YAML files for each group, or why it cannot be used."""
+    found = {}
+    for entry in sorted(metadata.entry_points(group=PLUG_INS), key=lambda entry: entry.name):
+        of = f" ({entry.dist.name} {entry.dist.version})" if entry.dist else ""
+        found[entry.name + of] = _folder_of(entry.value)
+    return found
 
 
-def _plug_in(entry: metadata.EntryPoint) -> PlugIn:
-    name = f"{entry.name} ({entry.dist.name} {entry.dist.version})" if entry.dist else entry.name
+def _folder_of(package: str) -> Path | str:
     try:
-        spec = util.find_spec(entry.value)  # imports the parent packages
+        spec = util.find_spec(package)  # imports the parent packages
     except Exception as error:  # whatever their code raises
-        return PlugIn(name, None, f"{type(error).__name__}: {error}")
+        return f"{type(error).__name__}: {error}"
     if spec is None or not spec.submodule_search_locations:
-        return PlugIn(name, None, f"there is no package {entry.value}")
-    return PlugIn(name, Path(next(iter(spec.submodule_search_locations))))
+        return f"there is no package {package}"
+    return Path(next(iter(spec.submodule_search_locations)))
 
 
 class _InstalledChoices(SearchPathPlugin):

@@ -25,9 +25,6 @@ from sweeps.processes import on_gpu
 TABLES = CONFIGS / "experiment"
 """The folder of the experiments that declare the tables."""
 
-REPEATED = "seed"
-"""The only setting that may have several values; a cell then shows mean and interval."""
-
 MARKS = {"blender": camera_file("train"), "nsvf": "bbox.txt"}
 """The file by which a scene's layout is recognised, by the value of `scene=` that reads it."""
 
@@ -36,10 +33,8 @@ MARKS = {"blender": camera_file("train"), "nsvf": "bbox.txt"}
 class DataSet:
     """Scenes of one layout: NeRF-Synthetic, or Tanks & Temples in NSVF's layout.
 
-    Attributes:
-        layout: the value of `scene=` that reads them.
-        scenes: the folder of each scene by name.
-        missing: why other scenes of the data set are left out, by name.
+    `layout` is the value of `scene=` that reads them. By name: the folders of the `scenes`, and why
+    others are `missing`.
     """
 
     layout: str
@@ -116,7 +111,7 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
         values = [word for word in settings if word not in groups]
         of_line = seeds or (usual if repeated else usual[:1])
         for seed, (scene, folder) in product(of_line, scenes.items()):
-            word = f"{REPEATED}={seed}"
+            word = f"seed={seed}"
             config = changed(with_choices(*groups), [*values, word])
             place = []
             if data:
@@ -147,11 +142,11 @@ def _lines(table: PaperTable, beyond: bool) -> Iterator[tuple[str, Line, bool]]:
 def _seeds(words: Sequence[str]) -> tuple[list[str], list[str]]:
     """The words that all jobs share, and the seeds given by the other words."""
     several = swept(words)
-    if others := sorted(several.keys() - {REPEATED}):
-        got = f"{', '.join(several[others[0]])}; only {REPEATED} may take several here"
+    if others := sorted(several.keys() - {"seed"}):
+        got = f"{', '.join(several[others[0]])}; only seed may take several here"
         raise unexpected(others[0], "one value", got)
-    named = [word for word in words if word.lstrip("+").partition("=")[0] == REPEATED]
-    values = several.get(REPEATED) or [word.partition("=")[2] for word in named[-1:]]
+    named = [word for word in words if word.lstrip("+").partition("=")[0] == "seed"]
+    values = several.get("seed") or [word.partition("=")[2] for word in named[-1:]]
     return [word for word in words if word not in named], list(dict.fromkeys(values))
 
 

@@ -21,9 +21,6 @@ if TYPE_CHECKING:  # these load torch, which `steerbench list` does without
     from bench.results import Store
     from reports.runs import Run
 
-PIPE_WIDTH = 200
-"""Width of text without a terminal: wide enough for every table."""
-
 
 class _Output(Console):
     def on_broken_pipe(self) -> None:
@@ -32,14 +29,13 @@ class _Output(Console):
 
 
 def console() -> Console:
-    """Standard output; in a file or pipe, tables are not cut to 80 columns."""
-    return _Output(width=None if sys.stdout.isatty() else PIPE_WIDTH, highlight=False)
+    """Standard output; in a file or pipe it is wide enough for every table."""
+    return _Output(width=None if sys.stdout.isatty() else 200, highlight=False)
 
 
-def show(*tables: Table) -> None:
-    """Print `tables`, one below the other."""
-    for table in tables:
-        console().print(rich_table(table))
+def show(table: Table) -> None:
+    """Print `table`."""
+    console().print(rich_table(table))
 
 
 def show_run(run: Run, heading: str) -> None:
@@ -61,9 +57,7 @@ def write_page(
 ) -> None:
     """Write a page into the folder `report`, if there is to be one, and print where it is.
 
-    Args:
-        labels: the names of its runs, by key; without any, there is no page.
-        failed: why other jobs failed, by name.
+    It shows the runs whose keys are in `labels`, if any, and says why other jobs `failed`, by name.
     """
     if report and labels:
         from reports import page  # loads matplotlib, which only a page needs

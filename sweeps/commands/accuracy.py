@@ -23,8 +23,6 @@ from sweeps.processes import device_lock
 from sweeps.terminal import print_rows, show
 from sweeps.variants import Row
 
-Knobs = Mapping[str, Sequence[Variant]]
-
 
 def main(options: argparse.Namespace) -> int:
     """Print both tables and the recommended setting, then all rows as JSON in the last line."""
@@ -80,7 +78,7 @@ def _last_words(words: Sequence[str]) -> list[str]:
     return list({key[word]: word for word in words}.values())
 
 
-def _knobs(config: DictConfig, words: Sequence[str], trained: bool) -> Knobs:
+def _knobs(config: DictConfig, words: Sequence[str], trained: bool) -> dict[str, Sequence[Variant]]:
     """The variants of each knob, by the knob's name, with everything else unchanged.
 
     First come the two that the knobs are compared with: everything off, if the method declares what
@@ -100,7 +98,9 @@ def _knobs(config: DictConfig, words: Sequence[str], trained: bool) -> Knobs:
     }
 
 
-def _chosen(knobs: Knobs, parts: Sequence[str]) -> list[tuple[str, Variant]]:
+def _chosen(
+    knobs: Mapping[str, Sequence[Variant]], parts: Sequence[str]
+) -> list[tuple[str, Variant]]:
     """What all knobs are compared with, and variants of knobs with any of `parts` in their name."""
     chosen = set(list(knobs)[: list(knobs).index(variants.AS_IT_IS.name) + 1])
     turned = [knob for knob in knobs if knob not in chosen]

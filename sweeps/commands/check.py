@@ -66,17 +66,12 @@ def _compare(options: argparse.Namespace) -> int:
 def _by_command(store: Store) -> dict[str, dict[str, Run]]:
     """Every run, by what was typed for it and by its seed; of several, the last that was stored."""
     stored: dict[str, dict[str, Run]] = {}
+    others = (*PLACES, "hydra.mode", "seed")  # what does not change a row is left out, too
     for run in readable(store):
-        seeds = stored.setdefault(_command(str(run.record["command"])), {})
-        seeds[str(run.facts["seed"])] = run
+        words = shlex.split(str(run.record["command"]))[2:]
+        kept = sorted(word for word in words if word.partition("=")[0] not in others)
+        stored.setdefault(shlex.join(kept), {})[str(run.facts["seed"])] = run
     return stored
-
-
-def _command(typed: str) -> str:
-    """What was typed, in one order, without the seed and what does not change a row."""
-    words = shlex.split(typed)[2:]
-    others = (*PLACES, "hydra.mode", "seed")
-    return shlex.join(sorted(word for word in words if word.partition("=")[0] not in others))
 
 
 def _record(path: Path, stored: Mapping[str, Mapping[str, Run]]) -> None:

@@ -6,14 +6,15 @@ import argparse
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 from bench.errors import SteerbenchError, Unavailable
 from reports.tables import Table
-from sweeps.overrides import PlugIn, choices, engine_kinds, plug_ins
+from sweeps.overrides import choices, engine_kinds, plug_ins
 from sweeps.terminal import console, show
 
-GROUPS = ("method", "engine", "scene", "trajectory", "protocol", "budget", "experiment")
+GROUPS = ("method", "engine", "scene", "trajectory", "protocol", "budget", "+experiment")
 
 
 def main(options: argparse.Namespace) -> int:
@@ -23,12 +24,12 @@ def main(options: argparse.Namespace) -> int:
     """
     words = options.config_dir
     files = [
-        (f"{'+' if group == 'experiment' else ''}{group}={name}", about)
+        (f"{group}={name}", about)
         for group in GROUPS
-        for name, about in described(group, words).items()
+        for name, about in described(group.lstrip("+"), words).items()
     ]
     _show("Choices", ("choice", "what it is"), files)
-    installed = [(each.name, _brings(each, words)) for each in plug_ins()]
+    installed = [(name, _brings(folder, words)) for name, folder in plug_ins().items()]
     _show("Installed plug-ins", ("plug-in", "what it brings"), installed)
     if not options.here:
         console().print("Backends and engines that this machine can use: steerbench list --here")
@@ -58,15 +59,15 @@ def described(group: str, words: Sequence[str] = ()) -> dict[str, str]:
     return comments
 
 
-def _brings(plug_in: PlugIn, words: Sequence[str]) -> str:
-    """The choices of a plug-in, or why it has none."""
-    if plug_in.folder is None:
-        return f"cannot be used: {plug_in.fault}"
+def _brings(folder: Path | str, words: Sequence[str]) -> str:
+    """The choices of a plug-in's folder, or why it has none."""
+    if isinstance(folder, str):
+        return f"cannot be used: {folder}"
     brought = []
-    for path in sorted(plug_in.folder.glob("*/*.yaml")):
+    for path in sorted(folder.glob("*/*.yaml")):
         group, hidden = path.parent.name, choices(path.parent.name, words)[path.stem] != path
         brought.append(f"{group}={path.stem}" + (" (hidden: the name is taken)" if hidden else ""))
-    return ", ".join(brought) or f"nothing: there are no GROUP/NAME.yaml in {plug_in.folder}"
+    return ", ".join(brought) or f"nothing: there are no GROUP/NAME.yaml in {folder}"
 
 
 def _state(name: str, kind: Any) -> str:

@@ -175,10 +175,7 @@ def gather(jobs: Sequence[Planned], runs: Mapping[str, Sequence[Run]]) -> dict[s
     """The lines of every table, each with its runs and the reasons why others are missing.
 
     With several scenes, a run of a line is the mean of one seed over the scenes that all lines of
-    the block have. Lines without any measurement are ignored for this.
-
-    Args:
-        runs: as returned by `newest`.
+    the block have. Lines without any measurement are ignored for this. `runs` are from `newest`.
     """
     blocks: dict[tuple[str, str], dict[str, list[Outcome]]] = {}
     for job in jobs:

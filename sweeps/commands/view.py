@@ -36,9 +36,6 @@ from sweeps.overrides import beside, composed
 if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle, ViserServer
 
-TALLEST = 2160
-"""Maximum height of a picture in pixels."""
-
 AS_GIVEN = "as given"
 """The setting of a knob that was not changed."""
 
@@ -92,8 +89,7 @@ class Viewer:
             ones choose the scene, the first camera and the folder of outputs.
 
     Raises:
-        Unavailable: viser is not installed.
-        SteerbenchError: a setting is wrong, the training failed, or the address cannot be served.
+        SteerbenchError: viser is not installed, or the address cannot be served.
     """
 
     def __init__(self, wanted: Sequence[Sequence[str]], host: str, port: int) -> None:
@@ -210,7 +206,7 @@ class Viewer:
             client,
             shown=gui.add_dropdown("picture", choices, initial_value=SIDE if two else choices[0]),
             split=gui.add_slider("divided at", 0.0, 1.0, 0.01, 0.5, visible=two),
-            height=gui.add_slider("rows", 16, TALLEST, 8, self.first.height),
+            height=gui.add_slider("rows", 16, 2160, 8, self.first.height),
             exact=gui.add_checkbox("PSNR", False, visible=self.scene.exact is not None),
             record=gui.add_checkbox("record a path", False),
             figures=gui.add_markdown("drawing the first picture ..."),

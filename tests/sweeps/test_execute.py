@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from concurrent.futures import Future
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
@@ -106,12 +105,6 @@ def test_there_are_as_many_at_a_time_as_cores_have_room_for(threads, device, tog
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(6)))
     config = composed([f"budget.threads={threads}", f"device={device}"])
     assert execute.room(config) == together
-
-
-def test_a_failed_training_says_why():
-    ended: Future[float] = Future()
-    ended.set_exception(SteerbenchError("no room\nfor it"))
-    assert execute._said(ended) == "failed: no room for it"
 
 
 SMALL = [

@@ -16,7 +16,7 @@ import pytest
 from bench import sources
 from sweeps import execute
 from sweeps.measurement import obtain
-from sweeps.overrides import PLUG_INS, PlugIn, plug_ins
+from sweeps.overrides import PLUG_INS, plug_ins
 
 from .test_documents import WITHOUT_LPIPS, mine  # noqa: F401 (a fixture)
 
@@ -183,11 +183,11 @@ def test_the_package_of_the_document_is_installed_listed_and_measured(mine: Path
 
 
 @pytest.fixture
-def plugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., PlugIn]]:
+def plugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Path | str]]:
     """Install a package `other` with an entry point of a value, and files of its folder."""
     monkeypatch.syspath_prepend(tmp_path / "site")
 
-    def install(value: str, files: Mapping[str, str] = MappingProxyType({})) -> PlugIn:
+    def install(value: str, files: Mapping[str, str] = MappingProxyType({})) -> Path | str:
         info = {
             "METADATA": "Metadata-Version: 2.1\nName: other\nVersion: 2.0\n",
             "entry_points.txt": f"[{PLUG_INS}]\nother = {value}\n",
@@ -198,7 +198,7 @@ def plugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text)
         plug_ins.cache_clear()
-        (found,) = [one for one in plug_ins() if one.name.startswith("other")]
+        (found,) = [one for name, one in plug_ins().items() if name.startswith("other")]
         return found
 
     yield install
@@ -215,9 +215,7 @@ def test_a_package_that_cannot_be_imported_is_a_line(plugged, steerbench):
 
 
 def test_an_entry_that_leads_nowhere_says_so(plugged):
-    found = plugged("nowhere_at_all")
-    assert found.folder is None
-    assert found.fault == "there is no package nowhere_at_all"
+    assert plugged("nowhere_at_all") == "there is no package nowhere_at_all"
 
 
 def test_a_name_that_is_taken_stays_ours(plugged, steerbench):
