@@ -20,7 +20,8 @@ PATH = os.pathsep.join((str(HERE), str(HERE.parents[1])))
 """Where other processes find the stand-ins, and the code of this checkout."""
 
 QUICK = ["method=grey", "scene=white", "budget=none", "protocol=quick"]
-STAND_INS = ["--config-dir", str(HERE / "configs"), *QUICK]
+CONFIGS = f"--config-dir={HERE / 'configs'}"
+STAND_INS = [CONFIGS, *QUICK]
 
 
 class Outcome(NamedTuple):

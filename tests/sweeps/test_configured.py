@@ -147,7 +147,6 @@ def test_a_target_that_cannot_be_imported_is_named(name):
         (["~method.grid"], ".grid is not set: give method.grid=..."),
         (["method.model.scale=8"], "use renderer.init=scratch"),
         (["method.renderer.width=0"], "renderer.width: expected 1 to 4096, got 0"),
-        (["method.renderer.blocks=-1"], "renderer.blocks: expected 0 to 256, got -1"),
         (["method.joint.opacity_entropy=-1"], "joint.opacity_entropy: expected 0 or more, got -1"),
     ],
 )

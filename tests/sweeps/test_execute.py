@@ -16,7 +16,7 @@ from sweeps.execute import Ended, read
 from sweeps.measurement import Job
 from sweeps.overrides import composed
 from sweeps.plan import chosen, plan
-from tests.sweeps.conftest import HERE
+from tests.sweeps.conftest import HERE, STAND_INS
 
 TABLES = {table.name: replace(table, curve=False) for table in chosen(None, [])}
 
@@ -86,8 +86,7 @@ def test_nothing_is_trained_for_a_line_whose_fellow_is_measured(monkeypatch):
 def test_a_method_that_declares_nothing_is_trained_for_each_of_its_settings(monkeypatch):
     """A plug-in may train with a setting that others choose afterwards."""
     monkeypatch.syspath_prepend(HERE)
-    words = [f"--config-dir={HERE / 'configs'}", "method=grey", "scene=white"]
-    configs = [composed([*words, f"+method.stop={stop}"]) for stop in (0.1, 0.2)]
+    configs = [composed([*STAND_INS, f"+method.stop={stop}"]) for stop in (0.1, 0.2)]
     assert len({execute._training(Job(config, [])) for config in configs}) == 2
 
 

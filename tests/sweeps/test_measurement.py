@@ -6,14 +6,13 @@ import pytest
 
 from sweeps.measurement import Job, obtain, stored
 from sweeps.overrides import composed
-from tests.sweeps.conftest import HERE, QUICK
+from tests.sweeps.conftest import STAND_INS
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
 
 def jobs(*levels: float, turns: str = "table") -> list[Job]:
-    words = [[*QUICK, f"method.level={level}"] for level in levels]
-    configs = [composed([f"--config-dir={HERE / 'configs'}", *each]) for each in words]
+    configs = [composed([*STAND_INS, f"method.level={level}"]) for level in levels]
     return [Job(config, [], turns=turns) for config in configs]
 
 

@@ -7,7 +7,7 @@ import math
 import os
 import re
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from sweeps.commands import paper
 from sweeps.commands.paper import gather, newest
 from sweeps.measurement import Job, described
 from sweeps.plan import DataSet, Planned, chosen, plan
-from tests.sweeps.conftest import HERE
+from tests.sweeps.conftest import CONFIGS, HERE
 from tests.sweeps.test_plan import blender
 
 TABLE3, TABLE5 = (
@@ -31,6 +31,12 @@ TABLE3, TABLE5 = (
     for table in chosen(None, [])
     if table.name in ("table3", "table5")
 )
+
+
+@pytest.fixture
+def outputs(store: Store) -> str:
+    """The word for the folder of the store."""
+    return f"outputs={store.folder.parent}"
 
 
 @pytest.fixture
@@ -73,8 +79,8 @@ def labels(page: Path) -> list[str]:
     return [line.split("|")[1].strip() for line in lines]
 
 
-def test_a_job_that_fails_stands_in_its_line_and_the_others_run(steerbench, measured, store):
-    outcome = steerbench("paper", "--table", "table3", "seed=0", f"outputs={store.folder.parent}")
+def test_a_job_that_fails_stands_in_its_line_and_the_others_run(steerbench, measured, outputs):
+    outcome = steerbench("paper", "--table", "table3", "seed=0", outputs)
     assert outcome.status == 1
     assert len(measured) == 4 * (1 + 3)  # lines; thrice each for their curves
     assert "failed: table3: L = 3, seed 0: no room" in outcome.err
@@ -84,44 +90,41 @@ def test_a_job_that_fails_stands_in_its_line_and_the_others_run(steerbench, meas
     assert "/ 33.14 /" in page.read_text()
 
 
-def test_the_jobs_go_where_hydras_launcher_puts_them(steerbench, measured, launched, store):
-    words = ("seed=0", f"outputs={store.folder.parent}")
-    assert steerbench("paper", "--table", "table5", *words).status == 0
+def test_the_jobs_go_where_hydras_launcher_puts_them(steerbench, measured, launched, outputs):
+    assert steerbench("paper", "--table", "table5", "seed=0", outputs).status == 0
     assert launched == [len(measured)]
 
 
-def test_what_cannot_run_here_says_so_in_its_line_and_is_no_failure(steerbench, store, monkeypatch):
+def test_what_cannot_run_here_says_so_in_its_line_and_does_not_fail(
+    steerbench, monkeypatch, outputs
+):
     def obtain(*_: object) -> None:
         raise Unavailable("no bfloat16 on this CPU")
 
     monkeypatch.setattr(execute, "obtain", obtain)
-    outcome = steerbench("paper", "--table", "table3", "seed=0", f"outputs={store.folder.parent}")
+    outcome = steerbench("paper", "--table", "table3", "seed=0", outputs)
     assert outcome.status == 0
     page = Path(re.search(r"report: (.*)", outcome.err)[1])
     assert labels(page)[0] == "L = 0: failed: no bfloat16 on this CPU"
 
 
-def test_a_report_has_what_is_there_and_measures_nothing(steerbench, measured, store, stored_run):
-    jobs = plan(TABLE3, [f"outputs={store.folder.parent}", "seed=0"])
+def test_a_report_has_what_is_there_and_measures_nothing(
+    steerbench, measured, outputs, store, stored_run
+):
+    jobs = plan(TABLE3, [outputs, "seed=0"])
     put(store, stored_run, jobs[1].config)
     jobs[2].keep_failure("killed")
-    outcome = steerbench("report", "--table", "table3", "seed=0", f"outputs={store.folder.parent}")
+    outcome = steerbench("report", "--table", "table3", "seed=0", outputs)
     assert (outcome.status, measured) == (0, [])
     page = Path(re.search(r"report: (.*)", outcome.err)[1])
-    missing = "not measured yet"
-    assert labels(page) == [
-        f"L = 0: {missing}",
-        "L = 1",
-        "L = 2: failed: killed",
-        f"L = 3: {missing}",
-    ]
+    last = "L = 3: not measured yet"
+    assert labels(page) == ["L = 0: not measured yet", "L = 1", "L = 2: failed: killed", last]
     written = page.with_suffix(".html").read_text()
     assert ">L = 1</a></td>" in written
     assert not re.search(r'src="(?!data:)', written)
 
 
-def test_a_check_names_the_broken_rows_of_the_store(steerbench, measured, store, stored_run):
-    outputs = f"outputs={store.folder.parent}"
+def test_a_check_names_the_broken_rows_of_the_store(steerbench, outputs, store, stored_run):
     key = put(store, stored_run, plan(TABLE3, [outputs, "seed=0"])[0].config)
     rows = store.folder / key / "rows.csv"
     table = pd.read_csv(rows)
@@ -136,8 +139,7 @@ def test_a_check_names_the_broken_rows_of_the_store(steerbench, measured, store,
     assert key in found[1].out
 
 
-def test_the_frames_of_runs_that_are_not_on_a_page_are_not_read(steerbench, store, stored_run):
-    outputs = f"outputs={store.folder.parent}"
+def test_frames_of_runs_that_are_not_on_a_page_are_not_read(steerbench, outputs, store, stored_run):
     key = put(store, stored_run, plan(TABLE3, [outputs, "seed=0"])[0].config)
     for run in (stored_run, key):
         (store.folder / run / "frames.csv").unlink()
@@ -146,9 +148,8 @@ def test_the_frames_of_runs_that_are_not_on_a_page_are_not_read(steerbench, stor
     assert steerbench("report", "--table", "table3", "seed=1", outputs).status == 0
 
 
-def test_the_page_goes_where_asked_and_tables_to_stdout(steerbench, measured, store, tmp_path):
+def test_the_page_goes_where_asked_and_tables_to_stdout(steerbench, measured, outputs, tmp_path):
     folder = tmp_path / "there"
-    outputs = f"outputs={store.folder.parent}"
     words = ("--table", "table5", "--report", str(folder), "--format", "latex")
     outcome = steerbench("paper", *words, outputs)
     assert outcome.status == 0
@@ -161,12 +162,6 @@ def test_the_page_goes_where_asked_and_tables_to_stdout(steerbench, measured, st
 
 def job(folder: Path) -> Planned:
     return plan(TABLE5, ["scene=blender", f"scene.path={folder}", "seed=0"])[0]
-
-
-def shown(store: Store, folder: Path) -> list[str]:
-    """Digests of the scenes of the runs in the line of the job that is asked for at `folder`."""
-    ((line,),) = gather([job(folder)], newest(store)).values()
-    return [run.record["scene"]["digest"] for run in line.runs]
 
 
 @pytest.fixture
@@ -187,42 +182,30 @@ def scenes(store: Store, stored_run: str, tmp_path: Path) -> Store:
     return store
 
 
-@pytest.fixture
-def content(monkeypatch: pytest.MonkeyPatch, tiny_scene: Scene) -> Callable[[str], None]:
-    """Says what the digest of a scene is that is loaded; none may be loaded before that."""
+@pytest.mark.parametrize(
+    ("folder", "digest", "found"),
+    [
+        ("a", "a", ["a"]),
+        ("b", None, ["b"]),  # lies where it was measured: it is not loaded
+        ("c", "a", ["a"]),  # elsewhere: it is known by its content
+        ("c", "c", []),
+        ("gone", None, ["b"]),  # not here: the last run is shown
+    ],
+)
+def test_of_folders_with_one_name_each_shows_its_own(
+    scenes, tmp_path, monkeypatch, tiny_scene, folder, digest, found
+):
+    def loaded(*contents: object) -> Scene:
+        assert digest, f"loads {contents}"
+        return replace(tiny_scene, digest=digest)
 
-    def none(*contents: object) -> Scene:
-        raise AssertionError(f"loads {contents}")
-
-    monkeypatch.setattr(configured, "_scene", none)
-    return lambda digest: monkeypatch.setattr(
-        configured, "_scene", lambda *contents: replace(tiny_scene, digest=digest)
-    )
-
-
-def test_of_folders_with_one_name_each_shows_its_own(scenes, tmp_path, content):
-    content("a")
-    assert shown(scenes, tmp_path / "a" / "mic") == ["a"]
-    content("b")
-    assert shown(scenes, tmp_path / "b" / "mic") == ["b"]
-
-
-def test_a_scene_that_lies_where_it_was_measured_is_not_loaded(scenes, tmp_path, content):
-    assert shown(scenes, tmp_path / "b" / "mic") == ["b"]
-
-
-@pytest.mark.parametrize(("digest", "found"), [("a", ["a"]), ("c", [])])
-def test_a_scene_elsewhere_is_known_by_its_content(scenes, tmp_path, content, digest, found):
+    monkeypatch.setattr(configured, "_scene", loaded)
     (tmp_path / "c" / "mic").mkdir(parents=True)
-    content(digest)
-    assert shown(scenes, tmp_path / "c" / "mic") == found
+    ((line,),) = gather([job(tmp_path / folder / "mic")], newest(scenes)).values()
+    assert [run.record["scene"]["digest"] for run in line.runs] == found
 
 
-def test_of_a_scene_that_is_not_here_the_last_run_is_shown(scenes, tmp_path, content):
-    assert shown(scenes, tmp_path / "gone" / "mic") == ["b"]
-
-
-def test_a_failure_stands_beside_what_was_measured_before(scenes, tmp_path):
+def test_a_failure_stands_beside_what_was_measured_before(scenes, tmp_path, elsewhere):
     asked = job(tmp_path / "b" / "mic")
     asked.keep_failure("no such folder")
     ((line,),) = gather([asked], newest(scenes)).values()
@@ -283,46 +266,34 @@ def test_means_are_over_the_scenes_that_all_lines_have(psnr):
     assert one.runs[0].conditions == other.runs[0].conditions
 
 
-def test_a_line_of_which_nothing_was_measured_takes_no_scene_away(psnr):
-    one, other = psnr({(0, "a", 0): 30.0, (0, "b", 0): 20.0}, "ab", "0")
-    assert one.mean("psnr") == 25.0
-    assert (list(other.runs), other.gaps) == ([], ["not measured yet"])
+A_AND_B = {(0, "a", 0): 30.0, (0, "b", 0): 20.0}
 
 
-def test_lines_without_a_common_scene_have_no_mean(psnr):
-    one, other = psnr({(0, "a", 0): 30.0, (1, "b", 0): 20.0}, "ab", "0")
-    assert one.mean("psnr") is None
-    assert one.gaps == ["b not measured yet", "no scene that all lines have"]
-    assert other.mean("psnr") is None
+@pytest.mark.parametrize(
+    ("found", "seeds", "means", "gaps"),
+    [
+        (A_AND_B, "0", [25.0, None], [[], ["not measured yet"]]),  # takes no scene away
+        (
+            {(0, "a", 0): 30.0, (1, "b", 0): 20.0},
+            "0",
+            [None, None],
+            [[f"{x} not measured yet", "no scene that all lines have"] for x in "ba"],
+        ),
+        (
+            {**A_AND_B, (0, "a", 1): 99.0},
+            "0,1",
+            [25.0, None],
+            [["seed 1 b not measured yet"], ["not measured yet"]],
+        ),
+    ],
+)
+def test_what_is_left_out_of_a_mean_is_named(psnr, found, seeds, means, gaps):
+    lines = psnr(found, "ab", seeds)
+    assert [line.mean("psnr") for line in lines] == means
+    assert [line.gaps for line in lines] == gaps
 
 
-def test_a_seed_without_all_scenes_is_left_out_and_named(psnr):
-    found = {(0, "a", 0): 30.0, (0, "b", 0): 20.0, (0, "a", 1): 99.0}
-    line, _ = psnr(found, "ab", "0,1")
-    assert line.mean("psnr") == 25.0
-    assert line.gaps == ["seed 1 b not measured yet"]
-
-
-EXPERIMENT = """\
-# @package _global_
-# Two greys.
-defaults:
-  - override /method: grey
-hydra:
-  sweeper:
-    params:
-      method: grey,dark
-table:
-  title: Two greys
-  published_on: paper
-  metrics: [psnr]
-  scenes: [psnr]
-  lines:
-    - {label: a grey, job: {}, published: [1.0]}
-    - {label: a dark one, job: {method: dark}}
-  rising:
-    psnr: [a dark one, a grey]
-"""
+# All of it, with a method that trains nothing
 
 
 def test_the_page_of_a_data_set_has_means_scenes_and_gaps(steerbench, tmp_path, monkeypatch):
@@ -331,13 +302,9 @@ def test_the_page_of_a_data_set_has_means_scenes_and_gaps(steerbench, tmp_path, 
     for name, value in values.items():
         blender(data / name, value)
     blender(data / "ship", pictures=False)
-    tables = tmp_path / "configs" / "experiment"
-    tables.mkdir(parents=True)
-    (tables / "table9.yaml").write_text(EXPERIMENT)
-    monkeypatch.setattr("sweeps.plan.TABLES", tables)
-    folders = [f"--config-dir={folder / 'configs'}" for folder in (HERE, tmp_path)]
-    words = [f"data={data}", "budget=none", "protocol=quick", "device=cpu"]
-    outcome = steerbench("paper", *folders, *words, "seed=0,1")
+    monkeypatch.setattr("sweeps.plan.TABLES", HERE / "configs" / "experiment")
+    words = [CONFIGS, f"data={data}", "device=cpu", "seed=0,1"]
+    outcome = steerbench("paper", *words)
     assert outcome.status == 0, outcome.err
     assert "missing: ship: no pictures" in outcome.err
     assert "4 of 8" in outcome.err
@@ -358,6 +325,6 @@ def test_the_page_of_a_data_set_has_means_scenes_and_gaps(steerbench, tmp_path, 
         assert f"| {scene}: a dark one | {dark[place]:.2f} |" in page
     assert "| PSNR, dB: a dark one < a grey |" in page
     assert "2 seeds" in page
-    again = steerbench("report", *folders, *words, "seed=0,1")
+    again = steerbench("report", *words)
     assert f"| a grey | **{mean}** / 1.00 / " in (tmp_path / "outputs/paper/report.md").read_text()
     assert again.status == 0

@@ -49,9 +49,8 @@ def test_a_curve_has_the_lines_of_the_papers_method_at_several_shares_of_one_tra
     assert len(marks) == 2 * 3  # lines, shares; of the first seed
     for job in marks:
         label, _, share = job.line.partition(", after ")
-        (whole,) = (
-            one for one in lines if one.line == label and one.config.seed == job.config.seed
-        )
+        where = (label, job.config.seed)
+        (whole,) = (one for one in lines if (one.line, one.config.seed) == where)
         one, other = described(job.config), described(whole.config)
         assert (one["method"].pop("after"), other["method"].pop("after")) == (float(share), 1)
         scored = one.pop("protocol"), other.pop("protocol")
@@ -73,9 +72,8 @@ def test_a_curve_has_the_lines_of_the_papers_method_at_several_shares_of_one_tra
 def test_only_the_papers_method_is_repeated_unless_seeds_are_asked_for(words, seeds, of_ours):
     found: dict[str, list[int]] = {"steernerf_lean": []}
     for job in plan(CURVED["table5"], words):
-        if job.block == "curves":
-            continue
-        found.setdefault(job.config.method.name, []).append(job.config.seed)
+        if job.block != "curves":
+            found.setdefault(job.config.method.name, []).append(job.config.seed)
     expected = list(range(seeds)) if isinstance(seeds, int) else seeds
     assert found == {"steernerf": 2 * expected, "steernerf_lean": 2 * of_ours}
 
@@ -118,14 +116,6 @@ def test_the_lines_of_table_3_differ_in_l_alone():
         nodes = (method["model"], "frames"), (of_training, "length"), (of_training, "least")
         assert [node.pop(name) for node, name in nodes] == [number] * 3
     assert all(of_line == settings[0] for of_line in settings)
-
-
-def test_every_seed_is_a_job_of_its_own_and_a_command_that_makes_it():
-    jobs = plan(ALONE, ["budget=tiny", "seed=0,2"])
-    assert [(job.line[:4], job.config.seed) for job in jobs] == 2 * [("with", 0), ("with", 2)]
-    for job in jobs:
-        again = composed([text for text in job.command[2:] if text != "hydra.mode=RUN"])
-        assert described(again) == described(job.config)
 
 
 def test_tables_share_the_run_that_they_have_in_common():
@@ -230,18 +220,15 @@ def test_of_nerf_synthetic_what_is_there_is_found_and_the_rest_is_named(tmp_path
     }
 
 
-def test_of_tanks_and_temples_too(tmp_path):
+def test_of_tanks_and_temples_too_and_scenes_of_ones_own_miss_nothing(tmp_path):
     for name in ("Barn", "Truck"):
         nsvf(tmp_path / name)
     nsvf(tmp_path / "Family", pictures=False)
     found = find(str(tmp_path))
     assert (found.layout, list(found.scenes)) == ("nsvf", ["Barn", "Truck"])
     assert set(found.missing) == {"Caterpillar", "Family", "Ignatius"}
-
-
-def test_scenes_of_ones_own_miss_nothing(tmp_path):
-    blender(tmp_path / "teapot")
-    assert find(str(tmp_path)).missing == {}
+    blender(tmp_path / "mine" / "teapot")
+    assert find(str(tmp_path / "mine")).missing == {}
 
 
 def test_scenes_of_two_layouts_have_no_mean(tmp_path):

@@ -22,33 +22,15 @@ from .test_documents import WITHOUT_LPIPS, mine  # noqa: F401 (a fixture)
 
 HELPER = "LEVEL = 0.5\n"
 RENDERER = """
-import torch
-
-from bench.types import Frame
 from mine.helper import LEVEL
+from stand_ins import Grey
 
 
-class Mine:
+class Mine(Grey):
     name = "mine"
-    train_s = 0.0
-    memory = 0
 
-    def fit(self, scene, budget, log):
-        pass
-
-    def reset(self):
-        pass
-
-    def render(self, camera, probe):
-        with probe.stage("paint"):
-            size = camera.height, camera.width
-            return Frame(torch.full((*size, 3), LEVEL), torch.ones(size), torch.ones(size))
-
-    def sizes(self):
-        return {"level": 4}
-
-    def settings(self):
-        return {"device": "cpu", "backend": "none", "engine": "none", "precision": "fp32"}
+    def __init__(self):
+        self.level = LEVEL
 """
 SMALL = (
     *("scene=totem", "scene.width=16", "scene.train=2", "scene.test=2", "budget=tiny"),
