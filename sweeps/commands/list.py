@@ -54,7 +54,7 @@ def described(group: str, words: Sequence[str] = ()) -> dict[str, str]:
     comment that is not a Hydra directive (`# @package`)."""
     comments = {}
     for name, path in choices(group, words).items():
-        lines = (line.removeprefix("#").strip() for line in path.open() if line.startswith("#"))
+        lines = [line[1:].strip() for line in path.read_text().splitlines() if line[:1] == "#"]
         comments[name] = next((line for line in lines if not line.startswith("@")), "")
     return comments
 

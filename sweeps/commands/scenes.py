@@ -7,7 +7,7 @@ from pathlib import Path
 
 from bench.console import ConsoleLog
 from bench.errors import unknown
-from bench.published import get, published, verify
+from bench.published import Published, get, published, verify
 
 SHOWN = 5
 """Missing or extra files to print by name, because there may be hundreds."""
@@ -18,7 +18,7 @@ def main(options: argparse.Namespace) -> int:
     log = ConsoleLog(Path("outputs"))
     if options.action == "verify":
         return _verify(Path(options.name), log)
-    known = {}
+    known: dict[str, tuple[Published, list[str]]] = {}
     for data in published():
         known |= {name: (data, [name]) for name in data.scenes}
         known[data.name] = data, sorted(data.scenes)

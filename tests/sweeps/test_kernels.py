@@ -45,26 +45,27 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], int]]:
     return calls
 
 
-def test_the_last_line_is_json_of_what_the_table_shows(steerbench, asked):
+def test_the_last_line_is_json_of_what_the_table_shows_and_a_wrong_kernel_fails(steerbench, asked):
     outcome = steerbench("kernels", "--filter", "enc", "--repeats", "3")
     assert asked == [(["encode"], 3)]
     assert outcome.status == 0
     for text in ("encode", "1.0e-07", "1.0e-06", "12.50", "10.40", "31.0x"):
         assert text in outcome.out
     assert json.loads(outcome.out.splitlines()[-1]) == [RIGHT]
-
-
-def test_a_wrong_kernel_shows_its_status_instead_of_a_time_and_fails(steerbench, asked):
     outcome = steerbench("kernels")
     assert outcome.status == 1
-    assert "wrong" in outcome.out
+    assert "wrong" in outcome.out  # instead of a time
     assert json.loads(outcome.out.splitlines()[-1]) == [RIGHT, WRONG]
 
 
-def test_a_filter_that_fits_nothing_is_an_error(steerbench, asked):
-    outcome = steerbench("kernels", "--filter", "splat")
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [("kernels", "no kernel has 'x' in its name"), ("stress", "no subject or case has 'x' in it")],
+)
+def test_a_filter_that_fits_nothing_is_an_error(steerbench, asked, command, said):
+    outcome = steerbench(command, "--filter", "x")
     assert outcome.status == 2
-    assert "no kernel has 'splat' in its name" in outcome.err
+    assert said in outcome.err
 
 
 def test_what_a_kernel_brings_has_a_line_for_each_that_a_method_calls(steerbench, tmp_path):
@@ -130,26 +131,17 @@ def two_cases(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("methods.checks.found", lambda name: cases)
 
 
-def test_the_last_line_of_stress_is_json_of_what_the_table_shows(steerbench, two_cases):
+def test_the_last_line_of_stress_is_json_and_a_case_that_fails_fails_it(steerbench, two_cases):
     outcome = steerbench("stress", "--filter", "sum")
     assert outcome.status == 0
     for text in ("sum", "long", "all is there", "reference", "fp32", "5.0e-07", "1.0e-06", "ok"):
         assert text in outcome.out
     (row,) = json.loads(outcome.out.splitlines()[-1])
     assert (row["subject"], row["error"], row["status"]) == ("sum", 5e-7, "ok")
-
-
-def test_a_case_that_fails_fails_the_command(steerbench, two_cases):
     outcome = steerbench("stress")
     assert outcome.status == 1
     assert "2 cases, 2 cells, 1 failed" in outcome.out
     assert [r["status"] for r in json.loads(outcome.out.splitlines()[-1])] == ["ok", "failed"]
-
-
-def test_a_filter_that_fits_no_case_is_an_error(steerbench, two_cases):
-    outcome = steerbench("stress", "--filter", "quotient")
-    assert outcome.status == 2
-    assert "no subject or case has 'quotient' in it" in outcome.err
 
 
 def test_on_a_page_the_cell_nearest_to_its_tolerance_stands_for_a_case(steerbench, monkeypatch):

@@ -83,19 +83,24 @@ def test_a_change_in_a_module_is_a_new_run_of_a_new_process(call, folder, tmp_pa
         assert len(keys(tmp_path)) == number
 
 
-def test_a_folder_that_is_not_there_is_named(steerbench):
-    for command in ("list", "report"):
-        refused = steerbench(command, "--config-dir", "nowhere")
-        assert refused.status == 2
-        assert "--config-dir: expected a folder, there is none at nowhere" in refused.err
+THERE = "There are: diver, gaussians, kilonerf, mine, nerf, ngp, nsvf, plenoctree"
 
 
-@pytest.mark.parametrize("command", ["run", "accuracy"])
-def test_a_name_near_it_is_answered_with_it(call, command):
-    refused = call(command, "method=mien")
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        *((f"{name} method=mien", f"method 'mien'. Did you mean mine? {THERE}")
+          for name in ("run", "accuracy")),
+        *((f"{name} --config-dir nowhere", "expected a folder, there is none at nowhere")
+          for name in ("list", "report")),
+        ("report --with mein", "Did you mean mine?"),
+        ("report --table table3 --with mine", "--with: table3 compares no methods; table1 does"),
+    ],
+)  # fmt: skip
+def test_a_word_that_leads_nowhere_is_answered(call, argv, said):
+    refused = call(*argv.split())
     assert refused.status == 2
-    assert "unknown method 'mien'. Did you mean mine?" in refused.err
-    assert "There are: diver, gaussians, kilonerf, mine, nerf, ngp, nsvf, plenoctree" in refused.err
+    assert said in refused.err
 
 
 @pytest.fixture
@@ -130,14 +135,6 @@ def test_table_1_has_a_line_for_it_that_is_measured_and_reported(call, only_mine
     assert re.search(r"\d\.\d\d / –", line)  # no published figure
     assert line_of(call("report", *words).err) == line
     assert len(keys(tmp_path)) == 1
-
-
-def test_only_a_table_of_methods_takes_it(call):
-    refused = call("report", "--table", "table3", "--with", "mine")
-    assert refused.status == 2
-    assert "--with: table3 compares no methods; table1 does" in refused.err
-    unknown = call("report", "--with", "mein")
-    assert "Did you mean mine?" in unknown.err
 
 
 # Packages from pip
