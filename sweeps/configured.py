@@ -122,9 +122,6 @@ def _scene(node: str, root: Path, held_out: bool) -> Scene:
     return hold_out(scene, VALIDATION, 8) if held_out else scene
 
 
-# Anything that has a `_target_`
-
-
 def build(config: DictConfig, group: str, *args: Any, **extra: Any) -> Any:
     """Call the `_target_` of `config[group]` with its settings, `args` and `extra`.
 

@@ -15,10 +15,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
 
+from bench.results import Store
 from reports.tables import Table, run_tables
 
-if TYPE_CHECKING:  # these load torch, which `steerbench list` does without
-    from bench.results import Store
+if TYPE_CHECKING:  # it loads torch, which `steerbench list` does without
     from reports.runs import Run
 
 

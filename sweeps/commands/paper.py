@@ -146,9 +146,6 @@ def _check(store: Store) -> int:
     return int(len(keys) > 0)
 
 
-# What the store has of the tables
-
-
 class Outcome(NamedTuple):
     """A job with its run, if there is one, and the reason why it is missing or in doubt."""
 

@@ -100,7 +100,6 @@ def test_the_kernels_alone_train_and_render_nothing(steerbench, measured, monkey
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["--repeats", "0"], "--repeats: expected 1 or more, got 0"),
         (["--within", "much"], "--within: expected decibels, 0.1dB for example, got 'much'"),
         (["--filter", "colour"], "no knob has 'colour' in its name; expected part of one of share"),
         (["budget=demmo"], "Did you mean demo?"),
