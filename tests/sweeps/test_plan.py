@@ -212,11 +212,8 @@ def test_of_nerf_synthetic_what_is_there_is_found_and_the_rest_is_named(tmp_path
     assert found.missing == {
         "chair": "no pictures",
         "drums": "no transforms_train.json or bbox.txt",
-        "ficus": "no folder",
-        "hotdog": "no folder",
         "lego": "1 of 4 pictures are not there",
-        "materials": "no folder",
-        "ship": "no folder",
+        **dict.fromkeys(("ficus", "hotdog", "materials", "ship"), "no folder"),
     }
 
 
@@ -231,18 +228,20 @@ def test_of_tanks_and_temples_too_and_scenes_of_ones_own_miss_nothing(tmp_path):
     assert find(str(tmp_path / "mine")).missing == {}
 
 
-def test_scenes_of_two_layouts_have_no_mean(tmp_path):
-    blender(tmp_path / "mic")
-    nsvf(tmp_path / "Barn")
-    with pytest.raises(SteerbenchError, match="scenes of both: Barn, mic"):
-        find(str(tmp_path))
-
-
-@pytest.mark.parametrize("make", [lambda path: None, blender])
-def test_a_folder_without_scenes_is_refused(tmp_path, make):
-    make(tmp_path)
-    with pytest.raises(SteerbenchError, match=r"got none.*scene\.path"):
-        find(str(tmp_path))
+@pytest.mark.parametrize(
+    ("folder", "said"),
+    [
+        ("empty", r"got none.*scene\.path"),
+        ("both/mic", r"got none.*scene\.path"),  # a scene itself
+        ("both", "scenes of both: Barn, mic"),
+    ],
+)
+def test_no_scenes_or_those_of_two_layouts_have_no_mean(tmp_path, folder, said):
+    (tmp_path / "empty").mkdir()
+    blender(tmp_path / "both" / "mic")
+    nsvf(tmp_path / "both" / "Barn")
+    with pytest.raises(SteerbenchError, match=said):
+        find(str(tmp_path / folder))
 
 
 @pytest.mark.parametrize("word", ["scene=totem", "scene.path=elsewhere", "++scene.path=elsewhere"])
@@ -251,14 +250,6 @@ def test_a_scene_beside_a_data_set_is_refused(tmp_path, word):
     with pytest.raises(SteerbenchError, match="expected one of them"):
         data_set([word, f"data={tmp_path}"])
     assert data_set([word]) == ([word], None)
-
-
-def test_other_settings_of_the_scenes_go_through(tmp_path):
-    blender(tmp_path / "mic")
-    words, data = data_set(["scene.downscale=4", f"data={tmp_path}", "budget=tiny"])
-    assert words == ["scene.downscale=4", "budget=tiny"]
-    (scale,) = {job.config.scene.downscale for job in plan(ALONE, words, data)}
-    assert scale == 4
 
 
 @pytest.mark.parametrize("text", ["/data/chair", "/a b,c (d)/it's", "/x=1/${y}#2", "~/Jürgen"])
@@ -270,8 +261,11 @@ def test_any_folder_can_be_named_in_a_command(text):
 def test_every_scene_is_a_job_of_its_own_and_a_command_that_makes_it(tmp_path):
     for name in ("mic", "chair"):
         blender(tmp_path / "my data" / name)
-    data = find(str(tmp_path / "my data"))
-    jobs = plan(ALONE, ["budget=tiny", "seed=0,1"], data)
+    typed = ["scene.downscale=4", f"data={tmp_path / 'my data'}", "budget=tiny", "seed=0,1"]
+    words, data = data_set(typed)
+    assert words == [typed[0], *typed[2:]]
+    jobs = plan(ALONE, words, data)
+    assert {job.config.scene.downscale for job in jobs} == {4}
     cells = [(job.scene, job.config.seed) for job in jobs]
     assert cells == 2 * [("chair", 0), ("mic", 0), ("chair", 1), ("mic", 1)]
     assert len({job.key for job in jobs}) == len(jobs)
