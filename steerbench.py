@@ -31,25 +31,16 @@ from pathlib import Path
 import pandas as pd
 
 from bench.console import ConsoleLog
+from bench.errors import SteerbenchError
 from bench.results import Store
-from bench.types import (
-    Budget,
-    Camera,
-    Frame,
-    Method,
-    NullProbe,
-    Probe,
-    Scene,
-    Split,
-    SteerbenchError,
-)
+from bench.types import Budget, Camera, Frame, Method, NullProbe, Probe, Scene, Split
 from reports.runs import Run, load
 from sweeps import configured
 from sweeps.commands.list import described
 from sweeps.commands.score import score
-from sweeps.deliver import write
-from sweeps.measurement import Group, Job, obtain
+from sweeps.measurement import Job, obtain
 from sweeps.overrides import composed
+from sweeps.terminal import write_page
 
 __all__ = [
     "Budget",
@@ -78,15 +69,13 @@ def run(*settings: str) -> Run:
     Args:
         settings: as for `steerbench run`: "method=ngp", "scene=totem", "budget=tiny".
             `--config-dir=DIR` names a folder with further choices.
-
-    Raises:
-        SteerbenchError: a setting is wrong, or the measurement failed.
     """
     config = composed(settings)
-    (obtained,) = obtain(Group([Job(config, ["steerbench", "run", *settings])]))
-    (run,) = load(obtained.store, {obtained.run: obtained.run})
+    job = Job(config, ["steerbench", "run", *settings])
+    (key,), _ = obtain([job])
+    (run,) = load(job.store, {key: key})
     label = str(run.facts["method"])
-    write(config.report, obtained.store, {obtained.run: label})
+    write_page(config.report, job.store, {key: label})
     return replace(run, label=label)
 
 
@@ -94,20 +83,13 @@ def fit(*settings: str) -> Method:
     """Train the method that `settings` describe on its scene, or load its stored stages.
 
     `method.render(camera, NullProbe())` renders a camera in scene units; see `load_scene`.
-
-    Raises:
-        SteerbenchError: a setting is wrong, or the training failed.
     """
     config = composed(settings)
     return configured.trained(config, ConsoleLog(Path(config.outputs)))
 
 
 def load_scene(*settings: str) -> Scene:
-    """Load the scene of `settings`: "scene=blender", "scene.path=DIR".
-
-    Raises:
-        SteerbenchError: the scene cannot be loaded.
-    """
+    """Load the scene of `settings`: "scene=blender", "scene.path=DIR"."""
     return configured.scene_of(composed(settings))
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from difflib import get_close_matches
 from pathlib import Path
 
 
@@ -21,6 +22,19 @@ class Unavailable(SteerbenchError):
 def unexpected(where: str | Path, expected: str, got: object) -> SteerbenchError:
     """The error that says what was expected at `where` (an option; a file and its field)."""
     return SteerbenchError(f"{where}: expected {expected}, got {got}")
+
+
+def unknown(kind: str, name: str, existing: Iterable[str]) -> SteerbenchError:
+    """The error for a `name` not among `existing`, with those that are near.
+
+    Near are first names on the same level (scene.path for scene.pth), then names anywhere.
+    """
+    names, place = sorted(existing), name[: name.rfind(".") + 1]
+    beside = {other.removeprefix(place): other for other in names if other.startswith(place)}
+    near = [beside[last] for last in get_close_matches(name.removeprefix(place), beside)]
+    near = near or get_close_matches(name, names)
+    guess = f" Did you mean {' or '.join(near)}?" if near else ""
+    return SteerbenchError(f"unknown {kind} '{name}'.{guess} There are: {', '.join(names)}.")
 
 
 def install_command(extra: str) -> str:

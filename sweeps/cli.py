@@ -1,4 +1,6 @@
-"""The command `steerbench`: dispatches to subcommands and maps errors and signals to exit statuses.
+"""The command `steerbench`: reads the words, calls the command, maps its end to an exit status.
+
+commands.toml lists and explains the commands and their arguments.
 
 Exit statuses: 0 done; 1 a check failed (a kernel is wrong, a file differs), a job of the tables
 failed, or a bug (with its traceback); 2 an error the user can act on; 130 interrupted; 141 the
@@ -10,17 +12,25 @@ from __future__ import annotations
 import argparse
 import errno
 import importlib
+import math
 import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Sequence
-from typing import NoReturn
+import tomllib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NoReturn
 
-from bench.errors import SteerbenchError
-from sweeps.arguments import COMMANDS, add_commands, overview
-from sweeps.names import unknown
+from bench.errors import SteerbenchError, unknown
 from sweeps.processes import set_up
+
+COMMANDS: dict[str, dict[str, Any]] = tomllib.loads(
+    (Path(__file__).parent / "commands.toml").read_text(encoding="utf-8")
+)
+"""What commands.toml says of each command, by name."""
+_SHARED = COMMANDS.pop("shared")
 
 EXAMPLES = """\
 examples
@@ -40,17 +50,11 @@ examples
 REFUSALS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR}
 
 
-class Parser(argparse.ArgumentParser):
-    """An argument parser that raises its errors as SteerbenchError instead of exiting."""
-
-    def error(self, message: str) -> NoReturn:
-        raise SteerbenchError(f"{message}\n{self.format_usage().rstrip()}")
-
-
 def main() -> None:
     """Run the command line and exit with its status."""
     set_up()
-    signal.signal(signal.SIGTERM, _terminate)
+    # Exit through every `finally`, so that checkpoints are saved and temporary files removed.
+    signal.signal(signal.SIGTERM, lambda signum, _: sys.exit(128 + signum))
     sys.exit(guard(dispatch, sys.argv[1:]))
 
 
@@ -74,12 +78,13 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
         return _fail(f"{error.filename}: {error.strerror}", 2)
 
 
-def dispatch(argv: Sequence[str]) -> int:
-    """Pass `argv` to the file of its command, which is imported only now.
+def _fail(message: str, status: int) -> int:
+    print(f"steerbench: {message}", file=sys.stderr)
+    return status
 
-    Raises:
-        SteerbenchError: there is no such command or argument, or the command failed.
-    """
+
+def dispatch(argv: Sequence[str]) -> int:
+    """Pass `argv` to the file of its command, which is imported only now."""
     of_hydra = argv[:1] == ["run"] or argv[:1] in (["-sc"], ["--shell-completion"])
     options = None if of_hydra else parsed(argv)
     if options and options.command is None:
@@ -91,16 +96,36 @@ def dispatch(argv: Sequence[str]) -> int:
     return command.main(options or argv[argv[0] == "run" :])
 
 
+class Parser(argparse.ArgumentParser):
+    """An argument parser that raises its errors as SteerbenchError instead of exiting."""
+
+    def error(self, message: str) -> NoReturn:
+        raise SteerbenchError(f"{message}\n{self.format_usage().rstrip()}")
+
+
 def parsed(argv: Sequence[str]) -> argparse.Namespace:
-    """The arguments of a command other than `run`."""
+    """The arguments of a command other than `run`.
+
+    Among them are the name of the `command`, None if there was none, and the innermost `parser`.
+    """
+    overview: dict[str, str] = {}
+    for name, about in COMMANDS.items():
+        lines = overview.get(about["group"], f"{about['group']}\n")
+        overview[about["group"]] = f"{lines}  {name:11}{about['purpose']}\n"
     parser = Parser(
         prog="steerbench",
         usage="steerbench COMMAND [...]",
-        description=f"Benchmarks of radiance-field renderers.\n\n{overview()}",
+        description="Benchmarks of radiance-field renderers.\n\n" + "\n".join(overview.values()),
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    add_commands(parser)
+    parser.set_defaults(command=None, parser=parser)
+    commands = parser.add_subparsers(prog=parser.prog, help=argparse.SUPPRESS)
+    for name, about in COMMANDS.items():
+        below = commands.add_parser(name, description=about["description"])
+        below.set_defaults(command=name, parser=below)
+        for argument, given in _arguments(about):
+            below.add_argument(argument, **given)
     if argv and not argv[0].startswith("-") and argv[0] not in COMMANDS:
         raise unknown("command", argv[0], COMMANDS)
     options, unread = parser.parse_known_args(argv)
@@ -114,11 +139,58 @@ def parsed(argv: Sequence[str]) -> argparse.Namespace:
     return options
 
 
-def _terminate(signum: int, frame: object) -> NoReturn:
-    """Exit through every `finally`, so that checkpoints are saved and temporary files removed."""
-    sys.exit(128 + signum)
+def _arguments(about: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The name and the options, as for `add_argument`, of each argument of a command."""
+    include = about.get("include", [])
+    if usual := about.get("settings"):
+        include = [*include, "folder"]
+    for group in (about.get("arguments", {}), *(_SHARED[name] for name in include)):
+        for name, options in group.items():
+            kind = TYPES[options["type"]] if "type" in options else {}
+            own = {key: value for key, value in options.items() if key != "type"}
+            more = "; may be repeated" if kind.get("action") == "append" else ""
+            more += f" (default {own['default']})" if own.get("default") else ""
+            yield name, {**kind, **own, "help": own["help"] + more}
+    if usual:  # last, because it takes all words that are left
+        help = f"settings as of `steerbench run` (default {usual})"
+        yield "overrides", {"help": help, "nargs": "*"}
 
 
-def _fail(message: str, status: int) -> int:
-    print(f"steerbench: {message}", file=sys.stderr)
-    return status
+def count(text: str, at_most: float = math.inf) -> int:
+    """A whole number of at least 1."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected 1 or more, got {text}")
+    if int(text) > at_most:
+        raise argparse.ArgumentTypeError(f"expected at most {at_most}, got {text}")
+    return int(text)
+
+
+def positive(text: str) -> float:
+    """A finite number above 0."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a number above 0, got {text}")
+    return number
+
+
+def config_dir(text: str) -> str:
+    """`--config-dir=` and the folder `text`, which must exist; `sweeps.overrides` reads it."""
+    if not Path(text).is_dir():
+        raise argparse.ArgumentTypeError(f"expected a folder, there is none at {text}")
+    return f"--config-dir={Path(text).resolve()}"
+
+
+SEVERAL = {"action": "append", "default": []}
+TYPES: dict[str, dict[str, Any]] = {
+    "path": {"type": Path},
+    "count": {"type": count, "metavar": "N"},
+    "positive": {"type": positive},
+    "port": {"type": partial(count, at_most=65535)},
+    "flag": {"action": "store_true"},
+    "several": SEVERAL,
+    "folders": {**SEVERAL, "type": config_dir},
+}
+"""The options of argparse for each `type` of an argument."""

@@ -1,25 +1,33 @@
-"""Makes what the configuration of a run describes: its settings, its scene, its trained method."""
+"""Makes what the configuration of a run describes: its settings, its scene, its trained method.
+
+All raise SteerbenchError, which names the setting, if one is wrong or cannot be had here.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import inspect
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Literal
+from types import UnionType
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import torch
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from bench.console import ConsoleLog
-from bench.errors import SteerbenchError, Unavailable
+from bench.errors import SteerbenchError, Unavailable, unexpected, unknown
 from bench.scenes.assemble import hold_out
 from bench.types import DEVICE, Log, Method, Scene
 from reports.trackers import tracker
-from sweeps.build import build, check_settings
-from sweeps.overrides import VALIDATION
+from sweeps.overrides import VALIDATION, target_of
 
-HELD_OUT = 8
-"""One in this many training pictures is held out if a trajectory renders held-out pictures."""
+STANDS_FOR = {"Path": str, "tuple": list, "Sequence": list, "Mapping": dict, "float": float | int}
+"""By the name of a type in a signature: the type that a configuration holds instead."""
 
 USUAL_THREADS = torch.get_num_threads()
 """Number of threads that torch uses by default."""
@@ -42,27 +50,21 @@ class Settings:
 
 
 def checked_settings(config: DictConfig) -> Settings:
-    """The settings in `config`. Also sets torch's number of threads as they say.
-
-    Raises:
-        SteerbenchError: a setting is wrong.
-    """
+    """The settings in `config`, checked. Also sets torch's number of threads as they say."""
     names = [field.name for field in fields(Settings)]
-    if missing := [name for name in names if name not in config]:
-        raise SteerbenchError(f"{missing[0]} is not set: give {missing[0]}=...")
-    values = {name: config[name] for name in names}
+    values = {name: config[name] for name in names if name in config}
     check_settings(Settings, values)
     settings = Settings(**values)
     if settings.seed < 0:
-        raise SteerbenchError(f"seed: expected 0 or more, got {settings.seed}")
+        raise unexpected("seed", "0 or more", settings.seed)
     if settings.threads is not None and settings.threads < 1:
-        raise SteerbenchError(f"threads: expected 1 or more, or null, got {settings.threads}")
+        raise unexpected("threads", "1 or more, or null", settings.threads)
     if settings.pictures < 0:
-        raise SteerbenchError(f"pictures: expected 0 or more, got {settings.pictures}")
+        raise unexpected("pictures", "0 or more", settings.pictures)
     if settings.tracker is not None:
         tracker(settings.tracker)
     if not DEVICE.fullmatch(settings.device):
-        raise SteerbenchError(f"device: expected auto, cpu, cuda or cuda:N, got {settings.device}")
+        raise unexpected("device", "auto, cpu, cuda or cuda:N", settings.device)
     _, _, number = settings.device.partition(":")
     if settings.device.startswith("cuda") and int(number or 0) >= torch.cuda.device_count():
         raise Unavailable(
@@ -74,11 +76,7 @@ def checked_settings(config: DictConfig) -> Settings:
 
 
 def trained(config: DictConfig, log: Log) -> Method:
-    """The method that `config` describes, trained on its scene.
-
-    Raises:
-        SteerbenchError: a setting is wrong, or something in the training went wrong.
-    """
+    """The method that `config` describes, trained on its scene."""
     torch.manual_seed(checked_settings(config).seed)
     method, budget = (build(config, name) for name in ("method", "budget"))
     method.fit(scene_of(config), budget, log)
@@ -88,17 +86,14 @@ def trained(config: DictConfig, log: Log) -> Method:
 def scene_of(config: DictConfig) -> Scene:
     """The scene that `config` describes.
 
-    If its trajectory renders held-out training pictures, these are removed from the training split,
-    so that a model is never scored on pictures that it was trained on.
-
-    Raises:
-        SteerbenchError: the scene cannot be loaded, or has too few training pictures.
+    If its trajectory renders held-out training pictures, these, one in eight, are removed from the
+    training split, so that a model is never scored on pictures that it was trained on.
     """
-    return _divided(*_contents(config))
+    return _scene(*_contents(config))
 
 
 def scene_digest(config: DictConfig) -> str:
-    """The digest of the scene that `config` describes; raises as `scene_of` does."""
+    """The digest of the scene that `config` describes."""
     return _digest(*_contents(config))
 
 
@@ -116,15 +111,87 @@ def _contents(config: DictConfig) -> tuple[str, Path, bool]:
 @cache
 def _digest(node: str, root: Path, held_out: bool) -> str:
     """Cached, because it takes loading the whole scene."""
-    return _divided(node, root, held_out).digest
-
-
-def _divided(node: str, root: Path, held_out: bool) -> Scene:
-    scene = _scene(node, root)
-    return hold_out(scene, VALIDATION, HELD_OUT) if held_out else scene
+    return _scene(node, root, held_out).digest
 
 
 @lru_cache(maxsize=1)
-def _scene(node: str, root: Path) -> Scene:
-    """The scene described by `node` (YAML), cached for the next job of a sweep."""
-    return build(OmegaConf.create({"scene": OmegaConf.create(node)}), "scene", log=ConsoleLog(root))
+def _scene(node: str, root: Path, held_out: bool) -> Scene:
+    """Cached for the next job of a sweep."""
+    config = OmegaConf.create({"scene": OmegaConf.create(node)})
+    scene = build(config, "scene", log=ConsoleLog(root))
+    return hold_out(scene, VALIDATION, 8) if held_out else scene
+
+
+def build(config: DictConfig, group: str, *args: Any, **extra: Any) -> Any:
+    """Call the `_target_` of `config[group]` with its settings, `args` and `extra`.
+
+    Nodes below it that have a `_target_` are built first. SteerbenchError if a setting is missing,
+    unknown to its target or of the wrong type. Exceptions of a target pass through.
+    """
+    try:
+        missing = sorted(OmegaConf.missing_keys(config[group]))  # full keys: "scene.path"
+        if missing:
+            raise SteerbenchError(f"{missing[0]} is not set: give {missing[0]}=...")
+        node: Any = OmegaConf.to_container(config[group], resolve=True)
+    except OmegaConfBaseException as error:  # a setting that others use was removed (~backend)
+        raise SteerbenchError(f"{group}: {str(error).splitlines()[0]}") from error
+    target = target_of(node)
+    given = [*list(inspect.signature(target).parameters)[: len(args)], *extra]
+    check_settings(target, node, f"{group}.", given)
+    try:
+        prepared = instantiate(node, _partial_=True, _convert_="all")
+        return prepared(*args, **extra)
+    except (InstantiationException, ValueError) as error:
+        cause = (isinstance(error, InstantiationException) and error.__cause__) or error
+        if isinstance(cause, ValueError):  # the target's message names the setting
+            raise SteerbenchError(f"{group}: {cause}") from error
+        raise cause from error
+
+
+def check_settings(
+    target: Any, settings: Mapping[str, Any], prefix: str = "", given: Collection[str] = ()
+) -> None:
+    """Raise `SteerbenchError` unless `target` accepts these settings, by name and type.
+
+    Errors put `prefix` before the names. Parameters `given` by the caller are not settings.
+    Settings that are nodes with a `_target_` are checked against that target.
+    """
+    # Types of inherited dataclass fields must be looked up in the modules of its bases.
+    plain = inspect.isclass(target) and not is_dataclass(target)
+    hints = get_type_hints(target.__init__ if plain else target)
+    parameters = inspect.signature(target).parameters
+    names = [name for name in parameters if name not in given]
+    if not settings.get("_partial_"):
+        for name in names:  # ~name removes a default of the configurations
+            one = parameters[name]
+            several = one.kind in (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+            if one.default is inspect.Parameter.empty and not several and name not in settings:
+                raise SteerbenchError(f"{prefix}{name} is not set: give {prefix}{name}=...")
+    for name, value in settings.items():
+        if name.startswith("_"):  # Hydra's own: _target_, _convert_
+            continue
+        if name not in names:
+            raise unknown("setting", f"{prefix}{name}", [f"{prefix}{other}" for other in names])
+        if isinstance(value, dict) and "_target_" in value:
+            check_settings(target_of(value), value, f"{prefix}{name}.")
+        elif not _fits(value, hints.get(name, Any)):
+            wanted = " or ".join(map(str, _choices(hints[name]))) or parameters[name].annotation
+            raise unexpected(f"{prefix}{name}", wanted, repr(value))
+
+
+def _choices(hint: Any) -> tuple[object, ...]:
+    """The values that a `Literal` allows; empty for other types."""
+    return get_args(hint) if get_origin(hint) is Literal else ()
+
+
+def _fits(value: object, hint: Any) -> bool:
+    """Whether a plain YAML `value` has the type `hint`; True if that cannot be decided."""
+    if get_origin(hint) is UnionType:
+        return any(_fits(value, option) for option in get_args(hint))
+    if choices := _choices(hint):
+        return value in choices
+    kind = get_origin(hint) or hint
+    kind = STANDS_FOR.get(getattr(kind, "__name__", ""), kind)
+    if not isinstance(kind, type | UnionType):
+        return True
+    return isinstance(value, kind) and (kind is bool or not isinstance(value, bool))

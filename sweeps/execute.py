@@ -1,11 +1,22 @@
-"""Runs work where Hydra's launcher puts it: in this process, in others, or on other machines."""
+"""Runs jobs where Hydra's launcher puts them: in this process, in others, or on other machines.
+
+Jobs in other processes share with this one only the store, and the folder in which they record how
+they ended.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import as_completed
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 from hydra import initialize_config_dir
 from hydra._internal.callbacks import Callbacks
@@ -16,24 +27,35 @@ from hydra.errors import InstantiationException
 from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from sweeps.overrides import CONFIGS, composed, explain, setting
-from sweeps.processes import set_up
+from bench.console import ConsoleLog
+from bench.errors import explained
+from bench.results import content_key
+from bench.sharing import whole
+from bench.study import study_of
+from reports.runs import load
+from reports.tables import decimal
+from sweeps.configured import build, trained
+from sweeps.measurement import Job, obtain, reason
+from sweeps.overrides import CONFIGS, composed, explain, setting, target_of
+from sweeps.processes import device_lock, on_gpu, processes, set_up
+from sweeps.terminal import time_left
 
-IN_PROCESS = "basic"
-"""Hydra's launcher that runs jobs here, one after the other."""
+OF_MEASUREMENT = ("engine", "precision", "protocol", "pictures")
+"""Settings of run.yaml that no training depends on."""
 
 W = TypeVar("W")
 R = TypeVar("R")
+
+
+# Where work is done
 
 
 @dataclass(frozen=True)
 class Launcher:
     """Where work is done.
 
-    Attributes:
-        words: the settings of Hydra among those of a command (`hydra/launcher=joblib`), and the
-            folders with further choices.
-        outputs: the folder of the store; notes on the work go below it.
+    `words` are the settings of Hydra among those of a command (`hydra/launcher=joblib`), and the
+    folders with further choices. Notes on the work go below `outputs`, the folder of the store.
     """
 
     words: Sequence[str]
@@ -41,15 +63,14 @@ class Launcher:
 
     @property
     def in_process(self) -> bool:
-        """Whether the work is done by this process."""
-        return self._config().hydra.runtime.choices["hydra/launcher"] == IN_PROCESS
+        """Whether the work is done by this process, one piece after the other."""
+        return self._config().hydra.runtime.choices["hydra/launcher"] == "basic"
 
     def run(self, work: Callable[[W], R], on: Sequence[W]) -> list[R]:
         """The results of `work` on each of the things in `on`.
 
-        Raises:
-            SteerbenchError: a setting of the launcher is wrong.
-            Exception: what `work` raised first, once all is done.
+        Raises what `work` raised first, once all is done; SteerbenchError if a setting of the
+        launcher is wrong.
         """
         if not on:
             return []
@@ -60,7 +81,7 @@ class Launcher:
         try:
             launcher = Plugins.instance().instantiate_launcher(
                 hydra_context=HydraContext(config_loader=loader, callbacks=Callbacks()),
-                task_function=_Numbered(work, on),
+                task_function=partial(_numbered, work, on),
                 config=config,
             )
         except InstantiationException as error:
@@ -94,19 +115,153 @@ def divided(words: Sequence[str]) -> tuple[list[str], list[str]]:
     return [word for word in words if word not in of_hydra], of_hydra
 
 
-@dataclass(frozen=True)
-class _Numbered(Generic[W, R]):
+def _numbered(work: Callable[[W], R], on: Sequence[W], config: Any) -> R | Exception:
     """The task of a launcher's job: the job's number says what it works on.
 
     An exception is returned, because Hydra would print it in its own way.
     """
+    set_up()
+    try:
+        return work(on[HydraConfig.get().job.num])
+    except Exception as error:
+        return error
 
-    work: Callable[[W], R]
-    on: Sequence[W]
 
-    def __call__(self, config: Any) -> R | Exception:
-        set_up()
-        try:
-            return self.work(self.on[HydraConfig.get().job.num])
-        except Exception as error:
-            return error
+# How jobs end
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a job ended: with the key of its `run`, or with a `failure`.
+
+    A run was `measured` unless the store had it. `number` counts from 0, in the order of the
+    sweep. `outputs` is the folder with its store, `report` that of its page. `begun` is in seconds
+    since the epoch.
+    """
+
+    number: int
+    name: str
+    outputs: str
+    report: str | None
+    begun: float
+    measured: bool = False
+    run: str | None = None
+    failure: str | None = None
+
+    def write(self, folder: Path) -> None:
+        """Write the record to `folder`, atomically."""
+        with explained(folder), whole(folder / f"{self.number}.job.json") as new:
+            new.write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
+
+
+def read(folder: Path) -> list[Ended]:
+    """Read the records of all jobs that have ended, in the order of the sweep."""
+    texts = (path.read_text(encoding="utf-8") for path in folder.glob("*.job.json"))
+    return sorted((Ended(**json.loads(text)) for text in texts), key=lambda job: job.number)
+
+
+def attempt(jobs: Sequence[Job], first: int, total: int) -> None:
+    """Obtain the runs of `jobs`, in a job of Hydra's; print and record how each ended.
+
+    `first` is the number of the first one in the sweep, `total` how many jobs that has; 0: not
+    known. A failure is printed, kept for reports, and raised.
+    """
+    folder, begun = Path(HydraConfig.get().runtime.output_dir), time.time()
+    records = [
+        Ended(number, job.name, str(job.config.outputs), job.config.report, begun)
+        for number, job in enumerate(jobs, first)
+    ]
+    try:
+        runs, measured = obtain(jobs)
+    except Exception as error:
+        why = reason(error)
+        for job, ended in zip(jobs, records, strict=True):
+            print(f"steerbench: failed: {job.name}: {error}", file=sys.stderr)
+            with _printed():
+                job.keep_failure(why)
+            with _printed():
+                replace(ended, failure=why).write(folder)
+        raise
+    for ended, run in zip(records, runs, strict=True):
+        replace(ended, run=run, measured=measured).write(folder)
+    for job, run in zip(jobs, runs, strict=True):
+        say(job, run, _progress(folder, total))
+
+
+@contextmanager
+def _printed() -> Iterator[None]:
+    """Print an error of the body and go on, so that it does not hide the failure being recorded."""
+    try:
+        yield
+    except Exception as error:
+        print(f"steerbench: {reason(error)}", file=sys.stderr)
+
+
+def say(job: Job, run: str, more: str = "") -> None:
+    """Print the figures of a job's run in one line, and `more` after them."""
+    (loaded,) = load(job.store, {run: job.name})
+    psnr, ms = decimal(loaded.values.get("psnr"), 2), decimal(loaded.values["frame_ms"], 1)
+    print(f"{job.name}: {psnr} dB, {ms} ms a frame{more}", file=sys.stderr)
+
+
+def _progress(folder: Path, total: int) -> str:
+    """How many jobs are done, and an estimate of the remaining time from the measured ones."""
+    ended = read(folder)
+    if len(ended) > total:
+        return ""
+    seconds = time.time() - min(job.begun for job in ended)
+    measured = sum(job.measured for job in ended)
+    left = time_left(seconds, measured, total - len(ended))
+    return f"; {len(ended)} of {total} jobs done{left}"
+
+
+# Trainings in parallel, because small ones gain little from a second core
+
+
+def train_ahead(jobs: Sequence[Job], measured: Collection[str]) -> None:
+    """Train the models of `jobs`, which share one budget, as many at a time as the cores allow.
+
+    Trainings of jobs whose key is in `measured` are skipped. The jobs load the stored stages when
+    they are measured. A training that fails here fails again then, and is reported then.
+    """
+    todo: dict[str, Job] = {}
+    for job in jobs:
+        todo.setdefault(_training(job), job)
+    for job in jobs:
+        if job.key in measured:
+            todo.pop(_training(job), None)
+    if len(todo) < 2:
+        return
+    workers, log = room(jobs[0].config), ConsoleLog(jobs[0].outputs)
+    log.info(f"training {len(todo)} models, {workers} at a time")
+    begun = time.monotonic()
+    with device_lock("cpu", log), processes(workers) as pool:
+        names = {pool.submit(_train, job.config): job.name for job in todo.values()}
+        for number, ended in enumerate(as_completed(names), 1):
+            left = time_left(time.monotonic() - begun, number, len(todo) - number)
+            error = ended.exception()
+            how = f"failed: {reason(error)}" if error else f"trained in {ended.result():.0f} s"
+            print(f"{how}: {names[ended]}{left}", file=sys.stderr)
+
+
+def room(config: DictConfig) -> int:
+    """How many trainings can run at a time; 1 on a GPU, or if the budget sets no `threads`."""
+    threads = build(config, "budget").threads
+    if threads is None or on_gpu(config.device):
+        return 1
+    return len(os.sched_getaffinity(0)) // threads
+
+
+def _training(job: Job) -> str:
+    """A key of all settings that a training may depend on; equal for jobs that share it."""
+    method = job.settings["method"]
+    left_out = {*OF_MEASUREMENT, "method"}
+    chosen = study_of(target_of(method)).chosen
+    others = {name: value for name, value in job.settings.items() if name not in left_out}
+    own = {name: value for name, value in method.items() if name not in chosen}
+    return content_key({**others, "method": own})
+
+
+def _train(config: DictConfig) -> float:
+    """Train, or load the training, in a worker process; return the seconds it took."""
+    return trained(config, ConsoleLog(Path(config.outputs), quiet=True)).train_s

@@ -1,27 +1,63 @@
-"""Jobs that are measured together: found in the store, or measured and put there."""
+"""Jobs: what identifies them, and their runs, which are found in the store or measured now."""
 
 from __future__ import annotations
 
+import hashlib
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from bench.console import ConsoleLog
+from bench.errors import SteerbenchError, explained
+from bench.provenance import computed_by
 from bench.results import Store, content_key
 from bench.run import Task, measure
+from bench.sharing import whole
 from bench.types import Log, Method
-from sweeps import failures
-from sweeps.build import build
-from sweeps.configured import checked_settings, scene_folder, scene_of
-from sweeps.deliver import send
-from sweeps.device_lock import device_lock
-from sweeps.identity import described, run_parts
+from reports.runs import load
+from reports.trackers import tracker
+from sweeps.configured import build, checked_settings, scene_folder, scene_of
+from sweeps.overrides import target_of
+from sweeps.processes import device_lock
+
+PLACES = ("outputs", "report", "tracker", "weights_dir")
+"""Settings that are only locations and do not change a row."""
+
+
+def described(config: DictConfig) -> dict[str, Any]:
+    """The settings that determine a run; equal for equal jobs.
+
+    Left out are: locations, except the last part of a scene's folder, which rows show; `split`,
+    which is in the trajectory; the engine, if the method uses none; and what only the tables read.
+    """
+    try:
+        plain: Any = OmegaConf.to_container(config, resolve=True)
+    except OmegaConfBaseException as error:  # a setting that others use was removed
+        raise SteerbenchError(" ".join(str(error).split())) from error
+    unused = () if "engine" in plain["method"] else ("engine", "precision")
+    left_out = ("split", "tables", *PLACES, *unused)
+    kept = {key: value for key, value in plain.items() if key not in left_out}
+    kept["scene"] = {name: value for name, value in plain["scene"].items() if name != "root"}
+    if "path" in kept["scene"]:
+        kept["scene"]["path"] = Path(kept["scene"]["path"]).name
+    return kept
+
+
+def job_key(settings: Mapping[str, Any], turns: str) -> str:
+    """Equal for jobs with the same `settings` (see `described`) and the same `turns`."""
+    return content_key({"settings": settings, "turns": turns} if turns else settings)
+
+
+def reason(error: BaseException) -> str:
+    """The message of `error` in one line."""
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 @dataclass(frozen=True)
@@ -32,69 +68,75 @@ class Job:
         config: the composed run.yaml.
         command: the words of the command line that makes it alone, for the record.
         name: its name at the terminal.
+        turns: jobs with the same `turns` are measured in turns: they share scene, trajectory,
+            protocol and seed. If it is empty, the job is measured alone.
     """
 
     config: DictConfig
     command: Sequence[str]
     name: str = ""
-
-
-@dataclass(frozen=True)
-class Group:
-    """Jobs that are measured in turns; mostly a single one.
-
-    Several share scene, trajectory, protocol and seed.
-
-    Attributes:
-        turns: the name of the group; a single job has none.
-        first: the number of the first job among those of all groups.
-    """
-
-    jobs: Sequence[Job]
     turns: str = ""
-    first: int = 0
+
+    @cached_property
+    def settings(self) -> dict[str, Any]:
+        """The settings that determine its run."""
+        return described(self.config)
+
+    @cached_property
+    def key(self) -> str:
+        """Equal for equal jobs."""
+        return job_key(self.settings, self.turns)
 
     @property
     def outputs(self) -> Path:
         """The folder of the store."""
-        return Path(self.jobs[0].config.outputs)
+        return Path(self.config.outputs)
+
+    @property
+    def store(self) -> Store:
+        """Where its run is, or will be."""
+        return Store(self.outputs)
+
+    @property
+    def failure_file(self) -> Path:
+        """Holds why the job failed, until it succeeds."""
+        return self.outputs / "failures" / f"{content_key(self.settings)[:16]}.txt"
+
+    @property
+    def failure(self) -> str | None:
+        """Why it failed in its last attempt; None if it did not."""
+        file = self.failure_file
+        return file.read_text(encoding="utf-8").strip() if file.exists() else None
+
+    def keep_failure(self, why: str) -> None:
+        """Record why it failed, for reports."""
+        with explained(self.failure_file.parent):
+            self.failure_file.parent.mkdir(parents=True, exist_ok=True)
+            with whole(self.failure_file) as new:
+                new.write_text(f"{why}\n", encoding="utf-8")
 
 
-@dataclass(frozen=True)
-class Obtained:
-    """A run in the store; `measured` says whether it had to be measured just now."""
+def obtain(jobs: Sequence[Job]) -> tuple[list[str], bool]:
+    """The keys of the runs of `jobs`, whose `turns` are equal, and whether they are measured now.
 
-    store: Store
-    run: str
-    measured: bool
-
-
-def obtain(group: Group) -> list[Obtained]:
-    """Measure the jobs of `group`, unless the store has all of them; forget earlier failures.
-
-    If it has some, these are measured again: figures that are compared come from the same hour.
-
-    Raises:
-        SteerbenchError: a setting is wrong, or something in the measurement went wrong.
+    They are measured unless the store has all of them: figures that are compared come from the same
+    hour. Earlier failures are forgotten.
     """
-    log = ConsoleLog(group.outputs)
-    ready = _ready(group, log)
+    log = ConsoleLog(jobs[0].outputs)
+    ready = _ready(jobs, log)
     if _stored(ready):
-        return _told(ready, False, log)
+        return _told(ready, False, log), False
     with device_lock(ready[0].method.settings()["device"], log):
         measured = not _stored(ready)  # by another process meanwhile
         if measured:
             _measure(ready, log)
-    return _told(ready, measured, log)
+    return _told(ready, measured, log), measured
 
 
-def stored(group: Group) -> list[Obtained]:
-    """The runs that `obtain` would find in the store, if it has all; otherwise none.
-
-    Raises as `obtain` does.
-    """
-    log = ConsoleLog(group.outputs)
-    ready = _ready(group, log)
+def stored(jobs: Sequence[Job]) -> list[str]:
+    """The keys that `obtain` would find in the store, if it has all; otherwise none."""
+    log = ConsoleLog(jobs[0].outputs)
+    ready = _ready(jobs, log)
     return _told(ready, False, log) if _stored(ready) else []
 
 
@@ -106,65 +148,91 @@ class _Ready:
     method: Method
     task: Task
     parts: Mapping[str, Any]
-    store: Store
-
-    @classmethod
-    def of(cls, job: Job, turns: str, log: Log) -> _Ready:
-        config, settings = job.config, checked_settings(job.config)
-        torch.manual_seed(settings.seed)
-        method, budget, protocol = (
-            build(config, name) for name in ("method", "budget", "protocol")
-        )
-        scene = scene_of(config)
-        trajectory = build(config, "trajectory", scene)
-        weights = Path(settings.weights_dir) if settings.weights_dir else None
-        parts = run_parts(config, scene, method, trajectory)
-        parts["lpips"] = protocol.find_lpips(weights, log)
-        if turns:
-            parts["turns"] = turns
-        task = Task(scene, trajectory, protocol, budget, settings.seed, weights, settings.pictures)
-        return cls(job, method, task, parts, Store(Path(settings.outputs)))
 
     @cached_property
     def run(self) -> str:
         """Its key in the store."""
-        return self.store.key(self.parts)
+        return self.job.store.key(self.parts)
 
 
-def _ready(group: Group, log: Log) -> list[_Ready]:
-    """The jobs of `group`, ready to be measured.
+def _ready(jobs: Sequence[Job], log: Log) -> list[_Ready]:
+    """The `jobs`, ready to be measured.
 
-    With `turns`, each key includes the keys of the whole group: if one job changes, all are
-    measured again.
+    With `turns`, each key includes the keys of all of them: if one job changes, all are measured
+    again.
     """
-    ready = [_Ready.of(job, group.turns, log) for job in group.jobs]
-    if not group.turns:
+    ready = [_prepared(job, log) for job in jobs]
+    if not jobs[0].turns:
         return ready
     beside = sorted(content_key(each.parts) for each in ready)
     return [replace(each, parts={**each.parts, "beside": beside}) for each in ready]
 
 
+def _prepared(job: Job, log: Log) -> _Ready:
+    config, settings = job.config, checked_settings(job.config)
+    torch.manual_seed(settings.seed)
+    method, budget, protocol = (build(config, name) for name in ("method", "budget", "protocol"))
+    scene = scene_of(config)
+    trajectory = build(config, "trajectory", scene)
+    weights = Path(settings.weights_dir) if settings.weights_dir else None
+    files = (*getattr(method, "reads", ()), *trajectory.reads)
+    parts = {
+        "config": job.settings,
+        "scene": scene.digest,
+        "resolved": method.settings(),
+        "files": [hashlib.sha256(f.read_bytes()).hexdigest() for f in files if f.is_file()],
+        **computed_by(measure, *_targets(job.settings)),
+        "lpips": protocol.find_lpips(weights, log),
+        **({"turns": job.turns} if job.turns else {}),
+    }
+    task = Task(scene, trajectory, protocol, budget, settings.seed, weights, settings.pictures)
+    return _Ready(job, method, task, parts)
+
+
+def _targets(node: Any) -> Iterator[Any]:
+    """The classes and functions named by the `_target_` of `node` and all nodes below it."""
+    if isinstance(node, Mapping):
+        if "_target_" in node:
+            yield target_of(node)
+        for value in node.values():
+            yield from _targets(value)
+
+
 def _stored(ready: Sequence[_Ready]) -> bool:
-    return all(each.store.find(each.run) for each in ready)
+    return all(each.job.store.find(each.run) for each in ready)
 
 
-def _told(ready: Sequence[_Ready], measured: bool, log: Log) -> list[Obtained]:
+def _told(ready: Sequence[_Ready], measured: bool, log: Log) -> list[str]:
     """Forget earlier failures of runs that the store has now, and send them to their tracker."""
     for each in ready:
-        config, store, run = each.job.config, each.store, each.run
+        job, run = each.job, each.run
         if not measured:
-            log.info(f"already measured; to measure again, remove {store.folder / run}")
-        failures.forget(Path(config.outputs), described(config))
-        send(config, store, run, each.method.name)
-    return [Obtained(each.store, each.run, measured) for each in ready]
+            log.info(f"already measured; to measure again, remove {job.store.folder / run}")
+        job.failure_file.unlink(missing_ok=True)
+        send(job.config, run, each.method.name)
+    return [each.run for each in ready]
 
 
 def _measure(ready: Sequence[_Ready], log: Log) -> None:
     """Measure all, and put them in the place of what an interruption has left of them."""
     measurements = measure([each.method for each in ready], ready[0].task, log)
     for each in ready:
-        each.store.remove(each.run)
+        each.job.store.remove(each.run)
     for each, measurement in zip(ready, measurements, strict=True):
         command, place = shlex.join(each.job.command), scene_folder(each.job.config)
         record = {**measurement.record, "command": command, "scene_path": place}
-        each.store.save(each.parts, replace(measurement, record=record))
+        each.job.store.save(each.parts, replace(measurement, record=record))
+
+
+def send(config: DictConfig, run: str, label: str) -> None:
+    """Send a run to the tracker of `config`, if it names one. Errors are only logged, because the
+    measurement is valid."""
+    if not config.tracker:
+        return
+    outputs = Path(config.outputs)
+    log = ConsoleLog(outputs)
+    try:
+        tracker(config.tracker)(load(Store(outputs), {run: label})[0], outputs)
+        log.info(f"sent to {config.tracker}: {run}")
+    except Exception as error:  # third-party library: any exception
+        log.info(f"not sent to {config.tracker}: {run}: {reason(error)}")

@@ -1,27 +1,31 @@
 """Composes the configuration from the words of a command; errors quote these words.
 
 Words are overrides as for `steerbench run` (scene=wires), and `--config-dir=DIR` for a folder with
-further choices.
+further choices. Installed packages bring folders of choices, too, named by entry points.
 """
 
 from __future__ import annotations
 
+import pkgutil
 import re
 import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
+from importlib import metadata, util
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra.core.config_loader import ConfigLoader
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
 from hydra.errors import MissingConfigException, OverrideParseException
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from bench.errors import SteerbenchError
-from sweeps import plug_ins
-from sweeps.names import unknown
+from bench.errors import SteerbenchError, unknown
 
 CONFIGS = Path(__file__).parent / "configs"
 FLAGS = ("--config-dir", "-cd")
@@ -29,12 +33,14 @@ FLAGS = ("--config-dir", "-cd")
 VALIDATION = "validation"
 """The split of held-out training pictures, and the trajectory that renders them."""
 
+PLUG_INS = "steerbench.configs"
+"""Group of the entry points; the value of each is the package that holds the YAML files."""
+
 
 def composed(words: Sequence[str], **options: bool) -> DictConfig:
     """The configuration of a run; `options` are those of Hydra's `compose`.
 
-    Raises:
-        SteerbenchError: a setting or a choice does not exist, or cannot be read.
+    SteerbenchError if a setting or a choice does not exist, or cannot be read.
     """
     quoted = [str(folder).replace("'", r"\'") for folder in _typed(words)]
     paths = ",".join(f"'file://{folder}'" for folder in quoted)
@@ -71,14 +77,24 @@ def changed(config: DictConfig, words: Sequence[str]) -> DictConfig:
     return copy
 
 
-def choices(group: str, words: Sequence[str] = ()) -> dict[str, Path]:
-    """The file of every choice of `group` by name, including folders named in `words`."""
-    found = {
-        path.stem: path
-        for folder in reversed(_folders(words))  # for equal names, the first folder wins
-        for path in (folder / group).glob("*.yaml")
+def swept(words: Sequence[str], loader: ConfigLoader | None = None) -> dict[str, list[str]]:
+    """The values of every setting with several values (seed=0,1,2); the last word for it counts.
+
+    Hydra's `loader` is needed if a choice may be a pattern (method=*). SteerbenchError if a word
+    cannot be read.
+    """
+    try:
+        parsed = OverridesParser.create(loader).parse_overrides(_overrides(words))
+    except Exception as error:
+        if not of_hydra(error):
+            raise
+        raise explain(error, words) from error
+    last = {override.get_key_element(): override for override in parsed}
+    return {
+        name: list(override.sweep_string_iterator())
+        for name, override in last.items()
+        if override.is_discrete_sweep()
     }
-    return dict(sorted(found.items()))
 
 
 def setting(name: str, text: str) -> str:
@@ -97,29 +113,6 @@ def of_hydra(error: Exception) -> bool:
     """
     *_, (innermost, _) = traceback.walk_tb(error.__traceback__)
     return innermost.f_globals["__name__"].partition(".")[0] in ("hydra", "omegaconf", "antlr4")
-
-
-def swept(words: Sequence[str], loader: ConfigLoader | None = None) -> dict[str, list[str]]:
-    """The values of every setting with several values (seed=0,1,2); the last word for it counts.
-
-    Args:
-        loader: Hydra's loader, needed if a choice may be a pattern (method=*).
-
-    Raises:
-        SteerbenchError: a word cannot be read.
-    """
-    try:
-        parsed = OverridesParser.create(loader).parse_overrides(_overrides(words))
-    except Exception as error:
-        if not of_hydra(error):
-            raise
-        raise explain(error, words) from error
-    last = {override.get_key_element(): override for override in parsed}
-    return {
-        name: list(override.sweep_string_iterator())
-        for name, override in last.items()
-        if override.is_discrete_sweep()
-    }
 
 
 def explain(error: Exception, words: Sequence[str]) -> SteerbenchError:
@@ -148,12 +141,20 @@ def explain(error: Exception, words: Sequence[str]) -> SteerbenchError:
 
 def _settings(words: Sequence[str]) -> list[str]:
     """All settings that exist with the choices (scene=blender) in `words`."""
-    folders = _folders(words)
-    groups = {path.name for folder in folders for path in folder.iterdir() if path.is_dir()}
+    groups = {path.name for folder in _folders(words) for path in folder.iterdir() if path.is_dir()}
     there = {f"{group}={name}" for group in groups for name in choices(group, words)}
     chosen = [word for word in words if word in there]
     config: Any = composed([*folder_words(words), *chosen])
     return [*groups, *leaves(OmegaConf.to_container(config, resolve=False))]
+
+
+def leaves(config: Any, prefix: str = "") -> Iterator[str]:
+    """The names of all settings in `config`, with dots between the levels."""
+    for key, value in config.items():
+        if isinstance(value, Mapping):
+            yield from leaves(value, f"{prefix}{key}.")
+        elif not key.startswith("_"):
+            yield f"{prefix}{key}"
 
 
 def beside(name: str, words: Sequence[str]) -> list[str]:
@@ -172,13 +173,31 @@ def holds(word: str, configs: Iterable[DictConfig]) -> bool:
     )
 
 
-def leaves(config: Any, prefix: str = "") -> Iterator[str]:
-    """The names of all settings in `config`, with dots between the levels."""
-    for key, value in config.items():
-        if isinstance(value, Mapping):
-            yield from leaves(value, f"{prefix}{key}.")
-        elif not key.startswith("_"):
-            yield f"{prefix}{key}"
+def choices(group: str, words: Sequence[str] = ()) -> dict[str, Path]:
+    """The file of every choice of `group` by name, including folders named in `words`."""
+    found = {
+        path.stem: path
+        for folder in reversed(_folders(words))  # for equal names, the first folder wins
+        for path in (folder / group).glob("*.yaml")
+    }
+    return dict(sorted(found.items()))
+
+
+def target_of(node: Mapping[str, Any] | DictConfig) -> Any:
+    """The class or function that `_target_` names; SteerbenchError if it cannot be imported."""
+    try:
+        return pkgutil.resolve_name(node["_target_"])
+    except (ImportError, AttributeError, ValueError) as error:
+        raise SteerbenchError(
+            f"cannot import {node['_target_']}: {error}; PYTHONPATH must name the folder of a "
+            "package that is not installed"
+        ) from error
+
+
+def engine_kinds(words: Sequence[str]) -> dict[str, Any]:
+    """The class of each engine by name; torch, the standard, comes first."""
+    files = sorted(choices("engine", words).items(), key=lambda file: (file[0] != "torch", file))
+    return {name: target_of(OmegaConf.load(path)) for name, path in files}  # type: ignore[arg-type]
 
 
 def folder_words(words: Sequence[str]) -> list[str]:
@@ -192,7 +211,7 @@ def _overrides(words: Sequence[str]) -> list[str]:
 
 def _folders(words: Sequence[str]) -> list[Path]:
     """Our configurations, the folders named in `words`, and those of installed plug-ins."""
-    return [CONFIGS, *_typed(words), *plug_ins.folders()]
+    return [CONFIGS, *_typed(words), *(x for x in plug_ins().values() if isinstance(x, Path))]
 
 
 def _typed(words: Sequence[str]) -> list[Path]:
@@ -203,3 +222,35 @@ def _typed(words: Sequence[str]) -> list[Path]:
         if name in FLAGS:
             further.append(Path(value if equals else after).resolve())
     return further
+
+
+@cache
+def plug_ins() -> dict[str, Path | str]:
+    """The plug-ins of this environment by name, "mine (mine-renderers 1.0)": the folder that holds
+    one of YAML files for each group, or why it cannot be used."""
+    found = {}
+    for entry in sorted(metadata.entry_points(group=PLUG_INS), key=lambda entry: entry.name):
+        of = f" ({entry.dist.name} {entry.dist.version})" if entry.dist else ""
+        found[entry.name + of] = _folder_of(entry.value)
+    return found
+
+
+def _folder_of(package: str) -> Path | str:
+    try:
+        spec = util.find_spec(package)  # imports the parent packages
+    except Exception as error:  # whatever their code raises
+        return f"{type(error).__name__}: {error}"
+    if spec is None or not spec.submodule_search_locations:
+        return f"there is no package {package}"
+    return Path(next(iter(spec.submodule_search_locations)))
+
+
+class _InstalledChoices(SearchPathPlugin):
+    """Appends the plug-ins' folders to Hydra's search path, so that our names take precedence."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for folder in _folders(())[1:]:
+            search_path.append("steerbench-plug-in", f"file://{folder}")
+
+
+Plugins.instance().register(_InstalledChoices)

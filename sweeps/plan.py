@@ -1,88 +1,62 @@
-"""The jobs of the tables of the paper."""
+"""The jobs of the tables of the paper, and the scenes of a data set that they are means over."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from bench.errors import SteerbenchError
+from bench.errors import SteerbenchError, unexpected, unknown
+from bench.scenes.blender import camera_file, picture_path
+from bench.scenes.files import data_folder, frames_of, read_json
+from bench.scenes.nsvf import picture_files
+from reports.outliers import REFERENCES
 from reports.paper_tables import METHOD, Line, PaperTable, paper_tables
-from sweeps.build import build, target_of
-from sweeps.data_sets import DataSet
-from sweeps.device_lock import on_gpu
-from sweeps.identity import described, job_key
-from sweeps.names import unknown
-from sweeps.overrides import CONFIGS, changed, choices, composed, setting, swept
+from sweeps.configured import build
+from sweeps.measurement import Job
+from sweeps.overrides import CONFIGS, changed, choices, composed, setting, swept, target_of
+from sweeps.processes import on_gpu
 
 TABLES = CONFIGS / "experiment"
 """The folder of the experiments that declare the tables."""
 
-REPEATED = "seed"
-"""The only setting that may have several values; a cell then shows mean and interval."""
+MARKS = {"blender": camera_file("train"), "nsvf": "bbox.txt"}
+"""The file by which a scene's layout is recognised, by the value of `scene=` that reads it."""
 
 
 @dataclass(frozen=True)
-class Repeats:
-    """How much of the tables is measured (`tables` in run.yaml).
+class DataSet:
+    """Scenes of one layout: NeRF-Synthetic, or Tanks & Temples in NSVF's layout.
 
-    Attributes:
-        seeds: every cell of the paper's method is repeated with this many seeds, starting at 0.
-        beyond: whether tables that vary the training also cover the method beyond the paper.
+    `layout` is the value of `scene=` that reads them. By name: the folders of the `scenes`, and why
+    others are `missing`.
     """
 
-    seeds: int
-    beyond: bool
-
-    def __post_init__(self) -> None:
-        if self.seeds < 1:
-            raise ValueError(f"seeds: expected 1 or more, got {self.seeds}")
+    layout: str
+    scenes: Mapping[str, Path]
+    missing: Mapping[str, str]
 
 
-@dataclass(frozen=True)
-class Planned:
-    """A job: the line of a table that it fills, its configuration, and the command that runs it.
+@dataclass(frozen=True, kw_only=True)
+class Planned(Job):
+    """A job of a table: `line` is what it fills, `block` the title of the lines beside it.
 
-    `block` is the title of the group of lines that it is compared with. `scene` is its scene in a
-    data set, empty without a data set. Jobs with the same `turns` are measured in turns; if it is
-    empty, the job is measured alone.
+    `scene` is its scene in a data set, empty without a data set.
     """
 
     table: str
     block: str
     line: str
-    config: DictConfig
-    command: Sequence[str]
     scene: str = ""
-    turns: str = ""
-
-    @property
-    def name(self) -> str:
-        """The name of the job at the terminal."""
-        parts = (f"{self.table}: {self.line}", self.scene, f"seed {self.config.seed}")
-        return ", ".join(filter(None, parts))
-
-    @cached_property
-    def settings(self) -> dict[str, Any]:
-        """The settings that determine its run."""
-        return described(self.config)
-
-    @cached_property
-    def key(self) -> str:
-        """Equal for equal jobs."""
-        return job_key(self.settings, self.turns)
 
 
 def chosen(name: str | None, methods: Sequence[str]) -> list[PaperTable]:
-    """The table called `name`, or all of them; `methods` get extra lines in the table of methods.
-
-    Raises:
-        SteerbenchError: there is no such table, or it compares no methods.
-    """
+    """The table called `name`, or all; `methods` get extra lines in the table of methods."""
     tables = {table.name: table for table in paper_tables(TABLES)}
     if name is not None and name not in tables:
         raise unknown("table", name, tables)
@@ -97,17 +71,20 @@ def chosen(name: str | None, methods: Sequence[str]) -> list[PaperTable]:
     ]
 
 
+def repeats(seeds: int, beyond: bool) -> tuple[int, bool]:
+    """How much of the tables is measured: `tables` in run.yaml, which explains both."""
+    if seeds < 1:
+        raise ValueError(f"seeds: expected 1 or more, got {seeds}")
+    return seeds, beyond
+
+
 def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -> list[Planned]:
     """The jobs of `table` under the settings in `words`, for each line, seed and scene of `data`.
 
     Seeds are those in `words`, otherwise the first `tables.seeds`; curves and methods other than
     the paper's use only one of them. Settings that a line lacks are those of the experiment. Lines
     at a precision that the engine lacks are left out. On a GPU the engine is torch, unless `words`
-    choose another.
-
-    Raises:
-        SteerbenchError: a word cannot be read, names nothing, or gives several values to a setting
-            other than the seed.
+    choose another. SteerbenchError if a word gives several values to another setting than the seed.
     """
     words, seeds = _seeds(words)
     fixed = [f"+experiment={table.name}", *words, *([f"scene={data.layout}"] if data else [])]
@@ -116,10 +93,9 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
         fixed.insert(1, "engine=torch")  # Table 1 uses OpenVINO, which computes on a CPU
         experiment = composed(fixed)
     build(experiment, "budget")  # refuses a wrong one before anything runs
-    repeats = build(experiment, "tables")
-    engine = experiment.engine
-    precisions = target_of(engine).precisions
-    usual = [str(seed) for seed in range(repeats.seeds)]
+    several, beyond = build(experiment, "tables")
+    usual = [str(seed) for seed in range(several)]
+    precisions = target_of(experiment.engine).precisions
     scenes = {name: str(folder) for name, folder in data.scenes.items()} if data else {"": ""}
 
     @cache  # values are set afterwards without composing again
@@ -127,24 +103,27 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
         return composed([*fixed, *groups])
 
     jobs = []
-    for block, line, repeated in _lines(table, repeats.beyond):
-        if line.job.get("precision", engine.precision) not in precisions:
+    for block, line, repeated in _lines(table, beyond):
+        if line.job.get("precision", experiment.engine.precision) not in precisions:
             continue
         settings = [f"{name}={value}" for name, value in line.job.items()]
         groups = [word for word in settings if choices(word.partition("=")[0], fixed)]
         values = [word for word in settings if word not in groups]
         of_line = seeds or (usual if repeated else usual[:1])
         for seed, (scene, folder) in product(of_line, scenes.items()):
-            word = f"{REPEATED}={seed}"
-            job = changed(with_choices(*groups), [*values, word])
+            word = f"seed={seed}"
+            config = changed(with_choices(*groups), [*values, word])
             place = []
             if data:
-                job.scene.path = folder
+                config.scene.path = folder
                 place = [setting("scene.path", folder)]
-            OmegaConf.resolve(job)  # once, or each build would resolve `${...}` again
+            OmegaConf.resolve(config)  # once, or each build would resolve `${...}` again
             command = ["steerbench", "run", *fixed, *settings, *place, word, "hydra.mode=RUN"]
+            parts = (f"{table.name}: {line.label}", scene, f"seed {config.seed}")
+            name = ", ".join(filter(None, parts))
             turns = f"{table.name}, {block}, {seed}, {scene}" if table.in_turns else ""
-            jobs.append(Planned(table.name, block, line.label, job, command, scene, turns))
+            where = {"table": table.name, "block": block, "line": line.label, "scene": scene}
+            jobs.append(Planned(config, command, name, turns, **where))
     return jobs
 
 
@@ -163,11 +142,57 @@ def _lines(table: PaperTable, beyond: bool) -> Iterator[tuple[str, Line, bool]]:
 def _seeds(words: Sequence[str]) -> tuple[list[str], list[str]]:
     """The words that all jobs share, and the seeds given by the other words."""
     several = swept(words)
-    if others := sorted(several.keys() - {REPEATED}):
-        raise SteerbenchError(
-            f"{others[0]}: expected one value, got {', '.join(several[others[0]])}; only "
-            f"{REPEATED} may take several here"
-        )
-    named = [word for word in words if word.lstrip("+").partition("=")[0] == REPEATED]
-    values = several.get(REPEATED) or [word.partition("=")[2] for word in named[-1:]]
+    if others := sorted(several.keys() - {"seed"}):
+        got = f"{', '.join(several[others[0]])}; only seed may take several here"
+        raise unexpected(others[0], "one value", got)
+    named = [word for word in words if word.lstrip("+").partition("=")[0] == "seed"]
+    values = several.get("seed") or [word.partition("=")[2] for word in named[-1:]]
     return [word for word in words if word not in named], list(dict.fromkeys(values))
+
+
+def find(path: str) -> DataSet:
+    """Every scene in a subfolder of `path` that has its pictures; SteerbenchError if there is none,
+    or there are scenes of both layouts."""
+    root = data_folder(path)
+    folders = {folder.name: folder for folder in sorted(root.iterdir()) if folder.is_dir()}
+    layouts = {
+        name: layout
+        for layout, mark in MARKS.items()
+        for name, folder in folders.items()
+        if (folder / mark).is_file()
+    }
+    known: Any = OmegaConf.load(REFERENCES)
+    data_sets = [set(known["psnr"]), set(known["tanks_and_temples"])]
+    wanted = next((names for names in data_sets if names & folders.keys()), set())
+    no_cameras = f"no {' or '.join(MARKS.values())}"
+    why = {name: no_cameras if name in folders else "no folder" for name in wanted - layouts.keys()}
+    why |= {name: _lack(folders[name], layout) for name, layout in layouts.items()}
+    missing = {name: lack for name, lack in sorted(why.items()) if lack}
+    whole = {name: folders[name] for name in sorted(layouts) if name not in missing}
+    used = {layouts[name] for name in whole}
+    if len(used) != 1:
+        got = f"scenes of both: {', '.join(whole)}" if used else "none"
+        reasons = "".join(f"; {name}: {lack}" for name, lack in missing.items())
+        raise SteerbenchError(
+            f"data={path}: expected folders of scenes in the layout of NeRF-Synthetic or in NSVF's,"
+            f" got {got}{reasons}; of a single scene the folder is scene.path"
+        )
+    return DataSet(used.pop(), whole, missing)
+
+
+def _lack(folder: Path, layout: str) -> str:
+    """Which pictures a scene lacks, judged by file names; empty if none."""
+    root = data_folder(folder)
+    try:
+        if layout == "nsvf":
+            files = picture_files(root)
+        else:  # those named in the camera files
+            names = [root / camera_file(split) for split in ("train", "test")]
+            frames = [one for path in names for one in frames_of(read_json(root, path.name), path)]
+            files = [picture_path(root, frame["file_path"], where) for where, frame in frames]
+    except SteerbenchError as error:
+        return str(error)
+    absent = [file for file in files if not file.is_file()]
+    if len(absent) == len(files):
+        return "no pictures"
+    return f"{len(absent)} of {len(files)} pictures are not there" if absent else ""

@@ -1,15 +1,27 @@
-"""Processes that measure or train: how they are set up, and pools of them."""
+"""Processes that measure or train: how they are set up, pools of them, and the lock of a device."""
 
 from __future__ import annotations
 
+import hashlib
 import multiprocessing
 import os
+import platform
+import tempfile
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bench.allocator import keep_freed
+from bench.sharing import locked
+
+if TYPE_CHECKING:  # help and completion do not load torch
+    from bench.types import Log
+
+LOCKS = "STEERBENCH_LOCKS"
+"""The environment variable that names another folder for the locks."""
 
 
 def set_up() -> None:
@@ -50,3 +62,37 @@ def _begin() -> None:
         os._exit(1)
 
     threading.Thread(target=wait, daemon=True).start()
+
+
+def device_lock(device: str, log: Log) -> AbstractContextManager[None]:
+    """Wait until no other process of this machine measures on `device`, then hold the lock.
+
+    Parallel work would distort the times. `device` is named as in `steerbench run`. If a process is
+    killed, the system releases its lock.
+    """
+    return locked(lock_file(device), f"waiting: another process measures on {device}", log)
+
+
+def on_gpu(device: str) -> bool:
+    """Whether `device`, named as in `steerbench run`, is a GPU."""
+    import torch
+
+    return device.startswith("cuda") or (device == "auto" and torch.cuda.is_available())
+
+
+def lock_file(device: str) -> Path:
+    """The file to lock, in a folder shared by all users and jobs.
+
+    It is not in `outputs`, which may be on a file system without locks; Slurm gives each job its
+    own /tmp and /dev/shm. GPUs are identified by UUID, because each job may see its own GPU as the
+    first one.
+    """
+    import torch
+
+    gpu = on_gpu(device)
+    if device == "auto":
+        device = "cuda" if gpu else "cpu"
+    which = torch.cuda.get_device_properties(device).uuid if gpu else device
+    name = hashlib.sha256(f"{platform.node()} {which}".encode()).hexdigest()[:16]
+    usual = "/var/tmp" if os.access("/var/tmp", os.W_OK) else tempfile.gettempdir()
+    return Path(os.environ.get(LOCKS) or usual) / f"steerbench-{name}.lock"

@@ -1,4 +1,4 @@
-"""What commands print: tables, rows, figures of a run, and how long the rest takes."""
+"""What commands print: tables, rows, figures of a run, pages, and how long the rest takes."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 import sys
 from collections.abc import Iterable, Mapping
 from datetime import timedelta
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.columns import Columns
@@ -14,13 +15,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
 
+from bench.results import Store
 from reports.tables import Table, run_tables
 
 if TYPE_CHECKING:  # it loads torch, which `steerbench list` does without
     from reports.runs import Run
-
-PIPE_WIDTH = 200
-"""Width of text without a terminal: wide enough for every table."""
 
 
 class _Output(Console):
@@ -30,14 +29,13 @@ class _Output(Console):
 
 
 def console() -> Console:
-    """Standard output; in a file or pipe, tables are not cut to 80 columns."""
-    return _Output(width=None if sys.stdout.isatty() else PIPE_WIDTH, highlight=False)
+    """Standard output; in a file or pipe it is wide enough for every table."""
+    return _Output(width=None if sys.stdout.isatty() else 200, highlight=False)
 
 
-def show(*tables: Table) -> None:
-    """Print `tables`, one below the other."""
-    for table in tables:
-        console().print(rich_table(table))
+def show(table: Table) -> None:
+    """Print `table`."""
+    console().print(rich_table(table))
 
 
 def show_run(run: Run, heading: str) -> None:
@@ -52,6 +50,19 @@ def say_missing(runs: Iterable[Run]) -> None:
     reasons = (f"{name}: n/a. {why}" for run in runs for name, why in run.record["missing"].items())
     for reason in dict.fromkeys(reasons):
         console().print(reason, markup=False, soft_wrap=True)
+
+
+def write_page(
+    report: str | None, store: Store, labels: Mapping[str, str], failed: Mapping[str, str] = {}
+) -> None:
+    """Write a page into the folder `report`, if there is to be one, and print where it is.
+
+    It shows the runs whose keys are in `labels`, if any, and says why other jobs `failed`, by name.
+    """
+    if report and labels:
+        from reports import page  # loads matplotlib, which only a page needs
+
+        print(f"report: {page.write_page(store, labels, Path(report), failed)}", file=sys.stderr)
 
 
 def print_rows(rows: Any) -> None:

@@ -62,37 +62,26 @@ def first(tmp_path_factory: pytest.TempPathFactory, lpips_weights: Path) -> tupl
     return folder, done.stdout
 
 
-def test_the_table_compares_quality_time_and_memory_of_the_methods(
+def test_the_table_and_the_report_compare_all_methods_and_stages_add_up_to_frames(
     first: tuple[Path, str],
 ) -> None:
-    printed = first[1]
+    outputs, printed = first[0] / "outputs", first[1]
     for word in ("PSNR", "SSIM", "LPIPS alex", "FPS", "model, MB", *METHODS):
         assert word in printed
-
-
-def test_the_report_shows_three_frames_of_every_method_with_their_errors(
-    first: tuple[Path, str],
-) -> None:
-    folder = first[0] / "outputs" / "demo"
-    text = (folder / "report.md").read_text()
-    pictures = list((folder / "pictures").glob("frames-*.png"))
+    text = (outputs / "demo" / "report.md").read_text()
+    pictures = list((outputs / "demo" / "pictures").glob("frames-*.png"))
     assert len(pictures) == 3
-    for picture in pictures:
-        assert f"![Ground truth, {', '.join(METHODS)}; a detail of each; error maps](" in text
-        assert picture.name in text
-    for stage in ("march", "field", "feature_reprojection", "renderer2d", "refinement"):
-        assert stage in text
-
-
-def test_the_stages_of_every_method_add_up_to_its_frame(first: tuple[Path, str]) -> None:
-    table = rows(first[0])
-    parts = table.groupby(["method", "phase"])
+    assert f"![Ground truth, {', '.join(METHODS)}; a detail of each; error maps](" in text
+    stages = ("march", "field", "feature_reprojection", "renderer2d", "refinement")
+    for word in (*(picture.name for picture in pictures), *stages):
+        assert word in text
+    parts = rows(first[0]).groupby(["method", "phase"])
     assert {method for method, _ in parts.groups} == set(METHODS)
     for _, part in parts:
         values = part.set_index("metric")["value"]
-        stages = values[values.index.str.startswith("stage_ms.")]
         if "frame_ms" in values:
-            assert stages.sum() == pytest.approx(values["frame_ms"], rel=1e-9)
+            of_stages = values[values.index.str.startswith("stage_ms.")]
+            assert of_stages.sum() == pytest.approx(values["frame_ms"], rel=1e-9)
 
 
 def test_the_same_seed_gives_the_same_rows(

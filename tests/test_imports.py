@@ -17,12 +17,10 @@ MAY_IMPORT = {
     "sweeps": {"bench", "reports", "sweeps"},
 }
 REACHES = {
-    "sweeps/commands/accuracy.py": "methods.checks.",
-    "sweeps/commands/compile.py": "methods.checks.",
-    "sweeps/commands/kernels.py": ("methods.checks.", "methods.kernels."),
+    "sweeps/commands/accuracy.py": "methods.checks",
+    "sweeps/commands/kernels.py": ("methods.checks", "methods.kernels."),
     "sweeps/commands/list.py": "methods.kernels.",
-    "sweeps/commands/stress.py": "methods.checks.",
-    "sweeps/worth.py": "methods.kernels.",
+    "sweeps/commands/stress.py": "methods.checks",
 }
 """What measures and lists parts of methods reaches them directly; methods only through
 `_target_`."""

@@ -51,18 +51,6 @@ def test_a_run_is_measured_once_and_a_method_renders_what_it_measured(
     assert np.array_equal(shown, kept)
 
 
-def test_pictures_are_scored_as_on_the_command_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    for name, level in (("theirs", 151), ("true", 100)):
-        Path(name).mkdir()
-        Image.fromarray(np.full((16, 20, 3), level, np.uint8)).save(f"{name}/0.png")
-    run = steerbench.score("theirs", "true", "protocol.name=quick", "protocol.lpips=[]", name="x")
-    assert run.label == "x"
-    assert run.values["psnr"] == pytest.approx(20 * np.log10(255 / 51))
-
-
 def test_choices_come_with_what_they_are() -> None:
     assert steerbench.methods()["ngp"].startswith("Instant-NGP")
     assert "totem" in steerbench.scenes()

@@ -1,1 +1,1 @@
-"""The commands of `steerbench`, a file each; sweeps/arguments.py declares their arguments."""
+"""The commands of `steerbench`; commands.toml declares their arguments."""

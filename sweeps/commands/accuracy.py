@@ -12,33 +12,23 @@ from omegaconf import DictConfig
 
 from bench.accuracy import best_instead, cheapest_within, experiment_rows
 from bench.console import ConsoleLog
-from bench.errors import SteerbenchError
+from bench.errors import SteerbenchError, unexpected
 from bench.study import Variant
+from methods import checks
 from reports.tradeoff import experiment_table, setting_table, write_tradeoff
-from sweeps.device_lock import device_lock
-from sweeps.execute import Launcher
+from sweeps import variants
 from sweeps.overrides import composed
+from sweeps.processes import device_lock
 from sweeps.terminal import print_rows, show
-from sweeps.variants import (
-    METHOD,
-    Row,
-    computes_with_engine,
-    declared,
-    engines,
-    render_variants,
-    settings,
-)
-
-Knobs = Mapping[str, Sequence[Variant]]
-
-AS_IT_IS = Variant("as it is")
-"""The settings as typed, with which every knob is compared."""
+from sweeps.variants import Row
 
 
 def main(options: argparse.Namespace) -> int:
     """Print both tables and the recommended setting, then all rows as JSON in the last line."""
     limit = None if options.within is None else decibels(options.within)
-    words, launcher = settings(options, METHOD, "scene=totem", "budget=demo", "trajectory=orbit")
+    words, launcher = variants.settings(
+        options, variants.METHOD, "scene=totem", "budget=demo", "trajectory=orbit"
+    )
     words = _last_words(words)
     log = ConsoleLog(launcher.outputs)
     rows: list[Row] = []
@@ -50,12 +40,19 @@ def main(options: argparse.Namespace) -> int:
                 f"{config.method._target_} declares no knobs in `study` (bench/study.py): it is "
                 "rendered as it is"
             )
-        rows = _setting_rows(words, _chosen(knobs, options.filter), options, launcher)
+        chosen = _chosen(knobs, options.filter)
+        lines = {each.name: _last_words([*words, *each.settings]) for _, each in chosen}
+        knob_of = {variant.name: knob for knob, variant in chosen}
+        rows = variants.render(lines, options, launcher)
+        best = best_instead([row["ms"] for row in rows], [-row["psnr"] for row in rows])
+        for row, instead in zip(rows, best, strict=True):
+            row["knob"] = knob_of[row["setting"]]
+            row["lost"] = rows[0]["psnr"] - row["psnr"]
+            row["instead"] = rows[instead]["setting"]  # on the frontier, and dominates it
+            row["overrides"] = shlex.join(lines[row["setting"]])
         show(setting_table(rows))
-    from methods.checks import found
-
     with device_lock("cpu", log):
-        experiments = experiment_rows(found("experiments"), options.repeats, log)
+        experiments = experiment_rows(checks.found("experiments"), options.repeats, log)
     show(experiment_table(experiments))
     command = shlex.join(["steerbench", *sys.argv[1:]])
     page = write_tradeoff(experiments, rows, launcher.outputs / "accuracy", command)
@@ -70,7 +67,7 @@ def decibels(text: str) -> float:
     """The number in "0.1dB", "0.1 dB" or "0.1"; SteerbenchError if invalid or negative."""
     number = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)\s*(dB)?", text, re.IGNORECASE)
     if not number:
-        raise SteerbenchError(f"--within: expected decibels, 0.1dB for example, got {text!r}")
+        raise unexpected("--within", "decibels, 0.1dB for example", repr(text))
     return float(number[1])
 
 
@@ -80,68 +77,39 @@ def _last_words(words: Sequence[str]) -> list[str]:
     return list({key[word]: word for word in words}.values())
 
 
-def _knobs(config: DictConfig, words: Sequence[str], trained: bool) -> Knobs:
+def _knobs(config: DictConfig, words: Sequence[str], trained: bool) -> dict[str, Sequence[Variant]]:
     """The variants of each knob, by the knob's name, with everything else unchanged.
 
     First come the two that the knobs are compared with: everything off, if the method declares what
     that is, and nothing changed. All use the same training, except those that `trained` adds.
     """
-    study = declared(config)
-    standard, *others = engines(words) if computes_with_engine(config) else [AS_IT_IS]
+    study = variants.declared(config)
+    standard, *others = (
+        variants.engines(words) if "engine" in config.method else [variants.AS_IT_IS]
+    )
     off = Variant("everything off", (*standard.settings, *study.exact))
     return {
         **({off.name: [off]} if off.settings else {}),
-        AS_IT_IS.name: [AS_IT_IS],
+        variants.AS_IT_IS.name: [variants.AS_IT_IS],
         **study.knobs,
         **({"engine": others} if others else {}),
         **(study.trained if trained else {}),
     }
 
 
-def _chosen(knobs: Knobs, parts: Sequence[str] | None) -> list[tuple[str, Variant]]:
+def _chosen(
+    knobs: Mapping[str, Sequence[Variant]], parts: Sequence[str]
+) -> list[tuple[str, Variant]]:
     """What all knobs are compared with, and variants of knobs with any of `parts` in their name."""
-    chosen = set(list(knobs)[: list(knobs).index(AS_IT_IS.name) + 1])
+    chosen = set(list(knobs)[: list(knobs).index(variants.AS_IT_IS.name) + 1])
     turned = [knob for knob in knobs if knob not in chosen]
     for part in parts or [""]:
         matching = {knob for knob in turned if part in knob}
         if parts and not matching:
-            raise SteerbenchError(
-                f"--filter: no knob has {part!r} in its name; expected part of one of "
-                f"{', '.join(turned)}"
-            )
+            there = f"expected part of one of {', '.join(turned)}"
+            raise SteerbenchError(f"--filter: no knob has {part!r} in its name; {there}")
         chosen |= matching
     return [(knob, variant) for knob, some in knobs.items() if knob in chosen for variant in some]
-
-
-def _setting_rows(
-    words: Sequence[str],
-    chosen: Sequence[tuple[str, Variant]],
-    options: argparse.Namespace,
-    launcher: Launcher,
-) -> list[Row]:
-    """One row per setting: its knob, overrides, costs and errors, `lost` and `instead`.
-
-    `lost` is its loss in dB against the first setting, `instead` the setting on the frontier that
-    dominates it. For the rest see `bench.accuracy.render_in_turns`.
-    """
-    lines = {variant.name: _last_words([*words, *variant.settings]) for _, variant in chosen}
-    rendered = render_variants(lines, options, launcher)
-    knob_of = {variant.name: knob for knob, variant in chosen}
-    values = [each.values for each in rendered]
-    best = best_instead([row["ms"] for row in values], [-row["psnr"] for row in values])
-    return [
-        {
-            "scene": each.scene,
-            "trajectory": each.trajectory,
-            "resolution": each.resolution,
-            "knob": knob_of[each.name],
-            **each.values,
-            "lost": values[0]["psnr"] - each.values["psnr"],
-            "instead": values[instead]["setting"],
-            "overrides": shlex.join(lines[each.name]),
-        }
-        for each, instead in zip(rendered, best, strict=True)
-    ]
 
 
 def _recommended(rows: Sequence[Row], limit: float) -> str:

@@ -8,29 +8,19 @@ from collections.abc import Iterable, Sequence
 from functools import partial
 from itertools import compress
 
+from omegaconf import DictConfig
+
 from bench.accuracy import steady_frames
-from bench.probes import OTHER, Line, device_waits
-from bench.study import Study, Variant
+from bench.probes import OTHER
+from bench.study import Study
 from bench.types import NullProbe
 from reports.tables import Table, decimal, spread
-from sweeps.commands.skips import nothing_skipped
-from sweeps.device_lock import on_gpu
+from sweeps import variants
 from sweeps.execute import Launcher
 from sweeps.overrides import composed, folder_words, holds
+from sweeps.processes import on_gpu
 from sweeps.terminal import print_rows, show
-from sweeps.variants import (
-    METHOD,
-    Rendered,
-    Row,
-    computes_with_engine,
-    declared,
-    engines,
-    fitted,
-    render_variants,
-    settings,
-    settings_of,
-    times,
-)
+from sweeps.variants import Row
 
 DENSE = ", nothing skipped"
 """Suffix of a line whose method skips nothing."""
@@ -38,27 +28,25 @@ DENSE = ", nothing skipped"
 
 def main(options: argparse.Namespace) -> int:
     """Print a table, then its rows as JSON in the last line; or the same of waits."""
-    words, launcher = settings(options, METHOD, "trajectory=smooth")
+    words, launcher = variants.settings(options, variants.METHOD, "trajectory=smooth")
     words = with_engine(words)
     if options.device_waits:
         return _print_waits(words, options.frames, launcher)
     config = composed(words)
-    study = declared(config)
-    usual = _precisions(words) or [Variant("as it is")]
-    variants = settings_of(words, usual)
+    study = variants.declared(config)
+    wanted = _lines(words)
     if study.skips:
-        variants |= settings_of([*words, *nothing_skipped(study)], _ending(usual, DENSE))
+        wanted |= _lines([*words, *variants.nothing_skipped(study)], DENSE)
     configs = [composed([*folder_words(words), *of]) for of in study.beside.values()]
     shared = [word for word in words if holds(word, configs)]  # settings that all of them have
     for name, of_method in study.beside.items():
-        other = [*shared, *of_method]
-        variants |= settings_of(other, _ending(_precisions(other), f", {name}") or [Variant(name)])
-    rendered = render_variants(variants, options, launcher)
-    rows = [_row(each, composed(variants[each.name]).budget == config.budget) for each in rendered]
+        wanted |= _lines([*shared, *of_method], f", {name}")
+    rendered = variants.render(wanted, options, launcher)
+    rows = [_row(each, composed(wanted[each["setting"]]), config.budget) for each in rendered]
     parts = _parts(study, rows)
     columns = ("", *parts, "frame ↓", "of rounds", "p99 / p50 ↓", "FPS ↑", "PSNR, dB ↑")
-    title = f"ms of a frame, and what of it each part takes itself; {rendered[0].frames} frames"
-    show(Table(title, columns, tuple(_line(row, parts) for row in rows)))
+    title = f"ms of a frame, and what of it each part takes itself; {rendered[0]['frames']} frames"
+    show(Table(title, columns, tuple(_cells(row, parts) for row in rows)))
     print_rows(rows)
     return 0
 
@@ -82,16 +70,16 @@ def _print_waits(words: Sequence[str], frames: int, launcher: Launcher) -> int:
 
 def _waits(words: Sequence[str], frames: int) -> list[Counter[Line]]:
     """Where the host waits in each steady frame of a second round: the first sets things up."""
-    with fitted({"as it is": words}, frames) as each:
-        (method,) = each.methods.values()
+    with variants.fitted({variants.AS_IT_IS.name: words}, frames) as (methods, ground, _):
+        (method,) = methods.values()
         for _ in range(2):
             method.reset()
             counted = []
-            for step in each.trajectory.steps:
+            for step in ground.trajectory.steps:
                 with device_waits() as waits:
                     method.render(step.camera, NullProbe())
                 counted.append(waits)
-        ready, _ = steady_frames([method], each.trajectory)
+        ready, _ = steady_frames([method], ground.trajectory)
         return list(compress(counted, ready))
 
 
@@ -101,31 +89,30 @@ def with_engine(words: Sequence[str]) -> list[str]:
     return ["engine=torch" if on_gpu(device) else "engine=openvino", *words]
 
 
-def _precisions(words: Sequence[str]) -> list[Variant]:
+def _lines(words: Sequence[str], ending: str = "") -> dict[str, list[str]]:
+    """The words of a line for each precision of the engine; of one line without an engine."""
     config = composed(words, return_hydra_config=True)
-    if not computes_with_engine(config):
-        return []
+    if "engine" not in config.method:
+        return {ending.removeprefix(", ") or variants.AS_IT_IS.name: list(words)}
     chosen = f"engine={config.hydra.runtime.choices.engine}"
-    return [variant for variant in engines(words) if chosen in variant.settings]
+    own = [variant for variant in variants.engines(words) if chosen in variant.settings]
+    return {f"{name}{ending}": of for name, of in variants.words_of(words, own).items()}
 
 
-def _ending(variants: Iterable[Variant], ending: str) -> list[Variant]:
-    return [Variant(variant.name + ending, variant.settings) for variant in variants]
-
-
-def _row(variant: Rendered, trained_alike: bool) -> Row:
+def _row(rendered: Row, config: DictConfig, budget: DictConfig) -> Row:
     """One line; its PSNR is left out if it has another budget than the first line."""
+    study = variants.declared(config)
     parts: dict[str, float] = {}
-    for metric, value in variant.values.items():
+    for metric, value in rendered.items():
         if metric.startswith("stage_ms."):
-            part = variant.study.part_of(metric.removeprefix("stage_ms."))
+            part = study.part_of(metric.removeprefix("stage_ms."))
             parts[part] = parts.get(part, 0.0) + value
     return {
-        "line": variant.name,
+        "line": rendered["setting"],
         "parts": parts,
-        "network_ms": variant.network_ms,
-        **times(variant),
-        "psnr": variant.values["psnr"] if trained_alike else None,
+        "network_ms": rendered.get(f"stage_ms.{study.network_stage}"),
+        **variants.times(rendered),
+        "psnr": rendered["psnr"] if config.budget == budget else None,
     }
 
 
@@ -136,7 +123,7 @@ def _parts(study: Study, rows: Iterable[Row]) -> list[str]:
     return [*named, *(part for part in there if part not in (*named, OTHER)), OTHER]
 
 
-def _line(row: Row, parts: Iterable[str]) -> tuple[str, ...]:
+def _cells(row: Row, parts: Iterable[str]) -> tuple[str, ...]:
     return (
         row["line"],
         *(decimal(row["parts"].get(part, 0.0), 1) for part in parts),

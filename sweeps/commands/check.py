@@ -15,7 +15,7 @@ from bench.results import Store
 from bench.sharing import whole
 from reports.regression import LIMITS, Figures, Limit, change_table, changes
 from reports.runs import Run, load, readable
-from sweeps.identity import PLACES
+from sweeps.measurement import PLACES
 from sweeps.terminal import console, show
 
 SCHEMA = 2
@@ -33,22 +33,22 @@ def main(options: argparse.Namespace) -> int:
     runs, limits = _read(options.baseline)
     failed = 0
     for command, old in runs.items():
-        if missing := old.keys() - stored.get(command, {}):
-            seeds = f" with seed={','.join(sorted(missing))}" if command in stored else ""
-            text = f"{command}: no such run{seeds} below {options.outputs}"
-            console().print(text, markup=False)
-            failed += 1
-            continue
-        try:
-            new = [Figures.of(stored[command][seed], limits) for seed in old]
-            rows = list(changes(list(old.values()), new, limits))
-        except SteerbenchError as error:
-            text = f"{command}: {error}; `steerbench check --record` takes the new ones"
-            console().print(text, markup=False)
-            failed += 1
-            continue
-        failed += sum(row.verdict != "" for row in rows)
-        show(change_table(command, rows))
+        there = stored.get(command, {})
+        if missing := old.keys() - there:
+            seeds = f" with seed={','.join(sorted(missing))}" if there else ""
+            why = f"no such run{seeds} below {options.outputs}"
+        else:
+            try:
+                new = [Figures.of(there[seed], limits) for seed in old]
+                rows = list(changes(list(old.values()), new, limits))
+            except SteerbenchError as error:
+                why = f"{error}; `steerbench check --record` takes the new ones"
+            else:
+                failed += sum(row.verdict != "" for row in rows)
+                show(change_table(command, rows))
+                continue
+        console().print(f"{command}: {why}", markup=False)
+        failed += 1
     console().print("as good as the baseline" if not failed else f"worse or missing: {failed}")
     return int(failed > 0)
 
@@ -66,24 +66,16 @@ def _compare(options: argparse.Namespace) -> int:
 def _by_command(store: Store) -> dict[str, dict[str, Run]]:
     """Every run, by what was typed for it and by its seed; of several, the last that was stored."""
     stored: dict[str, dict[str, Run]] = {}
+    others = (*PLACES, "hydra.mode", "seed")  # what does not change a row is left out, too
     for run in readable(store):
-        seeds = stored.setdefault(_command(str(run.record["command"])), {})
-        seeds[str(run.facts["seed"])] = run
+        words = shlex.split(str(run.record["command"]))[2:]
+        kept = sorted(word for word in words if word.partition("=")[0] not in others)
+        stored.setdefault(shlex.join(kept), {})[str(run.facts["seed"])] = run
     return stored
 
 
-def _command(typed: str) -> str:
-    """What was typed, in one order, without the seed and what does not change a row."""
-    words = shlex.split(typed)[2:]
-    others = (*PLACES, "hydra.mode", "seed")
-    return shlex.join(sorted(word for word in words if word.partition("=")[0] not in others))
-
-
 def _record(path: Path, stored: Mapping[str, Mapping[str, Run]]) -> None:
-    """Write the figures of `stored` to `path`.
-
-    A baseline that is there keeps its limits and its choice of runs.
-    """
+    """Write figures to `path`; a baseline that is there keeps its limits and its choice of runs."""
     limits: Mapping[str, Limit] = LIMITS
     if path.exists():
         known, limits = _read(path)

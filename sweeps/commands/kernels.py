@@ -1,51 +1,199 @@
-"""`steerbench kernels`: error and throughput of every kernel; a wrong kernel is not timed."""
+"""`steerbench kernels`: error and throughput of every kernel; a wrong kernel is not timed.
+
+`steerbench compile` compiles all of them now, not when they are first called. numba keeps compiled
+code beside the sources until they change. A kernel is compiled by computing its cases, which covers
+all types of inputs.
+
+`--worth` prints what the fast version of each kernel brings to each method. A method is trained for
+a moment. Then it renders the same frames, and trains as briefly again, in turns: with all kernels
+as they are, and with one of them computed by its reference.
+"""
 
 from __future__ import annotations
 
 import argparse
-import json
-from collections.abc import Mapping
+import importlib
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import as_completed
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from statistics import median
 from typing import Any
 
-from bench.case import timed_rows
+import torch
+from omegaconf import DictConfig
+
+from bench.accuracy import render_in_turns
+from bench.case import failed, timed_rows
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
-from reports.tables import Table
-from sweeps.device_lock import device_lock
-from sweeps.terminal import show
+from bench.types import Camera, Frame, Method, NullProbe, Probe, Scene
+from methods import checks
+from methods.kernels import compiled
+from methods.kernels.dispatch import forced, kernel_calls
+from reports.tables import Table, decimal
+from sweeps.configured import build, checked_settings
+from sweeps.overrides import choices, composed, swept
+from sweeps.processes import device_lock, processes
+from sweeps.terminal import print_rows, show
+from sweeps.variants import Row, common_ground
 
 COLUMNS = ("kernel", "case", "backend", "dtype", "error", "tolerance", "ms", "M items/s", "ratio")
 """`ratio`: time of the reference backend over time of this one, in the same case and run."""
 
+OF_WORTH = (
+    *("method", "kernel", "frame, ms", "by its reference", "ratio"),
+    *("training, s", "by its reference", "ratio", "brings"),
+)
+"""`brings`: the share that the fast version saves of a frame or of a training, the larger one."""
+
+SETTINGS = ("scene=totem", "scene.width=100", "trajectory=orbit", "budget=tiny")
+
+AS_IT_IS = ""
+"""In place of the name of a kernel: none is computed by its reference."""
+
 
 def main(options: argparse.Namespace) -> int:
     """Print a table, then its rows as JSON in the last line; return 1 if any kernel is wrong."""
-    import torch
-
-    from methods.checks import found
-    from methods.kernels import compiled
-
+    if options.command == "compile":
+        return _compile()
     if options.worth:
-        from sweeps.worth import worth
+        rows = _worth(options)
+        title = "What the fast version of a kernel brings"
+        table = Table(title, OF_WORTH, tuple(map(_line_of_worth, rows)))
+    else:
+        log, device = ConsoleLog(Path()), "cuda" if torch.cuda.is_available() else "cpu"
+        cases = [case for case in checks.found("cases") if options.filter in case.subject]
+        with device_lock("auto", log):
+            rows = timed_rows(cases, device, compiled(device), options.repeats, log)
+        if not rows:
+            raise SteerbenchError(f"--filter: no kernel has {options.filter!r} in its name")
+        table = Table("Kernels", COLUMNS, tuple(map(_line, rows)))
+    show(table)
+    print_rows(rows)
+    return int(any(row.get("status", "ok") != "ok" for row in rows))
 
-        return worth(options.overrides, options.frames, options.repeats)
-    log, device = ConsoleLog(Path()), "cuda" if torch.cuda.is_available() else "cpu"
-    cases = [case for case in found("cases") if options.filter in case.subject]
-    with device_lock("auto", log):
-        rows = timed_rows(cases, device, compiled(device), options.repeats, log)
-    if not rows:
-        raise SteerbenchError(f"--filter: no kernel has {options.filter!r} in its name")
-    show(Table("Kernels", COLUMNS, tuple(map(_line, rows))))
-    print(json.dumps(rows))
-    return int(any(row["status"] != "ok" for row in rows))
+
+def _compile() -> int:
+    """Compile the kernels for this CPU, on all cores; return 1 if one of them is wrong."""
+    names = checks.modules("cases")
+    with (
+        processes(len(os.sched_getaffinity(0))) as pool,
+        ConsoleLog(Path()).progress("compiling kernels", len(names)) as bar,
+    ):
+        wrong = []
+        for ended in as_completed([pool.submit(wrong_of, name) for name in names]):
+            wrong += ended.result()
+            bar.advance()
+    for case in sorted(wrong):
+        print(f"wrong on this machine: {case}; see `steerbench kernels`", file=sys.stderr)
+    return int(bool(wrong))
+
+
+def wrong_of(module: str) -> list[str]:
+    """Compute each quick case of `module` with compiled kernels; return the names of wrong ones."""
+    quick = [case for case in importlib.import_module(module).cases() if case.quick]
+    cells = [(case, cell) for case in quick for cell in case.tolerances if cell[0] == "cpu"]
+    rows = [case.check(cell, "cpu") for case, cell in cells]
+    return [f"{row['subject']}: {row['case']}" for row in rows if failed(row)]
 
 
 def _line(row: Mapping[str, Any]) -> tuple[str, ...]:
     labels = (row["kernel"], row["case"], row["backend"], row["dtype"])
-    error = "not finite" if row["error"] is None else f"{row['error']:.1e}"
-    errors = (error, "" if row["tolerance"] is None else f"{row['tolerance']:.1e}")
     if row["status"] != "ok":
-        return (*labels, *errors, row["status"], "", "")
+        return (*labels, *errors(row), row["status"], "", "")
     ratio = f"{row['ratio']:.1f}x" if "ratio" in row else ""
-    return (*labels, *errors, f"{row['ms']:.2f}", f"{row['mitems_s']:.2f}", ratio)
+    return (*labels, *errors(row), f"{row['ms']:.2f}", f"{row['mitems_s']:.2f}", ratio)
+
+
+def errors(row: Mapping[str, Any]) -> tuple[str, str]:
+    """The cells of the error of a check and of its tolerance."""
+    error = "not finite" if row["error"] is None else f"{row['error']:.1e}"
+    return error, "" if row["tolerance"] is None else f"{row['tolerance']:.1e}"
+
+
+def _worth(options: argparse.Namespace) -> list[Row]:
+    """The rows of the methods that the settings name; without `method=a,b`, of all methods."""
+    words = options.overrides
+    typed = [word.partition("=")[2] for word in words if word.startswith("method=")]
+    names = swept(words).get("method", typed) or list(choices("method", words))
+    rest = [*SETTINGS, *(word for word in words if not word.startswith("method="))]
+    each = (_rows_of_worth(name, rest, options.frames, options.repeats) for name in names)
+    return [row for rows in each for row in rows]
+
+
+def _rows_of_worth(name: str, words: Sequence[str], frames: int, repeats: int) -> list[Row]:
+    """A row for each kernel that the method calls."""
+    config = composed([*words, f"method={name}"])
+    settings = checked_settings(config)
+    log = ConsoleLog(Path(settings.outputs))
+    scene, path, protocol = common_ground(config, frames)
+    with device_lock(settings.device, log):
+        with kernel_calls() as in_training:
+            method, _ = _trained(config, scene, AS_IT_IS)
+        with kernel_calls() as in_frames, torch.no_grad():
+            for step in path.steps:
+                method.render(step.camera, NullProbe())
+        lines: dict[str, Any] = {one: Forced(method, one) for one in (AS_IT_IS, *in_frames)}
+        rendered = render_in_turns(lines, scene, path, protocol, repeats, log)
+        trained: dict[str, list[float]] = {one: [] for one in (AS_IT_IS, *in_training)}
+        for _ in range(repeats):
+            for kernel, seconds in trained.items():
+                seconds.append(_trained(config, scene, kernel)[1])
+    frame_ms = {row["setting"]: row["ms"] for row in rendered}
+    return [
+        {
+            "method": name,
+            "kernel": kernel.rpartition(".")[2],
+            "frame_ms": frame_ms[AS_IT_IS],
+            "frame_ms_reference": frame_ms.get(kernel),
+            "training_s": median(trained[AS_IT_IS]),
+            "training_s_reference": median(trained[kernel]) if kernel in trained else None,
+        }
+        for kernel in sorted(in_frames | in_training)
+    ]
+
+
+def _trained(config: DictConfig, scene: Scene, kernel: str) -> tuple[Method, float]:
+    """The method, trained in a store of its own, and how many seconds that took."""
+    with tempfile.TemporaryDirectory() as folder:
+        method = build(config, "method")
+        torch.manual_seed(config.seed)
+        begun = time.perf_counter()
+        with by_reference(kernel):
+            method.fit(scene, build(config, "budget"), ConsoleLog(Path(folder), quiet=True))
+        return method, time.perf_counter() - begun
+
+
+def by_reference(kernel: str) -> AbstractContextManager[None]:
+    """Inside, the reference computes `kernel`, a package; all as it is if that is `AS_IT_IS`."""
+    return nullcontext() if kernel == AS_IT_IS else forced(kernel, "reference")
+
+
+class Forced:
+    """A method that renders with one of its kernels computed by the reference."""
+
+    def __init__(self, method: Method, kernel: str) -> None:
+        self._method, self._kernel = method, kernel
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._method, name)
+
+    def render(self, camera: Camera, probe: Probe) -> Frame:
+        """The frame of the method."""
+        with by_reference(self._kernel):
+            return self._method.render(camera, probe)
+
+
+def _line_of_worth(row: Row) -> tuple[str, ...]:
+    cells, saved = [], []
+    for name, digits in (("frame_ms", 1), ("training_s", 2)):
+        own, other = row[name], row[f"{name}_reference"]
+        ratio = None if other is None else other / own
+        cells += [decimal(own, digits), decimal(other, digits), decimal(ratio, 2)]
+        saved += [] if ratio is None else [1 - 1 / ratio]
+    return (row["method"], row["kernel"], *cells, f"{max(saved):.0%}")

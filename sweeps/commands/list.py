@@ -6,16 +6,15 @@ import argparse
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 from bench.errors import SteerbenchError, Unavailable
 from reports.tables import Table
-from sweeps.build import engine_kinds
-from sweeps.overrides import choices
-from sweeps.plug_ins import PlugIn, installed
+from sweeps.overrides import choices, engine_kinds, plug_ins
 from sweeps.terminal import console, show
 
-GROUPS = ("method", "engine", "scene", "trajectory", "protocol", "budget", "experiment")
+GROUPS = ("method", "engine", "scene", "trajectory", "protocol", "budget", "+experiment")
 
 
 def main(options: argparse.Namespace) -> int:
@@ -25,13 +24,13 @@ def main(options: argparse.Namespace) -> int:
     """
     words = options.config_dir
     files = [
-        (f"{'+' if group == 'experiment' else ''}{group}={name}", about)
+        (f"{group}={name}", about)
         for group in GROUPS
-        for name, about in described(group, words).items()
+        for name, about in described(group.lstrip("+"), words).items()
     ]
     _show("Choices", ("choice", "what it is"), files)
-    plug_ins = [(each.name, _brings(each, words)) for each in installed()]
-    _show("Installed plug-ins", ("plug-in", "what it brings"), plug_ins)
+    installed = [(name, _brings(folder, words)) for name, folder in plug_ins().items()]
+    _show("Installed plug-ins", ("plug-in", "what it brings"), installed)
     if not options.here:
         console().print("Backends and engines that this machine can use: steerbench list --here")
         return 0
@@ -40,9 +39,7 @@ def main(options: argparse.Namespace) -> int:
 
     backends = [(name, why or "usable") for name, why in availability().items()]
     _show("Backends of the kernels", ("backend", "here"), backends)
-    engines = [
-        (name, _state(name, kind)) for name, kind in engine_kinds(choices("engine", words)).items()
-    ]
+    engines = [(name, _state(name, kind)) for name, kind in engine_kinds(words).items()]
     _show("Engines of the networks", ("engine", "here"), engines)
     return 0
 
@@ -53,19 +50,24 @@ def _show(title: str, columns: tuple[str, str], lines: Sequence[tuple[str, str]]
 
 
 def described(group: str, words: Sequence[str] = ()) -> dict[str, str]:
-    """Every choice of `group`, including folders named in `words`, with its description."""
-    return {name: _comment(path.read_text()) for name, path in choices(group, words).items()}
+    """Every choice of `group`, including folders named in `words`, with its description: the first
+    comment that is not a Hydra directive (`# @package`)."""
+    comments = {}
+    for name, path in choices(group, words).items():
+        lines = [line[1:].strip() for line in path.read_text().splitlines() if line[:1] == "#"]
+        comments[name] = next((line for line in lines if not line.startswith("@")), "")
+    return comments
 
 
-def _brings(plug_in: PlugIn, words: Sequence[str]) -> str:
-    """The choices of a plug-in, or why it has none."""
-    if plug_in.folder is None:
-        return f"cannot be used: {plug_in.fault}"
+def _brings(folder: Path | str, words: Sequence[str]) -> str:
+    """The choices of a plug-in's folder, or why it has none."""
+    if isinstance(folder, str):
+        return f"cannot be used: {folder}"
     brought = []
-    for path in sorted(plug_in.folder.glob("*/*.yaml")):
+    for path in sorted(folder.glob("*/*.yaml")):
         group, hidden = path.parent.name, choices(path.parent.name, words)[path.stem] != path
         brought.append(f"{group}={path.stem}" + (" (hidden: the name is taken)" if hidden else ""))
-    return ", ".join(brought) or f"nothing: there are no GROUP/NAME.yaml in {plug_in.folder}"
+    return ", ".join(brought) or f"nothing: there are no GROUP/NAME.yaml in {folder}"
 
 
 def _state(name: str, kind: Any) -> str:
@@ -76,9 +78,3 @@ def _state(name: str, kind: Any) -> str:
     with suppress(metadata.PackageNotFoundError):  # an engine's name may differ from its library's
         return f"usable (version {metadata.version(name)})"
     return "usable"
-
-
-def _comment(text: str) -> str:
-    """The first comment that is not a Hydra directive (`# @package`)."""
-    lines = (line.removeprefix("#").strip() for line in text.splitlines() if line.startswith("#"))
-    return next((line for line in lines if not line.startswith("@")), "")

@@ -4,27 +4,31 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
+from typing import NamedTuple
+
+from omegaconf import DictConfig
+from reports.scenes import over_scenes
 
 from bench.errors import SteerbenchError, Unavailable
 from bench.results import Store
 from reports import export
 from reports.outliers import outlier_table, outliers
 from reports.paper_page import write_paper_page
-from sweeps.data_sets import DataSet, find
-from sweeps.execute import Launcher, divided
-from sweeps.gather import gather, newest
-from sweeps.jobs import attempt, say
-from sweeps.measurement import Group, Job, Obtained, stored
+from reports.runs import Repeated, Run, over_common_frames, readable
+from sweeps.configured import scene_digest, scene_folder
+from sweeps.execute import Launcher, attempt, divided, room, say, train_ahead
+from sweeps.measurement import job_key, stored
 from sweeps.overrides import composed
-from sweeps.plan import Planned, chosen, plan
+from sweeps.plan import DataSet, Planned, chosen, find, plan
 from sweeps.terminal import console, show
-from sweeps.train_ahead import room, train_ahead
 
 DATA = "data="
 """Prefix of the word that names the folder of a data set."""
@@ -52,7 +56,7 @@ def main(options: argparse.Namespace) -> int:
     runs = newest(Store(outputs))
     broken = outliers(list(chain(*runs.values())))
     folder = options.report or outputs / "paper"
-    lines = gather(jobs, runs, outputs)
+    lines = gather(jobs, runs)
     page = write_paper_page(tables, lines, broken, folder, missing)
     if options.format:
         print(getattr(export, options.format)(tables, lines), end="")
@@ -63,19 +67,15 @@ def main(options: argparse.Namespace) -> int:
 def data_set(words: Sequence[str]) -> tuple[list[str], DataSet | None]:
     """The settings among `words`, and the data set if one of them names it (data=DIR).
 
-    Raises:
-        SteerbenchError: another word names a scene; or the data set has no scenes.
+    SteerbenchError if another word names a scene, or the data set has no scenes.
     """
     settings = [word for word in words if not word.startswith(DATA)]
-    named = [word.removeprefix(DATA) for word in words if word.startswith(DATA)]
-    scenes = [
-        word for word in settings if word.lstrip("+~").partition("=")[0] in ("scene", "scene.path")
-    ]
-    if named and scenes:
-        raise SteerbenchError(
-            f"{DATA}{named[-1]} and {scenes[0]}: expected one of them; data names all scenes"
-        )
-    return settings, find(named[-1]) if named else None
+    named = [word for word in words if word.startswith(DATA)]
+    of_scene = re.compile(r"[+~]*scene(\.path)?(=|$)")
+    if named and (scenes := [word for word in settings if of_scene.match(word)]):
+        both = f"{named[-1]} and {scenes[0]}"
+        raise SteerbenchError(f"{both}: expected one of them; data names all scenes")
+    return settings, find(named[-1].removeprefix(DATA)) if named else None
 
 
 def _run(jobs: Sequence[Planned], launcher: Launcher) -> int:
@@ -93,46 +93,46 @@ def _run(jobs: Sequence[Planned], launcher: Launcher) -> int:
     groups, measured = _groups(jobs, look_up=ahead)
     if ahead:
         train_ahead(jobs, measured)
-    total = sum(len(group.jobs) for group in groups)
+    total = sum(len(group) for _, group in groups)
     return sum(launcher.run(partial(_attempted, total=total), groups))
 
 
-def _groups(jobs: Sequence[Planned], look_up: bool) -> tuple[list[Group], set[str]]:
-    """The groups of the jobs; those with the same `turns` are one.
+def _groups(
+    jobs: Sequence[Planned], look_up: bool
+) -> tuple[list[tuple[int, list[Planned]]], set[str]]:
+    """The jobs that are measured in turns, together, after the number of the first of them.
 
-    With `look_up`, without the groups that the store has; and the keys of their jobs.
+    With `look_up`, without those that the store has; and the keys of these.
     """
     by_turns: dict[str, list[Planned]] = {}
     for job in jobs:
         by_turns.setdefault(job.turns or job.key, []).append(job)
-    groups: list[Group] = []
+    groups: list[tuple[int, list[Planned]]] = []
     measured: set[str] = set()
-    for planned in by_turns.values():
-        wanted = [Job(job.config, job.command, job.name) for job in planned]
-        first = sum(len(group.jobs) for group in groups)
-        group = Group(wanted, planned[0].turns, first)
-        there: list[Obtained] = []
+    for together in by_turns.values():
+        runs: list[str] = []
         with suppress(SteerbenchError):  # a job that cannot start says so when it is measured
-            there = stored(group) if look_up else []
-        if there:
-            measured |= {job.key for job in planned}
-            for each, obtained in zip(wanted, there, strict=True):
-                say(each, obtained)
+            runs = stored(together) if look_up else []
+        if runs:
+            measured |= {job.key for job in together}
+            for job, run in zip(together, runs, strict=True):
+                say(job, run)
         else:
-            groups.append(group)
+            groups.append((sum(len(group) for _, group in groups), together))
     return groups, measured
 
 
-def _attempted(group: Group, total: int) -> int:
-    """Attempt a group; return how many of its jobs failed that can run here."""
-    for number, job in enumerate(group.jobs, group.first + 1):
+def _attempted(group: tuple[int, Sequence[Planned]], total: int) -> int:
+    """Attempt jobs that are measured together; return how many failed that can run here."""
+    first, jobs = group
+    for number, job in enumerate(jobs, first + 1):
         print(f"{number} of {total}, {job.name}", file=sys.stderr)
     try:
-        attempt(group, total)
+        attempt(jobs, first, total)
     except Unavailable:
         return 0
     except Exception:  # already printed; the other jobs still run
-        return len(group.jobs)
+        return len(jobs)
     return 0
 
 
@@ -144,3 +144,107 @@ def _check(store: Store) -> int:
     keys = {outlier.key for outlier in broken}
     console().print(f"{len(keys)} of {len(runs)} runs look broken")
     return int(len(keys) > 0)
+
+
+class Outcome(NamedTuple):
+    """A job with its run, if there is one, and the reason why it is missing or in doubt."""
+
+    job: Planned
+    run: Run | None
+    gap: str | None
+
+
+def newest(store: Store) -> dict[str, list[Run]]:
+    """The latest run of each job and scene, by job key, newest first.
+
+    A job has several if its settings fit scenes in different folders.
+    """
+    of_jobs: dict[str, dict[str, Run]] = {}
+    for run in reversed(readable(store)):
+        parts = run.record["made_of"]
+        if "config" in parts:
+            of_job = of_jobs.setdefault(job_key(parts["config"], parts.get("turns", "")), {})
+            of_job.setdefault(run.record["scene"]["digest"], run)
+    return {job: list(of_scenes.values()) for job, of_scenes in of_jobs.items()}
+
+
+def gather(jobs: Sequence[Planned], runs: Mapping[str, Sequence[Run]]) -> dict[str, list[Repeated]]:
+    """The lines of every table, each with its runs and the reasons why others are missing.
+
+    With several scenes, a run of a line is the mean of one seed over the scenes that all lines of
+    the block have. Lines without any measurement are ignored for this. `runs` are from `newest`.
+    """
+    blocks: dict[tuple[str, str], dict[str, list[Outcome]]] = {}
+    for job in jobs:
+        line = blocks.setdefault((job.table, job.block), {}).setdefault(job.line, [])
+        line.append(_outcome(job, runs.get(job.key, ())))
+    tables: dict[str, list[Repeated]] = {}
+    for (table, _), of_block in blocks.items():
+        tables.setdefault(table, []).extend(_lines(of_block))
+    return tables
+
+
+def _outcome(job: Planned, runs: Sequence[Run]) -> Outcome:
+    failure = job.failure
+    if run := next((run for run in runs if of_scene(run, job.config)), None):
+        why = failure and f"failed when it was tried again: {failure}"
+        return Outcome(job, replace(run, label=job.line), why)
+    return Outcome(job, None, f"failed: {failure}" if failure else "not measured yet")
+
+
+def of_scene(run: Run, config: DictConfig) -> bool:
+    """Whether `run`, which has the settings of `config`, also has its scene.
+
+    The settings do not tell apart folders with the same last name. If the folder does not exist
+    here, only this name counts.
+    """
+    folder = scene_folder(config)
+    if folder is None or run.record.get("scene_path") == folder or not Path(folder).is_dir():
+        return True
+    return run.record["scene"]["digest"] == scene_digest(config)
+
+
+def _lines(of_block: Mapping[str, Sequence[Outcome]]) -> list[Repeated]:
+    every = [each for line in of_block.values() for each in line]
+    runs = iter(over_common_frames([each.run for each in every if each.run]))
+    lines = {
+        label: [each._replace(run=next(runs)) if each.run else each for each in line]
+        for label, line in of_block.items()
+    }
+    measured = [{each.job.scene for each in line if each.run} for line in lines.values()]
+    common = set.intersection(*filter(None, measured)) if any(measured) else set()
+    return [_line(label, outcomes, common) for label, outcomes in lines.items()]
+
+
+def _line(label: str, outcomes: Sequence[Outcome], common: set[str]) -> Repeated:
+    """A line whose runs are means over the scenes `common`, one per seed that has all of them."""
+    by_seed: dict[int, list[Run]] = {}
+    by_scene: dict[str, list[Run]] = {}
+    for each in sorted(outcomes, key=lambda each: each.job.scene not in common):
+        if each.run:
+            by_scene.setdefault(each.job.scene, []).append(each.run)
+            if each.job.scene in common:
+                by_seed.setdefault(each.job.config.seed, []).append(each.run)
+    runs = [over_scenes(of_seed) for of_seed in by_seed.values() if len(of_seed) == len(common)]
+    gaps = list(_gaps(outcomes))
+    if by_scene and not common:
+        gaps.append("no scene that all lines have")
+    several = {each.job.scene for each in outcomes} != {""}
+    return Repeated(label, runs, gaps, by_scene if several else {})
+
+
+def _gaps(outcomes: Sequence[Outcome]) -> Iterator[str]:
+    """Each reason for gaps once, with its seeds and scenes unless it concerns all of them."""
+    seeds = {each.job.config.seed for each in outcomes}
+    scenes = {each.job.scene for each in outcomes}
+    for why in dict.fromkeys(each.gap for each in outcomes if each.gap):
+        where: dict[int, list[str]] = {}
+        for each in outcomes:
+            if each.gap == why:
+                where.setdefault(each.job.config.seed, []).append(each.job.scene)
+        groups = list(where.items())
+        same = where.keys() == seeds and all(of == groups[0][1] for _, of in groups)
+        for seed, of_seed in groups[:1] if same else groups:
+            words = [] if same else [f"seed {seed}"]
+            words += [] if len(of_seed) == len(scenes) else [", ".join(of_seed)]
+            yield " ".join((*words, why))

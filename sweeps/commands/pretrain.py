@@ -7,8 +7,7 @@ from pathlib import Path
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
-from sweeps.build import build
-from sweeps.configured import checked_settings
+from sweeps.configured import build, checked_settings
 from sweeps.overrides import composed
 
 SETTINGS = (

@@ -21,8 +21,7 @@ from bench.results import Store
 from bench.trajectories import MIXED, write_path
 from bench.types import Camera, Method, NullProbe
 from bench.video import recorded
-from sweeps.build import build
-from sweeps.configured import scene_of, trained
+from sweeps.configured import build, scene_of, trained
 from sweeps.overrides import beside, composed, setting
 
 

@@ -6,12 +6,9 @@ import argparse
 import math
 import sys
 
-import pandas as pd
-
-from bench.errors import SteerbenchError
+from bench.errors import SteerbenchError, unknown
 from bench.results import Store
 from reports.tables import NOT_AVAILABLE, Table
-from sweeps.names import unknown
 from sweeps.terminal import show
 
 SHOWN = (
@@ -22,11 +19,7 @@ SHOWN = (
 
 
 def main(options: argparse.Namespace) -> int:
-    """Print the rows below `options.outputs`, filtered if asked, as a table, csv or json.
-
-    Raises:
-        SteerbenchError: nothing was measured, or nothing passes the filters.
-    """
+    """Print the rows below `options.outputs`, filtered if asked, as a table, csv or json."""
     rows = Store(options.outputs).rows(report=lambda message: print(message, file=sys.stderr))
     if rows.empty:
         raise SteerbenchError(f"{options.outputs}: no runs yet; `steerbench run` makes one")
@@ -42,13 +35,10 @@ def main(options: argparse.Namespace) -> int:
         rows.to_json(sys.stdout, orient="records", indent=1, double_precision=15)
         print()
     else:
-        show(Table(str(options.outputs), SHOWN, _lines(rows)))
+        shown = rows.assign(run=rows["run"].str[:8])[list(SHOWN)]
+        lines = tuple(tuple(map(_text, line)) for line in shown.itertuples(index=False))
+        show(Table(str(options.outputs), SHOWN, lines))
     return 0
-
-
-def _lines(rows: pd.DataFrame) -> tuple[tuple[str, ...], ...]:
-    shown = rows.assign(run=rows["run"].str[:8])[list(SHOWN)]
-    return tuple(tuple(map(_text, line)) for line in shown.itertuples(index=False))
 
 
 def _text(cell: object) -> str:

@@ -17,26 +17,25 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from sweeps.execute import join_cluster
 from sweeps.overrides import CONFIGS, explain, of_hydra, settled, swept
 
 if TYPE_CHECKING:
-    from sweeps.jobs import Ended
+    from sweeps.execute import Ended
 
 
 class SweepCallback(Callback):
     """Records that a sweep starts; run.yaml lists it among Hydra's callbacks.
 
-    Hydra creates the object and never hands it out, so the record is kept on the class.
-
-    Attributes:
-        folder: where jobs record how they ended; None without a sweep.
+    Hydra creates the object and never hands it out, so the record is kept on the class: the
+    `folder` where jobs record how they ended; None without a sweep.
     """
 
     folder: ClassVar[Path | None] = None
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Record the folder of the sweep, before its launcher is made."""
+        from sweeps.execute import join_cluster
+
         SweepCallback.folder = Path(config.hydra.sweep.dir)
         join_cluster(config)
 
@@ -45,10 +44,7 @@ def main(argv: Sequence[str]) -> int:
     """Run one job, a sweep, or Hydra's own help, as the overrides and flags in `argv` say.
 
     In a sweep, a failed job is reported at once and the others still run; the table at the end
-    lists all of them.
-
-    Raises:
-        SteerbenchError: a setting or a choice does not exist, or a job failed.
+    lists all of them. Raises the error of a job, or SteerbenchError for a wrong setting.
     """
     # Hydra's parser accepts overrides only in one contiguous block, so flags go first.
     flags = [word for word in argv if word.startswith("-") or not re.search("^~|=", word)]
@@ -56,37 +52,30 @@ def main(argv: Sequence[str]) -> int:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its errors instead of printing them
     _hide_subcommand_from_completion()
     SweepCallback.folder = None
-    error = _launch(argv)
-    if SweepCallback.folder is not None:
-        _finish(SweepCallback.folder)
-    if error is not None:
-        raise error
-    return 0
-
-
-def _launch(argv: Sequence[str]) -> Exception | None:
-    """Let Hydra run every job; return the error of a job or of a wrong setting, if any."""
-    failures: list[Exception] = []
+    errors: list[Exception] = []
 
     def job(config: DictConfig) -> None:
-        command = ["steerbench", "run", *_config_dir(), *HydraConfig.get().overrides.task]
-        if HydraConfig.get().mode == RunMode.MULTIRUN:
+        present = HydraConfig.get()
+        sources = present.runtime.config_sources
+        folders = [f"--config-dir={x.path}" for x in sources if x.provider == "command-line"]
+        command = ["steerbench", "run", *folders, *present.overrides.task]
+        if present.mode == RunMode.MULTIRUN:
             _one_of_many(settled(config), command)
             return
         try:
             _alone(settled(config), command)
         except Exception as error:
-            failures.append(error)  # bypasses Hydra, which would print it in its own way
+            errors.append(error)  # bypasses Hydra, which would print it in its own way
 
     try:
         hydra.main(str(CONFIGS), "run", version_base="1.3")(job)()
     except Exception as error:
-        if not of_hydra(error):
-            return error
-        explained = explain(error, argv)
-        explained.__cause__ = error
-        return explained
-    return failures[0] if failures else None
+        errors.append(explain(error, argv) if of_hydra(error) else error)
+    if SweepCallback.folder is not None:
+        _finish(SweepCallback.folder)
+    if errors:
+        raise errors[0]
+    return 0
 
 
 # These load torch, which --help and completion do not need.
@@ -95,23 +84,23 @@ def _launch(argv: Sequence[str]) -> Exception | None:
 def _alone(config: DictConfig, command: Sequence[str]) -> None:
     """Obtain the run that `config` describes, print its tables, write the page it asks for."""
     from reports.runs import load
-    from sweeps.deliver import write
-    from sweeps.measurement import Group, Job, obtain
-    from sweeps.terminal import say_missing, show_run
+    from sweeps.measurement import Job, obtain
+    from sweeps.terminal import say_missing, show_run, write_page
 
-    (obtained,) = obtain(Group([Job(config, command)]))
-    label = HydraConfig.get().runtime.choices["method"]
-    (run,) = load(obtained.store, {obtained.run: label})
+    job = Job(config, command)
+    (key,), measured = obtain([job])
+    labels = {key: HydraConfig.get().runtime.choices["method"]}
+    (run,) = load(job.store, labels)
     what = run.facts[["method", "scene", "trajectory", "resolution", "budget", "protocol"]]
     show_run(run, f"{', '.join(what)}, seed {run.facts['seed']}")
-    if not obtained.measured:
+    if not measured:
         say_missing([run])
-    write(config.report, obtained.store, {obtained.run: label})
+    write_page(config.report, job.store, labels)
 
 
 def _one_of_many(config: DictConfig, command: Sequence[str]) -> None:
-    from sweeps.jobs import attempt
-    from sweeps.measurement import Group, Job
+    from sweeps.execute import attempt
+    from sweeps.measurement import Job
     from sweeps.processes import set_up
 
     set_up()  # the launcher may have started this process
@@ -119,7 +108,7 @@ def _one_of_many(config: DictConfig, command: Sequence[str]) -> None:
     sizes = _sizes(Path(present.runtime.output_dir) / "multirun.yaml")
     name = label(present.runtime.choices["method"], present.overrides.task, sizes or ())
     total = 0 if sizes is None else prod(sizes.values())
-    attempt(Group([Job(config, command, name)], first=present.job.num), total)
+    attempt([Job(config, command, name)], present.job.num, total)
 
 
 def _sizes(file: Path) -> dict[str, int] | None:
@@ -153,31 +142,23 @@ def _finish(folder: Path) -> None:
     from bench.results import Store
     from reports.comparison import comparison
     from reports.runs import load, over_common_frames
-    from sweeps.deliver import write
-    from sweeps.jobs import read
-    from sweeps.terminal import say_missing, show
+    from sweeps.execute import read
+    from sweeps.terminal import say_missing, show, write_page
+
+    def labels(jobs: Sequence[Ended]) -> tuple[dict[str, str], dict[str, str]]:
+        """Names of the runs by key, and reasons of failed jobs by name."""
+        runs = {job.run: job.name for job in jobs if job.run}
+        return runs, {job.name: job.failure for job in jobs if job.failure}
 
     ended = read(folder)
     for outputs in dict.fromkeys(job.outputs for job in ended):
         store, there = Store(Path(outputs)), [job for job in ended if job.outputs == outputs]
-        labels, failed = _labels(there)
-        runs = over_common_frames(load(store, labels))
+        names, failed = labels(there)
+        runs = over_common_frames(load(store, names))
         show(comparison(runs, failed))
         say_missing(runs)
         for report in dict.fromkeys(job.report for job in there):
-            write(report, store, *_labels([job for job in there if job.report == report]))
-
-
-def _labels(jobs: Sequence[Ended]) -> tuple[dict[str, str], dict[str, str]]:
-    """Names of the runs by key, and reasons of failed jobs by name."""
-    runs = {job.run: job.name for job in jobs if job.run}
-    return runs, {job.name: job.failure for job in jobs if job.failure}
-
-
-def _config_dir() -> list[str]:
-    """The folder of further choices from the command line, as one word, for the job's command."""
-    sources = HydraConfig.get().runtime.config_sources
-    return [f"--config-dir={x.path}" for x in sources if x.provider == "command-line"]
+            write_page(report, store, *labels([job for job in there if job.report == report]))
 
 
 def _hide_subcommand_from_completion() -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import math
 import statistics
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from omegaconf import DictConfig
@@ -16,19 +16,16 @@ from omegaconf import DictConfig
 from bench.accuracy import mean_figures, observed_order
 from bench.cameras import frame_camera
 from bench.console import ConsoleLog
-from bench.errors import SteerbenchError
+from bench.errors import SteerbenchError, unexpected, unknown
 from bench.probes import FrameRecord, MemoryMeter, StageClock, p99_to_p50
-from bench.study import Study
 from bench.threads import torch_threads
 from bench.types import Camera, Log, Method, Scene
 from reports.tables import Table, decimal, megabytes
-from sweeps.build import build
-from sweeps.configured import checked_settings, scene_of
-from sweeps.device_lock import device_lock
-from sweeps.names import unknown
+from sweeps.configured import build, checked_settings, scene_of
 from sweeps.overrides import composed
+from sweeps.processes import device_lock
 from sweeps.terminal import print_rows, show
-from sweeps.variants import METHOD, Row, amount, computes_with_engine, declared, settings
+from sweeps.variants import METHOD, Row, amount, declared, settings
 
 FEW_STEPS = "++budget.renderer_steps=8"
 """A 2D renderer costs the same however long it was trained."""
@@ -36,16 +33,11 @@ FEW_STEPS = "++budget.renderer_steps=8"
 SIZES = ((200, 200), (400, 400), (800, 800), (1920, 1080), (3840, 2160))
 
 
-@dataclass(frozen=True)
-class Point:
-    """One measurement.
+class Point(NamedTuple):
+    """One measurement: a `value` of an `axis`, that the power is fitted to, and how it is shown.
 
-    Attributes:
-        axis: what is varied.
-        value: the size that the power is fitted to, as `bench.study.Axis` has it.
-        label: the value as it is shown.
-        settings: the words for `steerbench run` that set it.
-        size: width and height of the frames; None: those of the trajectory.
+    `settings` are the words for `steerbench run` that set it; `size` is the width and height of the
+    frames, None: those of the trajectory.
     """
 
     axis: str
@@ -59,7 +51,7 @@ def main(options: argparse.Namespace) -> int:
     """Print a table with the fitted exponents, then its rows as JSON in the last line."""
     words, launcher = settings(options, METHOD, "trajectory=smooth", FEW_STEPS)
     config = composed(words, return_hydra_config=True)
-    points = _chosen(config, options.axis)
+    points = _points(config, options.axis)
     for point in points:
         composed([*words, *point.settings])  # refused before anything is measured
     work = partial(_rows, words, frames=options.frames)
@@ -74,15 +66,29 @@ def main(options: argparse.Namespace) -> int:
     return 0
 
 
-def _points(study: Study) -> Iterator[Point]:
-    for width, height in SIZES:
-        yield Point("pixels", width * height, f"{width} x {height}", size=(width, height))
+def _points(config: DictConfig, names: Sequence[str]) -> list[Point]:
+    """The points of the axes `names`; by default, of all axes."""
+    study = declared(config)
+    axes = ("pixels", "threads", *study.axes)
+    for name in names:
+        if name not in axes:
+            raise unknown("axis", name, axes)
+    engine = config.hydra.runtime.choices.engine
+    if "threads" in (names or axes) and "engine" in config.method and engine != "torch":
+        others = [name for name in axes if name != "threads"]
+        raise SteerbenchError(
+            "--axis threads: expected engine=torch, whose threads can be chosen afterwards; for "
+            f"another engine give --axis {', '.join(others[:-1])} or {others[-1]}"
+        )
+    points = [Point("pixels", w * h, f"{w} x {h}", size=(w, h)) for w, h in SIZES]
     for threads in range(1, torch.get_num_threads() + 1):
         label = f"{threads} thread{'s' * (threads > 1)}"
-        yield Point("threads", threads, label, (f"threads={threads}",))
+        points.append(Point("threads", threads, label, (f"threads={threads}",)))
     for name, axis in study.axes.items():
         for value, size in zip(axis.values, axis.size or axis.values, strict=True):
-            yield Point(name, size, axis.label.format(value), (f"{axis.setting}={value}",))
+            label = axis.label.format(value)
+            points.append(Point(name, size, label, (f"{axis.setting}={value}",)))
+    return [point for point in points if point.axis in (names or axes)]
 
 
 def _rows(words: Sequence[str], points: Sequence[Point], frames: int) -> list[Row]:
@@ -97,23 +103,6 @@ def _rows(words: Sequence[str], points: Sequence[Point], frames: int) -> list[Ro
     return rows
 
 
-def _chosen(config: DictConfig, names: Sequence[str] | None) -> list[Point]:
-    """The points of the axes `names`; by default, of all axes."""
-    study = declared(config)
-    axes = ("pixels", "threads", *study.axes)
-    for name in names or ():
-        if name not in axes:
-            raise unknown("axis", name, axes)
-    engine = config.hydra.runtime.choices.engine
-    if "threads" in (names or axes) and computes_with_engine(config) and engine != "torch":
-        others = [name for name in axes if name != "threads"]
-        raise SteerbenchError(
-            "--axis threads: expected engine=torch, whose threads can be chosen afterwards; for "
-            f"another engine give --axis {', '.join(others[:-1])} or {others[-1]}"
-        )
-    return [point for point in _points(study) if point.axis in (names or axes)]
-
-
 def _row(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) -> Row:
     """Time, work and memory of the first steady `frames` of the trajectory at `point`."""
     torch.manual_seed(config.seed)
@@ -122,10 +111,8 @@ def _row(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) 
     cameras = [step.camera for step in build(config, "trajectory", scene).steps]
     cameras = cameras[: method.memory + frames]
     if len(cameras) <= method.memory:
-        raise SteerbenchError(
-            f"trajectory: expected more than the {method.memory} frames that {method.name} looks "
-            f"back on, got {len(cameras)}"
-        )
+        expected = f"more than the {method.memory} frames that {method.name} looks back on"
+        raise unexpected("trajectory", expected, len(cameras))
     if point.size:
         cameras = [frame_camera(camera, *point.size) for camera in cameras]
     with torch_threads(config.threads or torch.get_num_threads()):  # trained with the default
@@ -164,9 +151,8 @@ def _render(
 
 def _table(title: str, axes: Mapping[str, Sequence[Row]]) -> Table:
     """All rows, and below those of each axis the exponent with which each figure grows."""
-    counters = dict.fromkeys(
-        name for rows in axes.values() for row in rows for name in row if name.startswith("work.")
-    )
+    names = dict.fromkeys(name for rows in axes.values() for row in rows for name in row)
+    counters = [name for name in names if name.startswith("work.")]
     figures = {
         "frame_ms": ("ms / frame ↓", lambda ms: decimal(ms, 1)),
         "p99_to_p50": ("p99 / p50 ↓", lambda ratio: decimal(ratio, 2)),
@@ -189,14 +175,10 @@ def _table(title: str, axes: Mapping[str, Sequence[Row]]) -> Table:
 
 
 def growth(rows: Sequence[Row], figure: str) -> float:
-    """The exponent p of `figure` ~ value^p, by least squares on the logarithms.
-
-    nan if fewer than two values are above 0.
-    """
-    points = [
-        (row["value"], row[figure]) for row in rows if row["value"] > 0 and row.get(figure, 0) > 0
-    ]
-    if len({value for value, _ in points}) < 2:
+    """The exponent p of `figure` ~ value^p by least squares on the logarithms; nan if fewer than
+    two values are above 0."""
+    used = [row for row in rows if row["value"] > 0 and row.get(figure, 0) > 0]
+    values = [row["value"] for row in used]
+    if len(set(values)) < 2:
         return math.nan
-    value, of = zip(*points, strict=True)
-    return observed_order(value, of)
+    return observed_order(values, [row[figure] for row in used])

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 
 from bench.console import ConsoleLog
+from bench.errors import unknown
 from bench.published import Published, get, published, verify
-from sweeps.names import unknown
 
 SHOWN = 5
 """Missing or extra files to print by name, because there may be hundreds."""
@@ -17,29 +16,21 @@ SHOWN = 5
 def main(options: argparse.Namespace) -> int:
     """Do what `options.action` says; return 1 if a file differs from the release or none exists."""
     log = ConsoleLog(Path("outputs"))
-    if options.action == "get":
-        return _get(options.name, options.to, log)
-    return _verify(Path(options.name), log)
-
-
-def _get(name: str, to: Path, log: ConsoleLog) -> int:
-    data, scenes = _found(name)
-    folder = to / data.name if len(data.scenes) > 1 else to
+    if options.action == "verify":
+        return _verify(Path(options.name), log)
+    known: dict[str, tuple[Published, list[str]]] = {}
+    for data in published():
+        known |= {name: (data, [name]) for name in data.scenes}
+        known[data.name] = data, sorted(data.scenes)
+    if options.name not in known:
+        raise unknown("scene", options.name, known)
+    data, scenes = known[options.name]
+    folder = options.to / data.name if len(data.scenes) > 1 else options.to
     for scene in scenes:
         path = get(data, scene, folder, log)
         print(f"{path}: scene={data.layout} scene.path={path}")
     print(f"licence: {data.licence}")
     return 0
-
-
-def _found(name: str) -> tuple[Published, Sequence[str]]:
-    known = published()
-    for data in known:
-        if name == data.name:
-            return data, sorted(data.scenes)
-        if name in data.scenes:
-            return data, [name]
-    raise unknown("scene", name, {name for data in known for name in (data.name, *data.scenes)})
 
 
 def _verify(path: Path, log: ConsoleLog) -> int:

@@ -11,18 +11,15 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from bench import pictures as given
 from bench.console import ConsoleLog
-from bench.pictures import Match, Pair, pairs_with_folder, pairs_with_split
-from bench.pictures import score as score_pairs
+from bench.errors import SteerbenchError, unknown
 from bench.protocol import EvaluationProtocol
 from bench.provenance import digest, libraries
 from bench.results import Store
-from bench.types import SteerbenchError
 from reports.runs import Run, load
-from sweeps.build import build
-from sweeps.configured import checked_settings, scene_of
-from sweeps.deliver import send
-from sweeps.names import unknown
+from sweeps.configured import build, checked_settings, scene_of
+from sweeps.measurement import send
 from sweeps.overrides import composed
 from sweeps.terminal import show_run
 
@@ -32,8 +29,8 @@ NOTHING = "-"
 
 def main(options: argparse.Namespace) -> int:
     """Score the pictures, keep the rows in the store, print them."""
-    given = {name: getattr(options, name) for name in ("name", "match", "sequence")}
-    run = score(options.pictures, options.truth, *options.overrides, **given)
+    words = {name: getattr(options, name) for name in ("name", "match", "sequence")}
+    run = score(options.pictures, options.truth, *options.overrides, **words)
     show_run(run, f"{run.label} on {run.facts['scene']}, protocol {run.facts['protocol']}")
     return 0
 
@@ -43,7 +40,7 @@ def score(
     truth: str | Path | None = None,
     *settings: str,
     name: str | None = None,
-    match: Match = "name",
+    match: given.Match = "name",
     sequence: bool = False,
 ) -> Run:
     """Score a folder of pictures against true ones, as `steerbench score` does.
@@ -70,53 +67,50 @@ def score(
     else:
         if named := [word for word in settings if word.startswith("scene")]:
             raise SteerbenchError(f"--truth and {named[0]}: expected one of them")
-        pairs = pairs_with_folder(folder, Path(truth), match)
+        pairs = given.pairs_with_folder(folder, Path(truth), match)
         place = {"scene": Path(truth).resolve().name, "split": NOTHING}
     facts = {"method": name or folder.resolve().name, **place, "trajectory": "pictures", "seed": 0}
     facts |= dict.fromkeys(("budget", "device", "backend", "engine", "precision"), NOTHING)
-    first = pairs[0]
-    example = f"{first.picture.name} is scored against {first.name}"  # for the user to check
+    example = f"{pairs[0].picture.name} is scored against {pairs[0].name}"  # for the user to check
     log.info(f"{len(pairs)} pictures, matched by {match}: {example}")
     lpips, missing = protocol.load_lpips(weights, log)
-    measurement = score_pairs(
+    measurement = given.score(
         pairs, protocol, lpips, facts, log, sequence=sequence, kept=plain.pictures
     )
     record = measurement.record
     parts = {
-        "score": digest(score_pairs),
-        "libraries": libraries(score_pairs),
-        "pictures": record["pictures"],
-        "truths": record["truths"],
+        "score": digest(given.score),
+        "libraries": libraries(given.score),
+        **{part: record[part] for part in ("pictures", "truths")},
         "protocol": asdict(protocol),
         "lpips": protocol.find_lpips(weights, log),
         "facts": facts,
         "sequence": sequence,
     }
-    options = {"--truth": truth, "--name": name, "--match": match}
-    given = [str(x) for pair in options.items() if pair[1] is not None for x in pair]
-    given += ["--sequence"] if sequence else []
-    more: dict[str, Any] = {
-        "command": shlex.join(["steerbench", "score", str(folder), *given, *settings]),
+    words = {"--truth": truth, "--name": name, "--match": match}
+    typed = [str(x) for pair in words.items() if pair[1] is not None for x in pair]
+    typed += ["--sequence"] if sequence else []
+    more = {
+        "command": shlex.join(["steerbench", "score", str(folder), *typed, *settings]),
         "missing": missing,
         "scene": {"name": facts["scene"], "digest": record["truths"]},
         "budget": {"name": NOTHING},
     }
-    key = store.key(parts)
+    key, label = store.key(parts), str(facts["method"])
     if store.find(key) is None:
         store.save(parts, replace(measurement, record={**record, **more}))
-    label = str(facts["method"])
-    send(config, store, key, label)
+    send(config, key, label)
     (run,) = load(store, {key: label})
     return run
 
 
 def _against_scene(
-    folder: Path, config: DictConfig, protocol: EvaluationProtocol, match: Match
-) -> tuple[Sequence[Pair], dict[str, Any]]:
+    folder: Path, config: DictConfig, protocol: EvaluationProtocol, match: given.Match
+) -> tuple[Sequence[given.Pair], dict[str, Any]]:
     """Pairs of the pictures with those of the scene's split, and the facts for their rows."""
     OmegaConf.update(config, "scene.background", protocol.background)
     scene, split = scene_of(config), config.split
     if split not in scene.splits:
         raise unknown("split", split, scene.splits)
-    pairs = pairs_with_split(folder, scene.splits[split], match)
+    pairs = given.pairs_with_split(folder, scene.splits[split], match)
     return pairs, {"scene": scene.name, "split": split}

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from bench.case import failed, run_cases
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
+from methods import checks
 from reports.tables import Table
-from sweeps.terminal import show
+from sweeps.commands.kernels import errors
+from sweeps.terminal import print_rows, show
 
 COLUMNS = (
     *("subject", "case", "what must hold", "by", "on", "precision"),
@@ -29,11 +32,7 @@ CASE_COLUMNS = (
 
 def main(options: argparse.Namespace) -> int:
     """Print a table, then its rows as JSON in the last line; return 1 if anything fails."""
-    import torch
-
-    from methods.checks import found
-
-    cases = [c for c in found("cases") if options.filter in f"{c.subject}, {c.name}"]
+    cases = [c for c in checks.found("cases") if options.filter in f"{c.subject}, {c.name}"]
     if not cases:
         raise SteerbenchError(f"--filter: no subject or case has {options.filter!r} in it")
     devices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
@@ -46,16 +45,14 @@ def main(options: argparse.Namespace) -> int:
         labels = ("subject", "case", "holds", "backend", "device", "precision")
         lines = tuple((*(row[name] for name in labels), *_end(row)) for row in rows)
         show(Table(title, COLUMNS, lines, figures=False))
-    print(json.dumps(rows))
+    print_rows(rows)
     return int(wrong > 0)
 
 
 def _end(row: Mapping[str, Any]) -> tuple[str, str, str]:
     """The cells of the columns "worst", "at most" and "status"."""
-    seen = "not finite" if row["error"] is None else f"{row['error']:.1e}"
-    if row["status"].startswith("unavailable"):
-        seen = ""
-    return seen, "" if row["tolerance"] is None else f"{row['tolerance']:.1e}", row["status"]
+    seen, at_most = errors(row)
+    return "" if row["status"].startswith("unavailable") else seen, at_most, row["status"]
 
 
 def _case_lines(rows: Iterable[Mapping[str, Any]]) -> Iterator[tuple[str, ...]]:

@@ -20,7 +20,8 @@ PATH = os.pathsep.join((str(HERE), str(HERE.parents[1])))
 """Where other processes find the stand-ins, and the code of this checkout."""
 
 QUICK = ["method=grey", "scene=white", "budget=none", "protocol=quick"]
-STAND_INS = ["--config-dir", str(HERE / "configs"), *QUICK]
+CONFIGS = f"--config-dir={HERE / 'configs'}"
+STAND_INS = [CONFIGS, *QUICK]
 
 
 class Outcome(NamedTuple):
@@ -32,12 +33,17 @@ class Outcome(NamedTuple):
 
 
 @pytest.fixture
-def steerbench(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> Callable[..., Outcome]:
-    """Call the command line within this process; the working directory is `tmp_path`."""
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The working directory is `tmp_path`, and the stand-ins can be imported."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(HERE)
+
+
+@pytest.fixture
+def steerbench(
+    elsewhere: None, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> Callable[..., Outcome]:
+    """Call the command line within this process, `elsewhere`."""
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # which `run` sets: restored after the test
     monkeypatch.setattr(sys, "argv", ["steerbench"])
 

@@ -58,9 +58,10 @@ def test_a_choice_says_what_it_is_and_composes_to_something_that_exists(choice):
     assert callable(get_object(node(choice)["_target_"]))
 
 
-@pytest.mark.parametrize(
-    "choice", [x for x in CHOICES if x[0] in "mbp"]
-)  # method, budget, protocol
+OF_DATACLASSES = [x for x in CHOICES if x.startswith(("method", "budget", "protocol"))]
+
+
+@pytest.mark.parametrize("choice", OF_DATACLASSES)
 def test_options_stand_there_with_all_their_fields_and_no_other_default(choice):
     there = list(options(choice, node(choice)))
     assert [name for name, _, value in there if value is MISSING] == []

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from sweeps import arguments, cli, overrides
+from sweeps import cli, overrides
 from sweeps.overrides import choices, composed, swept
 from sweeps.plan import chosen, plan
 from sweeps.variants import METHOD
@@ -86,20 +86,16 @@ def typed(command: str) -> list[str]:
 WITHOUT_LPIPS = ("protocol.lpips=[]", "protocol.name=quick")
 
 
-def test_method_and_scene_of_the_document_are_measured_from_outside_the_package(steerbench, mine):
+def test_method_and_scene_of_the_document_are_listed_measured_and_studied_from_outside(
+    steerbench, mine, monkeypatch
+):
+    assert "The mean colour of the training pictures." in steerbench(*typed("list")).out
     measured = steerbench(*typed("run"), *WITHOUT_LPIPS)
     assert measured.status == 0, measured.err
     assert "19.83" in measured.out  # 20 log10(255 / 26)
     assert "paint" in measured.out
     refused = steerbench(*typed("run"), *WITHOUT_LPIPS, "method.shade=2.0")
     assert refused.err.endswith("method: shade: expected 0 to 1, got 2.0\n")
-
-
-def test_the_method_of_the_document_is_listed(steerbench, mine):
-    assert "The mean colour of the training pictures." in steerbench(*typed("list")).out
-
-
-def test_the_method_of_the_document_is_studied(steerbench, mine, monkeypatch):
     monkeypatch.setattr("methods.checks.found", lambda name: [])  # no kernels
     studied = steerbench(*typed("accuracy"), "--repeats", "1")
     assert studied.status == 0, studied.err
@@ -183,7 +179,7 @@ def test_every_command_of_a_document_can_be_typed(document, words, monkeypatch, 
             return
     else:
         options = captured(monkeypatch, words)
-        studied = arguments.COMMANDS[words[0]]["group"] == "studies of a method"
+        studied = cli.COMMANDS[words[0]]["group"] == "studies of a method"
         usual = [METHOD] if studied else []
         settings = [*usual, *getattr(options, "overrides", [])]
     settings = [word for word in settings if not word.startswith(ELSEWHERE)]
@@ -196,7 +192,7 @@ def test_every_command_of_a_document_can_be_typed(document, words, monkeypatch, 
 
 def test_every_command_there_is_has_an_example():
     examples = {words[0] for words in commands(DOCS / "commands.md")}
-    assert examples == set(arguments.COMMANDS)
+    assert examples == set(cli.COMMANDS)
 
 
 GROUPS = ("method", "scene", "trajectory", "protocol", "budget", "engine")

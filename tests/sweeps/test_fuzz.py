@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from bench.errors import SteerbenchError
-from sweeps.build import build
+from sweeps.configured import build
 from sweeps.overrides import CONFIGS, composed, leaves
 
 GROUPS = {path.name for path in CONFIGS.iterdir() if path.is_dir()}

@@ -1,15 +1,19 @@
-"""`steerbench kernels`: a table, then JSON; a kernel that is wrong fails the command."""
+"""`steerbench kernels`, `compile` and `stress`: a table, then JSON; what is wrong fails them."""
 
 from __future__ import annotations
 
 import fcntl
 import json
+import sys
+from types import SimpleNamespace
 
 import pytest
 
 from bench.case import Case
+from bench.errors import Unavailable
 from bench.types import Log
-from sweeps.device_lock import lock_file
+from sweeps.commands.kernels import wrong_of
+from sweeps.processes import lock_file
 
 RIGHT = {
     "kernel": "encode", "case": "view", "backend": "cpu", "dtype": "float32", "error": 1e-7,
@@ -41,26 +45,27 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], int]]:
     return calls
 
 
-def test_the_last_line_is_json_of_what_the_table_shows(steerbench, asked):
+def test_the_last_line_is_json_of_what_the_table_shows_and_a_wrong_kernel_fails(steerbench, asked):
     outcome = steerbench("kernels", "--filter", "enc", "--repeats", "3")
     assert asked == [(["encode"], 3)]
     assert outcome.status == 0
     for text in ("encode", "1.0e-07", "1.0e-06", "12.50", "10.40", "31.0x"):
         assert text in outcome.out
     assert json.loads(outcome.out.splitlines()[-1]) == [RIGHT]
-
-
-def test_a_wrong_kernel_shows_its_status_instead_of_a_time_and_fails(steerbench, asked):
     outcome = steerbench("kernels")
     assert outcome.status == 1
-    assert "wrong" in outcome.out
+    assert "wrong" in outcome.out  # instead of a time
     assert json.loads(outcome.out.splitlines()[-1]) == [RIGHT, WRONG]
 
 
-def test_a_filter_that_fits_nothing_is_an_error(steerbench, asked):
-    outcome = steerbench("kernels", "--filter", "splat")
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [("kernels", "no kernel has 'x' in its name"), ("stress", "no subject or case has 'x' in it")],
+)
+def test_a_filter_that_fits_nothing_is_an_error(steerbench, asked, command, said):
+    outcome = steerbench(command, "--filter", "x")
     assert outcome.status == 2
-    assert "no kernel has 'splat' in its name" in outcome.err
+    assert said in outcome.err
 
 
 def test_what_a_kernel_brings_has_a_line_for_each_that_a_method_calls(steerbench, tmp_path):
@@ -75,3 +80,81 @@ def test_what_a_kernel_brings_has_a_line_for_each_that_a_method_calls(steerbench
         assert row["method"] == "ngp"
         assert min(row["frame_ms"], row["training_s"], row["training_s_reference"]) > 0
     assert rows["march"]["frame_ms_reference"] > 0
+
+
+@pytest.mark.parametrize(
+    ("error", "slow", "cells", "wrong"),
+    [
+        (0.0, False, [("cpu", "fp32")], []),  # what is not compiled is left out
+        (0.5, False, [("cpu", "fp32")], ["march: empty"]),
+        (0.5, True, [], []),
+        (Unavailable("no such products"), False, [("cpu", "fp32")], []),
+    ],
+)
+def test_compiled_kernels_compute_their_quick_cases(monkeypatch, error, slow, cells, wrong):
+    computed = []
+
+    def measure(backend: str, device: str, precision: str) -> float:
+        computed.append((backend, precision))
+        if isinstance(error, Unavailable):
+            raise error
+        return error
+
+    tolerances = {("cpu", "fp32"): 0.1, ("reference", "fp32"): 0.1}
+    case = Case("march", "empty", "", "", tolerances, measure, slow=slow)
+    monkeypatch.setitem(sys.modules, "stand_in", SimpleNamespace(cases=lambda: [case]))
+    assert wrong_of("stand_in") == wrong
+    assert computed == cells
+
+
+@pytest.mark.slow
+def test_compile_computes_the_cases_of_all_modules_in_processes(steerbench, monkeypatch):
+    monkeypatch.setattr("methods.checks.modules", lambda name: ["methods.kernels.spherical.cases"])
+    assert steerbench("compile").status == 0
+    monkeypatch.setattr("methods.checks.modules", lambda name: ["methods.kernels.spherical"])
+    with pytest.raises(AttributeError, match="has no attribute 'cases'"):
+        steerbench("compile")
+
+
+# stress
+
+
+@pytest.fixture
+def two_cases(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that holds, about sums, and one that does not, about products."""
+    cells = {("reference", "fp32"): 1e-6}
+    errors = {"sum": 5e-7, "product": 2}
+    cases = [
+        Case(subject, "long", "all is there", "u", cells, lambda *cell, error=error: error)
+        for subject, error in errors.items()
+    ]
+    monkeypatch.setattr("methods.checks.found", lambda name: cases)
+
+
+def test_the_last_line_of_stress_is_json_and_a_case_that_fails_fails_it(steerbench, two_cases):
+    outcome = steerbench("stress", "--filter", "sum")
+    assert outcome.status == 0
+    for text in ("sum", "long", "all is there", "reference", "fp32", "5.0e-07", "1.0e-06", "ok"):
+        assert text in outcome.out
+    (row,) = json.loads(outcome.out.splitlines()[-1])
+    assert (row["subject"], row["error"], row["status"]) == ("sum", 5e-7, "ok")
+    outcome = steerbench("stress")
+    assert outcome.status == 1
+    assert "2 cases, 2 cells, 1 failed" in outcome.out
+    assert [r["status"] for r in json.loads(outcome.out.splitlines()[-1])] == ["ok", "failed"]
+
+
+def test_on_a_page_the_cell_nearest_to_its_tolerance_stands_for_a_case(steerbench, monkeypatch):
+    seen = {"cpu": 5e-7, "reference": 4e-7, "gpu": Unavailable("no GPU")}
+    cells = {("cpu", "fp32"): 1e-6, ("reference", "fp32"): 5e-7, ("gpu", "fp32"): 1e-6}
+
+    def worst(backend: str, device: str, precision: str) -> float:
+        if isinstance(seen[backend], Unavailable):
+            raise seen[backend]
+        return seen[backend]
+
+    case = Case("sum", "long", "all is there", "of rounding", cells, worst)
+    monkeypatch.setattr("methods.checks.found", lambda name: [case])
+    lines = steerbench("stress", "--format", "markdown").out.splitlines()
+    figures = "3 | reference fp32 | 4.0e-07 | 5.0e-07 | ok | of rounding"
+    assert lines[2] == f"| sum | long | all is there | {figures} |"

@@ -31,6 +31,7 @@ FRAMES = ["--frames", "3", "--repeats", "1"]
         ["accuracy", *FRAMES, "--filter", "stop"],
         ["scaling", "--frames", "3", "--axis", "L"],
         ["paper", "--table", "table2", "tables.beyond=false"],
+        ["kernels", "--filter", "adam"],
     ],
     ids=" ".join,
 )
@@ -38,7 +39,7 @@ def test_it_ends_well(command, steerbench, gpu):
     name, *options = command
     settings = [word for word in SMALLEST if name != "paper" or not word.startswith("method=")]
     outcome = steerbench(name, *options, *settings)
-    assert outcome.status == 0, outcome.err
+    assert outcome.status == 0, outcome.err + outcome.out
     assert gpu.waited
 
 
@@ -47,9 +48,3 @@ def test_pictures_are_scored_there(steerbench, gpu, lpips_weights):
     outcome = steerbench("run", *SMALLEST, *words)
     assert outcome.status == 0, outcome.err
     assert "LPIPS alex" in outcome.out
-
-
-def test_kernels_are_compared_there(steerbench, gpu):
-    outcome = steerbench("kernels", "--filter", "adam")
-    assert outcome.status == 0, outcome.err + outcome.out
-    assert gpu.waited

@@ -1,65 +1,47 @@
-"""Mistyped overrides: one line that names what was typed, the nearest names, and what exists."""
+"""Wrong settings: one line that names what was typed, the nearest names, and what exists."""
 
 from __future__ import annotations
 
 import pytest
 
+UNKNOWN = [
+    ("method=gery", "method", "gery", "grey"),
+    ("scene=blendr", "scene", "blendr", "blender"),
+    ("budgt=none", "setting", "budgt", "budget"),
+    ("sed=1", "setting", "sed", "seed"),
+    ("method.lvl=1", "setting", "method.lvl", "method.level"),
+    ("+experiment=dmo", "experiment", "dmo", "demo"),
+    ("trajectory.limt=2", "setting", "trajectory.limt", "trajectory.limit"),
+    ("+scene.fraems=2", "setting", "scene.fraems", "scene.frames"),
+    ("scene=blender scene.downscal=2", "setting", "scene.downscal", "scene.downscale"),
+]
+"""Words, the kind of the name that does not exist, the name, and a near one."""
+
 
 @pytest.mark.parametrize(
-    ("argument", "kind", "typed", "nearest"),
+    ("words", "said"),
     [
-        ("method=gery", "method", "gery", "grey"),
-        ("scene=blendr", "scene", "blendr", "blender"),
-        ("budgt=none", "setting", "budgt", "budget"),
-        ("sed=1", "setting", "sed", "seed"),
-        ("method.lvl=1", "setting", "method.lvl", "method.level"),
-        ("+experiment=dmo", "experiment", "dmo", "demo"),
-        ("trajectory.limt=2", "setting", "trajectory.limt", "trajectory.limit"),
-        ("+scene.fraems=2", "setting", "scene.fraems", "scene.frames"),
+        *((words, f"unknown {kind} '{typed}'. Did you mean {near}")
+          for words, kind, typed, near in UNKNOWN),
+        *((word, f"cannot read '{word}': settings are written key=value")
+          for word in ("demo", "a=b=c", "scene.path=[")),
+        ("method=steernerf field=nerf", "field: each method brings its own"),
+        ("scene=blender", "scene.path is not set: give scene.path=...\n"),
     ],
-)
-def test_an_unknown_name_comes_with_the_nearest_one(run, argument, kind, typed, nearest):
-    outcome = run(argument)
-    assert outcome.status == 2
-    assert outcome.out == ""
-    assert outcome.err.startswith(f"steerbench: unknown {kind} '{typed}'. Did you mean {nearest}")
+)  # fmt: skip
+def test_what_is_wrong_is_named_in_one_line(run, words, said):
+    outcome = run(*words.split())
+    assert (outcome.status, outcome.out) == (2, "")
+    assert outcome.err.startswith(f"steerbench: {said}")
     assert outcome.err.count("\n") == 1
 
 
-def test_settings_of_the_chosen_scene_are_among_the_suggestions(steerbench):
-    outcome = steerbench("run", "scene=blender", "scene.path=x", "scene.downscal=2")
-    assert "Did you mean scene.downscale?" in outcome.err
-
-
-def test_the_field_of_a_method_is_not_chosen_for_another(steerbench):
-    outcome = steerbench("run", "method=steernerf", "field=nerf")
-    assert outcome.status == 2
-    assert outcome.err.startswith("steerbench: field: each method brings its own")
-
-
-@pytest.mark.parametrize("argument", ["demo", "a=b=c", "scene.path=["])
-def test_what_is_no_override_is_quoted_with_an_example(run, argument):
-    outcome = run(argument)
-    assert outcome.status == 2
-    assert f"cannot read '{argument}'" in outcome.err
-    assert "key=value" in outcome.err
-
-
-def test_a_setting_without_default_is_asked_for(run):
-    outcome = run("scene=blender")
-    assert outcome.err == "steerbench: scene.path is not set: give scene.path=...\n"
-
-
 @pytest.mark.parametrize(
-    ("argument", "said"),
-    [
-        ("~nothing", "'nothing' does not exist"),
-        *((word, "") for word in ("budget=0.0", "~budget=0.0", "scene=null", "~seed", "~method")),
-    ],
+    "word", ["~nothing", "budget=0.0", "~budget=0.0", "scene=null", "~seed", "~method"]
 )
-def test_what_is_no_choice_or_not_there_is_an_error_without_traceback(run, argument, said):
-    outcome = run(argument)
+def test_what_is_no_choice_or_not_there_is_an_error_without_traceback(run, word):
+    outcome = run(word)
     assert outcome.status == 2
     assert outcome.err.startswith("steerbench: ")
-    assert said in outcome.err
+    assert word != "~nothing" or "'nothing' does not exist" in outcome.err
     assert "Traceback" not in outcome.err

@@ -1,12 +1,14 @@
-"""`steerbench paper`: its plan, its page, what a failed job leaves behind."""
+"""`steerbench paper` and `report`: the runs in a line, their means, what failed jobs leave."""
 
 from __future__ import annotations
 
 import json
+import math
+import os
 import re
 import shutil
+from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import pandas as pd
@@ -14,170 +16,27 @@ import pytest
 from omegaconf import DictConfig
 
 from bench.results import Store
-from bench.types import SteerbenchError, Unavailable
-from sweeps import failures, jobs
-from sweeps.identity import described
-from sweeps.measurement import Group, Obtained
-from sweeps.overrides import composed
-from sweeps.plan import Planned, chosen, plan
+from bench.types import Scene, SteerbenchError, Unavailable
+from reports.runs import Run, load
+from sweeps import configured, execute
+from sweeps.commands import paper
+from sweeps.commands.paper import gather, newest
+from sweeps.measurement import Job, described
+from sweeps.plan import DataSet, Planned, chosen, plan
+from tests.sweeps.conftest import CONFIGS, HERE
+from tests.sweeps.test_plan import blender
 
-CURVED = {table.name: table for table in chosen(None, [])}
-TABLES = {name: replace(table, curve=False) for name, table in CURVED.items()}
-"""Their lines alone."""
-
-
-@cache
-def with_one_seed(name: str) -> tuple[Planned, ...]:
-    """The jobs of the lines of a table; composing them takes seconds."""
-    return tuple(plan(TABLES[name], ["seed=0"]))
-
-
-@pytest.mark.parametrize("name", TABLES)
-def test_every_line_that_can_be_measured_has_its_job(name):
-    jobs = with_one_seed(name)
-    lines = [line.label for block in TABLES[name].blocks for line in block.lines]
-    assert sorted(job.line for job in jobs) == sorted(lines)
-    assert len({job.key for job in jobs}) == len(lines)
-
-
-def test_a_curve_has_the_lines_of_the_papers_method_at_several_shares_of_one_training():
-    table = CURVED["table5"]
-    lines, jobs = (plan(one, ["budget=demo"]) for one in (TABLES["table5"], table))
-    marks = [job for job in jobs if "after" in job.line]
-    assert [job.key for job in jobs if job not in marks] == [job.key for job in lines]
-    assert len(marks) == 2 * 3  # lines, shares; of the first seed
-    for job in marks:
-        label, _, share = job.line.partition(", after ")
-        (whole,) = (
-            one for one in lines if one.line == label and one.config.seed == job.config.seed
-        )
-        one, other = described(job.config), described(whole.config)
-        assert (one["method"].pop("after"), other["method"].pop("after")) == (float(share), 1)
-        scored = one.pop("protocol"), other.pop("protocol")
-        assert [protocol["lpips"] for protocol in scored] == [[], ["alex", "vgg"]]
-        assert one == other
-
-
-@pytest.mark.parametrize(
-    ("words", "seeds", "of_ours"),
-    [
-        *(([f"budget={name}"], 1, [0]) for name in ("tiny", "full")),
-        *(([f"budget={name}"], 3, [0]) for name in ("demo", "small")),
-        (["budget=paper"], 3, []),
-        (["budget=demo", "tables.seeds=2"], 2, [0]),
-        (["budget=demo", "seed=7"], [7], [7]),
-        (["budget=demo", "seed=1,2"], [1, 2], [1, 2]),
-    ],
+TABLE3, TABLE5 = (
+    replace(table, curve=False, beyond=None)
+    for table in chosen(None, [])
+    if table.name in ("table3", "table5")
 )
-def test_only_the_papers_method_is_repeated_unless_seeds_are_asked_for(words, seeds, of_ours):
-    found: dict[str, list[int]] = {"steernerf_lean": []}
-    for job in plan(CURVED["table5"], words):
-        if job.block == "curves":
-            continue
-        found.setdefault(job.config.method.name, []).append(job.config.seed)
-    expected = list(range(seeds)) if isinstance(seeds, int) else seeds
-    assert found == {"steernerf": 2 * expected, "steernerf_lean": 2 * of_ours}
 
 
-def test_only_the_table_of_times_is_measured_in_turns():
-    """The lines of a method with one seed together."""
-    for name in TABLES:
-        jobs = with_one_seed(name)
-        turns = {job.turns for job in jobs}
-        assert (turns == {""}) == (name != "table2")
-        for turn in turns - {""}:
-            together = [job for job in jobs if job.turns == turn]
-            assert len(together) == 2
-            assert len({(job.config.method.name, job.config.seed) for job in together}) == 1
-
-
-def test_settings_hold_for_every_job():
-    for job in plan(TABLES["table3"], ["budget=tiny", "seed=3"]):
-        assert job.config.budget.name == "tiny"
-        assert job.config.seed == 3
-        assert job.line == f"L = {job.config.method.model.frames}"
-        assert job.config.trajectory._target_ == "bench.trajectories.orbit"
-
-
-@pytest.mark.parametrize("name", [name for name in TABLES if name != "table3"])
-def test_a_table_is_of_the_papers_method_and_then_of_ours(name):
-    configs = [job.config for job in with_one_seed(name)]
-    methods = [config.method.name for config in configs if "engine" in config.method]
-    half = len(methods) // 2
-    assert methods == ["steernerf"] * half + ["steernerf_lean"] * half
-
-
-def test_the_lines_of_table_3_differ_in_l_alone():
-    settings = [described(job.config) for job in with_one_seed("table3")]
-    assert len(settings) == 4
-    for number, setting in enumerate(settings):
-        assert setting["method"]["rendering"]["range"]["mode"] == "off"
-        of_training = setting["method"]["joint"]["motion"]  # has exactly L frames
-        nodes = (
-            (setting["method"]["model"], "frames"),
-            (of_training, "length"),
-            (of_training, "least"),
-        )
-        assert [node.pop(name) for node, name in nodes] == [number] * 3
-    assert all(setting == settings[0] for setting in settings)
-
-
-def test_every_seed_is_a_job_of_its_own_and_a_command_that_makes_it():
-    jobs = plan(replace(TABLES["table5"], beyond=None), ["budget=tiny", "seed=0,2"])
-    assert [(job.line[:4], job.config.seed) for job in jobs] == [
-        ("with", 0),
-        ("with", 2),
-        ("with", 0),
-        ("with", 2),
-    ]
-    for job in jobs:
-        again = composed([text for text in job.command[2:] if text != "hydra.mode=RUN"])
-        assert described(again) == described(job.config)
-
-
-def test_tables_share_the_run_that_they_have_in_common():
-    """But for the table of times: a time in turns is another figure than one alone."""
-    lines = [("table3", 2), ("table4", 1), ("table5", 0), ("table2", 0)]
-    *jobs, timed = (with_one_seed(name)[place] for name, place in lines)
-    assert len({job.key for job in jobs}) == 1
-    assert described(timed.config) == described(jobs[0].config)
-    assert timed.key != jobs[0].key
-
-
-@pytest.mark.parametrize(
-    ("method", "name", "line"),
-    [
-        ("ngp", "table1", "Instant-NGP"),
-        ("steernerf", "table4", "K = 6"),
-        ("steernerf_lean", "table4", "K = 6 (steernerf_lean)"),
-        ("steernerf_lean_frozen", "table5", "without joint training (steernerf_lean)"),
-        ("steernerf_lean_k3", "table4", "K = 3 (steernerf_lean)"),
-    ],
-)
-def test_what_the_figures_show_is_what_the_tables_measure(method, name, line):
-    shown = composed(["+experiment=figures", f"method={method}"])
-    (job,) = (job for job in with_one_seed(name) if job.line == line)
-    assert described(shown) == described(job.config)
-
-
-@pytest.mark.parametrize("word", ["tables.seeds=5", "tables.beyond=false"])
-def test_what_only_the_tables_read_changes_no_key(word):
-    assert described(composed([word])) == described(composed([]))
-
-
-@pytest.mark.parametrize(
-    ("override", "said"),
-    [
-        ("budgt=tiny", "budgt"),
-        ("scene=totem,wires", "totem, wires"),
-        ("a=b=,", "a=b=,"),
-        ("tables.seeds=0", "tables: seeds: expected 1 or more"),
-        ("budget.threads=0", "threads: expected 1 or more"),
-    ],
-)
-def test_a_setting_that_cannot_be_had_is_named(override, said):
-    with pytest.raises(SteerbenchError, match=said):
-        plan(TABLES["table3"], [override])
+@pytest.fixture
+def outputs(store: Store) -> str:
+    """The word for the folder of the store."""
+    return f"outputs={store.folder.parent}"
 
 
 @pytest.fixture
@@ -188,14 +47,14 @@ def measured(
     for."""
     asked: list[DictConfig] = []
 
-    def obtain(group: Group) -> list[Obtained]:
-        (config,) = [job.config for job in group.jobs]
+    def obtain(jobs: list[Job]) -> tuple[list[str], bool]:
+        (config,) = [job.config for job in jobs]
         asked.append(config)
         if config.method.model.frames == 3:
             raise SteerbenchError("no room\nfor L = 3")
-        return [Obtained(store, put(store, stored_run, config), measured=True)]
+        return [put(store, stored_run, config)], True
 
-    monkeypatch.setattr(jobs, "obtain", obtain)
+    monkeypatch.setattr(execute, "obtain", obtain)
     monkeypatch.chdir(tmp_path)
     return asked
 
@@ -220,8 +79,8 @@ def labels(page: Path) -> list[str]:
     return [line.split("|")[1].strip() for line in lines]
 
 
-def test_a_job_that_fails_stands_in_its_line_and_the_others_run(steerbench, measured, store):
-    outcome = steerbench("paper", "--table", "table3", "seed=0", f"outputs={store.folder.parent}")
+def test_a_job_that_fails_stands_in_its_line_and_the_others_run(steerbench, measured, outputs):
+    outcome = steerbench("paper", "--table", "table3", "seed=0", outputs)
     assert outcome.status == 1
     assert len(measured) == 4 * (1 + 3)  # lines; thrice each for their curves
     assert "failed: table3: L = 3, seed 0: no room" in outcome.err
@@ -231,54 +90,42 @@ def test_a_job_that_fails_stands_in_its_line_and_the_others_run(steerbench, meas
     assert "/ 33.14 /" in page.read_text()
 
 
-def test_the_jobs_go_where_hydras_launcher_puts_them(steerbench, measured, launched, store):
-    words = ("seed=0", f"outputs={store.folder.parent}")
-    assert steerbench("paper", "--table", "table5", *words).status == 0
+def test_the_jobs_go_where_hydras_launcher_puts_them(steerbench, measured, launched, outputs):
+    assert steerbench("paper", "--table", "table5", "seed=0", outputs).status == 0
     assert launched == [len(measured)]
 
 
-def test_what_cannot_run_here_says_so_in_its_line_and_is_no_failure(steerbench, store, monkeypatch):
-    def obtain(*_: object) -> list[Obtained]:
+def test_what_cannot_run_here_says_so_in_its_line_and_does_not_fail(
+    steerbench, monkeypatch, outputs
+):
+    def obtain(*_: object) -> None:
         raise Unavailable("no bfloat16 on this CPU")
 
-    monkeypatch.setattr(jobs, "obtain", obtain)
-    outcome = steerbench("paper", "--table", "table3", "seed=0", f"outputs={store.folder.parent}")
+    monkeypatch.setattr(execute, "obtain", obtain)
+    outcome = steerbench("paper", "--table", "table3", "seed=0", outputs)
     assert outcome.status == 0
     page = Path(re.search(r"report: (.*)", outcome.err)[1])
     assert labels(page)[0] == "L = 0: failed: no bfloat16 on this CPU"
 
 
-def test_a_report_has_what_is_there_and_measures_nothing(steerbench, measured, store, stored_run):
-    jobs = plan(TABLES["table3"], [f"outputs={store.folder.parent}", "seed=0"])
+def test_a_report_has_what_is_there_and_measures_nothing(
+    steerbench, measured, outputs, store, stored_run
+):
+    jobs = plan(TABLE3, [outputs, "seed=0"])
     put(store, stored_run, jobs[1].config)
-    failures.keep(store.folder.parent, described(jobs[2].config), "killed")
-    outcome = steerbench("report", "--table", "table3", "seed=0", f"outputs={store.folder.parent}")
+    jobs[2].keep_failure("killed")
+    outcome = steerbench("report", "--table", "table3", "seed=0", outputs)
     assert (outcome.status, measured) == (0, [])
     page = Path(re.search(r"report: (.*)", outcome.err)[1])
-    missing = "not measured yet"
-    assert labels(page) == [
-        f"L = 0: {missing}",
-        "L = 1",
-        "L = 2: failed: killed",
-        f"L = 3: {missing}",
-    ]
+    last = "L = 3: not measured yet"
+    assert labels(page) == ["L = 0: not measured yet", "L = 1", "L = 2: failed: killed", last]
     written = page.with_suffix(".html").read_text()
     assert ">L = 1</a></td>" in written
     assert not re.search(r'src="(?!data:)', written)
 
 
-def test_a_failure_is_forgotten_once_the_job_succeeds(tmp_path):
-    job = {"seed": 1}
-    failures.keep(tmp_path, job, "no room")
-    assert failures.last(tmp_path, job) == "no room"
-    assert failures.last(tmp_path, {"seed": 2}) is None
-    failures.forget(tmp_path, job)
-    assert failures.last(tmp_path, job) is None
-
-
-def test_a_check_names_the_broken_rows_of_the_store(steerbench, measured, store, stored_run):
-    outputs = f"outputs={store.folder.parent}"
-    key = put(store, stored_run, plan(TABLES["table3"], [outputs, "seed=0"])[0].config)
+def test_a_check_names_the_broken_rows_of_the_store(steerbench, outputs, store, stored_run):
+    key = put(store, stored_run, plan(TABLE3, [outputs, "seed=0"])[0].config)
     rows = store.folder / key / "rows.csv"
     table = pd.read_csv(rows)
     named = table["metric"].str.startswith("stage_ms.") & (table["metric"] != "stage_ms.other")
@@ -292,9 +139,8 @@ def test_a_check_names_the_broken_rows_of_the_store(steerbench, measured, store,
     assert key in found[1].out
 
 
-def test_the_frames_of_runs_that_are_not_on_a_page_are_not_read(steerbench, store, stored_run):
-    outputs = f"outputs={store.folder.parent}"
-    key = put(store, stored_run, plan(TABLES["table3"], [outputs, "seed=0"])[0].config)
+def test_frames_of_runs_that_are_not_on_a_page_are_not_read(steerbench, outputs, store, stored_run):
+    key = put(store, stored_run, plan(TABLE3, [outputs, "seed=0"])[0].config)
     for run in (stored_run, key):
         (store.folder / run / "frames.csv").unlink()
     checked = steerbench("report", "--check", outputs)
@@ -302,11 +148,183 @@ def test_the_frames_of_runs_that_are_not_on_a_page_are_not_read(steerbench, stor
     assert steerbench("report", "--table", "table3", "seed=1", outputs).status == 0
 
 
-def test_the_page_goes_where_asked_and_tables_to_stdout(steerbench, measured, store, tmp_path):
+def test_the_page_goes_where_asked_and_tables_to_stdout(steerbench, measured, outputs, tmp_path):
     folder = tmp_path / "there"
-    outputs = f"outputs={store.folder.parent}"
     words = ("--table", "table5", "--report", str(folder), "--format", "latex")
     outcome = steerbench("paper", *words, outputs)
     assert outcome.status == 0
     assert r"\label{tab:table5}" in outcome.out
     assert "## Table 5: Joint training" in (folder / "report.md").read_text()
+
+
+# Which run of the store a line shows: of the same settings, and of the very scene
+
+
+def job(folder: Path) -> Planned:
+    return plan(TABLE5, ["scene=blender", f"scene.path={folder}", "seed=0"])[0]
+
+
+@pytest.fixture
+def scenes(store: Store, stored_run: str, tmp_path: Path) -> Store:
+    """A store with the job measured in a/mic and then in b/mic, scenes that differ."""
+    for number, name in enumerate("ab"):
+        key = f"{number}{stored_run[1:]}"
+        folder = shutil.copytree(store.folder / stored_run, store.folder / key)
+        path = tmp_path / name / "mic"
+        path.mkdir(parents=True)
+        record = json.loads((folder / "record.json").read_text())
+        record["made_of"] = {"config": described(job(path).config)}
+        record["scene"]["digest"], record["scene_path"] = name, str(path)
+        (folder / "record.json").write_text(json.dumps(record))
+        rows = (folder / "rows.csv").read_text().replace(stored_run, key)
+        (folder / "rows.csv").write_text(rows)
+        os.utime(folder, (number, number))
+    return store
+
+
+@pytest.mark.parametrize(
+    ("folder", "digest", "found"),
+    [
+        ("a", "a", ["a"]),
+        ("b", None, ["b"]),  # lies where it was measured: it is not loaded
+        ("c", "a", ["a"]),  # elsewhere: it is known by its content
+        ("c", "c", []),
+        ("gone", None, ["b"]),  # not here: the last run is shown
+    ],
+)
+def test_of_folders_with_one_name_each_shows_its_own(
+    scenes, tmp_path, monkeypatch, tiny_scene, folder, digest, found
+):
+    def loaded(*contents: object) -> Scene:
+        assert digest, f"loads {contents}"
+        return replace(tiny_scene, digest=digest)
+
+    monkeypatch.setattr(configured, "_scene", loaded)
+    (tmp_path / "c" / "mic").mkdir(parents=True)
+    ((line,),) = gather([job(tmp_path / folder / "mic")], newest(scenes)).values()
+    assert [run.record["scene"]["digest"] for run in line.runs] == found
+
+
+def test_a_failure_stands_beside_what_was_measured_before(scenes, tmp_path, elsewhere):
+    asked = job(tmp_path / "b" / "mic")
+    asked.keep_failure("no such folder")
+    ((line,),) = gather([asked], newest(scenes)).values()
+    assert len(line.runs) == 1
+    assert line.gaps == ["failed when it was tried again: no such folder"]
+
+
+# Means over the scenes of a data set
+
+
+@pytest.fixture
+def psnr(store: Store, stored_run: str, monkeypatch: pytest.MonkeyPatch, elsewhere: None):
+    """Gathers lines of Table 5 from the PSNR of each line, scene and seed that was measured."""
+    (source,) = load(store, {stored_run: "run"})
+    monkeypatch.setattr(paper, "of_scene", lambda run, config: True)
+
+    def lines(found: Mapping[tuple[int, str, int], float], scenes: str, seeds: str):
+        data = DataSet("blender", {name: Path("/data") / name for name in scenes}, {})
+        jobs = plan(TABLE5, [f"seed={seeds}"], data)
+        labels = [line.label for line in TABLE5.lines]
+        runs = {}
+        for job in jobs:
+            place = (labels.index(job.line), job.scene, job.config.seed)
+            if place in found:
+                runs[job.key] = [run_of(source, job, found[place])]
+        (of_table,) = gather(jobs, runs).values()
+        return of_table
+
+    return lines
+
+
+def run_of(source: Run, job: Planned, psnr: float) -> Run:
+    """A run of the scene and seed of `job` with this PSNR."""
+    rows = source.rows.assign(scene=job.scene, seed=job.config.seed)
+    rows.loc[rows["metric"] == "psnr", "value"] = psnr
+    return replace(source, key=job.key[:16], rows=rows)
+
+
+def test_a_figure_is_the_mean_over_seeds_of_means_over_scenes(psnr):
+    found = {(0, "a", 0): 30.0, (0, "b", 0): 20.0, (0, "a", 1): 32.0, (0, "b", 1): 22.0}
+    line, _ = psnr(found, "ab", "0,1")
+    assert [run.values["psnr"] for run in line.runs] == [25.0, 27.0]
+    assert line.mean("psnr") == 26.0
+    # Of two means that are 2 apart, not of four runs: t(0.975, 1) * sqrt(2) / sqrt(2).
+    assert line.half("psnr") == pytest.approx(12.706, abs=1e-3)
+    assert [run.facts["seed"] for run in line.runs] == [0, 1]
+    assert {run.facts["scene"] for run in line.runs} == {"mean of a, b"}
+    assert len(line.measured) == 4
+
+
+def test_means_are_over_the_scenes_that_all_lines_have(psnr):
+    found = {(0, "a", 0): 30.0, (0, "b", 0): 20.0, (0, "c", 0): 10.0, (1, "a", 0): 31.0}
+    found[1, "c", 0] = 11.0
+    one, other = psnr(found, "abc", "0")
+    assert (one.mean("psnr"), other.mean("psnr")) == (20.0, 21.0)
+    assert (one.gaps, other.gaps) == ([], ["b not measured yet"])
+    assert list(one.by_scene) == ["a", "c", "b"]
+    assert one.runs[0].conditions == other.runs[0].conditions
+
+
+A_AND_B = {(0, "a", 0): 30.0, (0, "b", 0): 20.0}
+
+
+@pytest.mark.parametrize(
+    ("found", "seeds", "means", "gaps"),
+    [
+        (A_AND_B, "0", [25.0, None], [[], ["not measured yet"]]),  # takes no scene away
+        (
+            {(0, "a", 0): 30.0, (1, "b", 0): 20.0},
+            "0",
+            [None, None],
+            [[f"{x} not measured yet", "no scene that all lines have"] for x in "ba"],
+        ),
+        (
+            {**A_AND_B, (0, "a", 1): 99.0},
+            "0,1",
+            [25.0, None],
+            [["seed 1 b not measured yet"], ["not measured yet"]],
+        ),
+    ],
+)
+def test_what_is_left_out_of_a_mean_is_named(psnr, found, seeds, means, gaps):
+    lines = psnr(found, "ab", seeds)
+    assert [line.mean("psnr") for line in lines] == means
+    assert [line.gaps for line in lines] == gaps
+
+
+# All of it, with a method that trains nothing
+
+
+def test_the_page_of_a_data_set_has_means_scenes_and_gaps(steerbench, tmp_path, monkeypatch):
+    data = tmp_path / "data"
+    values = {"chair": 255, "mic": 204}
+    for name, value in values.items():
+        blender(data / name, value)
+    blender(data / "ship", pictures=False)
+    monkeypatch.setattr("sweeps.plan.TABLES", HERE / "configs" / "experiment")
+    words = [CONFIGS, f"data={data}", "device=cpu", "seed=0,1"]
+    outcome = steerbench("paper", *words)
+    assert outcome.status == 0, outcome.err
+    assert "missing: ship: no pictures" in outcome.err
+    assert "4 of 8" in outcome.err
+    page = Path(re.search(r"report: (.*)", outcome.err)[1]).read_text()
+    assert "- missing: ship: no pictures" in page
+    assert "scene mean of chair, mic" in page
+    # Pictures are rounded to 8 bit: 0.5 is 128 of 255, 0.25 is 64.
+    grey, dark = (
+        [-20 * math.log10((value - level) / 255) for value in values.values()]
+        for level in (128, 64)
+    )
+    mean = f"{sum(grey) / 2:.2f}"
+    assert f"| a grey | **{mean}** / 1.00 / " in page
+    assert f"| a dark one | {sum(dark) / 2:.2f} / – |" in page
+    assert "### Each scene" in page
+    for place, scene in enumerate(values):
+        assert f"| {scene}: a grey | {grey[place]:.2f} |" in page
+        assert f"| {scene}: a dark one | {dark[place]:.2f} |" in page
+    assert "| PSNR, dB: a dark one < a grey |" in page
+    assert "2 seeds" in page
+    again = steerbench("report", *words)
+    assert f"| a grey | **{mean}** / 1.00 / " in (tmp_path / "outputs/paper/report.md").read_text()
+    assert again.status == 0

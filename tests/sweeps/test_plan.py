@@ -1,111 +1,276 @@
-"""Which run of the store a line shows: of the same settings, and of the very scene."""
+"""The jobs of the paper's tables, and the scenes of a data set that they are means over."""
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
-from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from bench.results import Store
-from bench.types import Scene
-from sweeps import configured, failures
+from bench.errors import SteerbenchError
 from sweeps.commands.breakdown import with_engine
-from sweeps.gather import gather, newest
-from sweeps.identity import described
-from sweeps.overrides import composed
-from sweeps.plan import Planned, chosen, plan
+from sweeps.commands.paper import data_set
+from sweeps.measurement import described
+from sweeps.overrides import composed, setting
+from sweeps.plan import Planned, chosen, find, plan
 
-(TABLE,) = (
-    replace(table, lines=table.lines[:1], curve=False, beyond=None)
-    for table in chosen(None, [])
-    if table.name == "table5"
+CURVED = {table.name: table for table in chosen(None, [])}
+TABLES = {name: replace(table, curve=False) for name, table in CURVED.items()}
+"""Their lines alone."""
+
+ALONE = replace(TABLES["table5"], beyond=None)
+POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]
+
+
+@cache
+def with_one_seed(name: str) -> tuple[Planned, ...]:
+    """The jobs of the lines of a table; composing them takes seconds."""
+    return tuple(plan(TABLES[name], ["seed=0"]))
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_every_line_that_can_be_measured_has_its_job(name):
+    jobs = with_one_seed(name)
+    lines = [line.label for block in TABLES[name].blocks for line in block.lines]
+    assert sorted(job.line for job in jobs) == sorted(lines)
+    assert len({job.key for job in jobs}) == len(lines)
+
+
+def test_a_curve_has_the_lines_of_the_papers_method_at_several_shares_of_one_training():
+    table = CURVED["table5"]
+    lines, jobs = (plan(one, ["budget=demo"]) for one in (TABLES["table5"], table))
+    marks = [job for job in jobs if "after" in job.line]
+    assert [job.key for job in jobs if job not in marks] == [job.key for job in lines]
+    assert len(marks) == 2 * 3  # lines, shares; of the first seed
+    for job in marks:
+        label, _, share = job.line.partition(", after ")
+        where = (label, job.config.seed)
+        (whole,) = (one for one in lines if (one.line, one.config.seed) == where)
+        one, other = described(job.config), described(whole.config)
+        assert (one["method"].pop("after"), other["method"].pop("after")) == (float(share), 1)
+        scored = one.pop("protocol"), other.pop("protocol")
+        assert [protocol["lpips"] for protocol in scored] == [[], ["alex", "vgg"]]
+        assert one == other
+
+
+@pytest.mark.parametrize(
+    ("words", "seeds", "of_ours"),
+    [
+        *(([f"budget={name}"], 1, [0]) for name in ("tiny", "full")),
+        *(([f"budget={name}"], 3, [0]) for name in ("demo", "small")),
+        (["budget=paper"], 3, []),
+        (["budget=demo", "tables.seeds=2"], 2, [0]),
+        (["budget=demo", "seed=7"], [7], [7]),
+        (["budget=demo", "seed=1,2"], [1, 2], [1, 2]),
+    ],
 )
+def test_only_the_papers_method_is_repeated_unless_seeds_are_asked_for(words, seeds, of_ours):
+    found: dict[str, list[int]] = {"steernerf_lean": []}
+    for job in plan(CURVED["table5"], words):
+        if job.block != "curves":
+            found.setdefault(job.config.method.name, []).append(job.config.seed)
+    expected = list(range(seeds)) if isinstance(seeds, int) else seeds
+    assert found == {"steernerf": 2 * expected, "steernerf_lean": 2 * of_ours}
 
 
-def job(folder: Path) -> Planned:
-    return plan(TABLE, ["scene=blender", f"scene.path={folder}", "seed=0"])[0]
+def test_only_the_table_of_times_is_measured_in_turns():
+    """The lines of a method with one seed together."""
+    for name in TABLES:
+        jobs = with_one_seed(name)
+        turns = {job.turns for job in jobs}
+        assert (turns == {""}) == (name != "table2")
+        for turn in turns - {""}:
+            together = [job for job in jobs if job.turns == turn]
+            assert len(together) == 2
+            assert len({(job.config.method.name, job.config.seed) for job in together}) == 1
 
 
-def shown(store: Store, folder: Path) -> list[str]:
-    """Digests of the scenes of the runs in the line of the job that is asked for at `folder`."""
-    ((line,),) = gather([job(folder)], newest(store), store.folder.parent).values()
-    return [run.record["scene"]["digest"] for run in line.runs]
+def test_settings_hold_for_every_job():
+    for job in plan(TABLES["table3"], ["budget=tiny", "seed=3"]):
+        assert job.config.budget.name == "tiny"
+        assert job.config.seed == 3
+        assert job.line == f"L = {job.config.method.model.frames}"
+        assert job.config.trajectory._target_ == "bench.trajectories.orbit"
 
 
-@pytest.fixture
-def measured(store: Store, stored_run: str, tmp_path: Path) -> Store:
-    """A store with the job measured in a/mic and then in b/mic, scenes that differ."""
-    for number, name in enumerate("ab"):
-        key = f"{number}{stored_run[1:]}"
-        folder = shutil.copytree(store.folder / stored_run, store.folder / key)
-        path = tmp_path / name / "mic"
-        path.mkdir(parents=True)
-        record = json.loads((folder / "record.json").read_text())
-        record["made_of"] = {"config": described(job(path).config)}
-        record["scene"]["digest"], record["scene_path"] = name, str(path)
-        (folder / "record.json").write_text(json.dumps(record))
-        rows = (folder / "rows.csv").read_text().replace(stored_run, key)
-        (folder / "rows.csv").write_text(rows)
-        os.utime(folder, (number, number))
-    return store
+@pytest.mark.parametrize("name", [name for name in TABLES if name != "table3"])
+def test_a_table_is_of_the_papers_method_and_then_of_ours(name):
+    configs = [job.config for job in with_one_seed(name)]
+    methods = [config.method.name for config in configs if "engine" in config.method]
+    half = len(methods) // 2
+    assert methods == ["steernerf"] * half + ["steernerf_lean"] * half
 
 
-@pytest.fixture
-def content(monkeypatch: pytest.MonkeyPatch, tiny_scene: Scene) -> Callable[[str], None]:
-    """Says what the digest of a scene is that is loaded; none may be loaded before that."""
-
-    def none(node: str, root: Path) -> Scene:
-        raise AssertionError(f"loads {node}")
-
-    monkeypatch.setattr(configured, "_scene", none)
-    return lambda digest: monkeypatch.setattr(
-        configured, "_scene", lambda node, root: replace(tiny_scene, digest=digest)
-    )
-
-
-def test_of_folders_with_one_name_each_shows_its_own(measured, tmp_path, content):
-    content("a")
-    assert shown(measured, tmp_path / "a" / "mic") == ["a"]
-    content("b")
-    assert shown(measured, tmp_path / "b" / "mic") == ["b"]
+def test_the_lines_of_table_3_differ_in_l_alone():
+    settings = [described(job.config) for job in with_one_seed("table3")]
+    assert len(settings) == 4
+    for number, of_line in enumerate(settings):
+        method = of_line["method"]
+        assert method["rendering"]["range"]["mode"] == "off"
+        of_training = method["joint"]["motion"]  # has exactly L frames
+        nodes = (method["model"], "frames"), (of_training, "length"), (of_training, "least")
+        assert [node.pop(name) for node, name in nodes] == [number] * 3
+    assert all(of_line == settings[0] for of_line in settings)
 
 
-def test_a_scene_that_lies_where_it_was_measured_is_not_loaded(measured, tmp_path, content):
-    assert shown(measured, tmp_path / "b" / "mic") == ["b"]
+def test_tables_share_the_run_that_they_have_in_common():
+    """But for the table of times: a time in turns is another figure than one alone."""
+    lines = [("table3", 2), ("table4", 1), ("table5", 0), ("table2", 0)]
+    *jobs, timed = (with_one_seed(name)[place] for name, place in lines)
+    assert len({job.key for job in jobs}) == 1
+    assert described(timed.config) == described(jobs[0].config)
+    assert timed.key != jobs[0].key
 
 
-@pytest.mark.parametrize(("digest", "found"), [("a", ["a"]), ("c", [])])
-def test_a_scene_elsewhere_is_known_by_its_content(measured, tmp_path, content, digest, found):
-    (tmp_path / "c" / "mic").mkdir(parents=True)
-    content(digest)
-    assert shown(measured, tmp_path / "c" / "mic") == found
+@pytest.mark.parametrize(
+    ("method", "name", "line"),
+    [
+        ("ngp", "table1", "Instant-NGP"),
+        ("steernerf", "table4", "K = 6"),
+        ("steernerf_lean", "table4", "K = 6 (steernerf_lean)"),
+        ("steernerf_lean_frozen", "table5", "without joint training (steernerf_lean)"),
+        ("steernerf_lean_k3", "table4", "K = 3 (steernerf_lean)"),
+    ],
+)
+def test_what_the_figures_show_is_what_the_tables_measure(method, name, line):
+    shown = composed(["+experiment=figures", f"method={method}"])
+    (job,) = (job for job in with_one_seed(name) if job.line == line)
+    assert described(shown) == described(job.config)
 
 
-def test_of_a_scene_that_is_not_here_the_last_run_is_shown(measured, tmp_path, content):
-    assert shown(measured, tmp_path / "gone" / "mic") == ["b"]
+@pytest.mark.parametrize("word", ["tables.seeds=5", "tables.beyond=false"])
+def test_what_only_the_tables_read_changes_no_key(word):
+    assert described(composed([word])) == described(composed([]))
 
 
-def test_a_failure_stands_beside_what_was_measured_before(measured, tmp_path):
-    asked = job(tmp_path / "b" / "mic")
-    outputs = measured.folder.parent
-    failures.keep(outputs, described(asked.config), "no such folder")
-    ((line,),) = gather([asked], newest(measured), outputs).values()
-    assert len(line.runs) == 1
-    assert line.gaps == ["failed when it was tried again: no such folder"]
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("budgt=tiny", "budgt"),
+        ("scene=totem,wires", "totem, wires"),
+        ("a=b=,", "a=b=,"),
+        ("tables.seeds=0", "tables: seeds: expected 1 or more"),
+        ("budget.threads=0", "threads: expected 1 or more"),
+    ],
+)
+def test_a_setting_that_cannot_be_had_is_named(override, said):
+    with pytest.raises(SteerbenchError, match=said):
+        plan(TABLES["table3"], [override])
 
 
 @pytest.mark.parametrize(("gpu", "engine"), [(False, "OpenVino"), (True, "TorchEngine")])
 @pytest.mark.parametrize("asked", [[], ["engine=torch"]])
 def test_the_engine_of_the_first_table_is_one_for_the_device(gpu, engine, asked, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
-    (table,) = (table for table in chosen(None, []) if table.name == "table1")
-    targets = {job.config.engine._target_.split(".")[-1] for job in plan(table, asked)}
+    jobs = plan(TABLES["table1"], asked)
+    targets = {job.config.engine._target_.split(".")[-1] for job in jobs}
     assert targets == {"TorchEngine" if asked else engine}
     words = with_engine([*asked, "device=auto"])
     assert composed(words).engine._target_.split(".")[-1] in targets
+
+
+# Data sets
+
+
+def blender(folder: Path, value: int = 255, pictures: bool = True) -> Path:
+    """A scene in the layout of NeRF-Synthetic: two pictures of 16 x 16 of one value a split."""
+    for split in ("train", "test"):
+        (folder / split).mkdir(parents=True)
+        names = [f"./{split}/r_{number}" for number in range(2)]
+        frames = [{"file_path": name, "transform_matrix": POSE} for name in names]
+        record = {"camera_angle_x": 0.7, "frames": frames}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(record))
+        for name in names if pictures else ():
+            picture = np.full((16, 16, 3), value, np.uint8)
+            Image.fromarray(picture).save(folder / f"{name}.png")
+    return folder
+
+
+def nsvf(folder: Path, pictures: bool = True) -> Path:
+    """A scene in NSVF's layout, as far as its names show."""
+    for name in ("rgb", "pose"):
+        (folder / name).mkdir(parents=True)
+    (folder / "bbox.txt").touch()
+    if pictures:
+        (folder / "rgb" / "0_00000.png").touch()
+    return folder
+
+
+def test_of_nerf_synthetic_what_is_there_is_found_and_the_rest_is_named(tmp_path):
+    for name in ("mic", "lego"):
+        blender(tmp_path / name)
+    blender(tmp_path / "chair", pictures=False)
+    (tmp_path / "lego" / "test" / "r_1.png").unlink()
+    (tmp_path / "drums").mkdir()
+    found = find(str(tmp_path))
+    assert (found.layout, list(found.scenes)) == ("blender", ["mic"])
+    assert found.missing == {
+        "chair": "no pictures",
+        "drums": "no transforms_train.json or bbox.txt",
+        "lego": "1 of 4 pictures are not there",
+        **dict.fromkeys(("ficus", "hotdog", "materials", "ship"), "no folder"),
+    }
+
+
+def test_of_tanks_and_temples_too_and_scenes_of_ones_own_miss_nothing(tmp_path):
+    for name in ("Barn", "Truck"):
+        nsvf(tmp_path / name)
+    nsvf(tmp_path / "Family", pictures=False)
+    found = find(str(tmp_path))
+    assert (found.layout, list(found.scenes)) == ("nsvf", ["Barn", "Truck"])
+    assert set(found.missing) == {"Caterpillar", "Family", "Ignatius"}
+    blender(tmp_path / "mine" / "teapot")
+    assert find(str(tmp_path / "mine")).missing == {}
+
+
+@pytest.mark.parametrize(
+    ("folder", "said"),
+    [
+        ("empty", r"got none.*scene\.path"),
+        ("both/mic", r"got none.*scene\.path"),  # a scene itself
+        ("both", "scenes of both: Barn, mic"),
+    ],
+)
+def test_no_scenes_or_those_of_two_layouts_have_no_mean(tmp_path, folder, said):
+    (tmp_path / "empty").mkdir()
+    blender(tmp_path / "both" / "mic")
+    nsvf(tmp_path / "both" / "Barn")
+    with pytest.raises(SteerbenchError, match=said):
+        find(str(tmp_path / folder))
+
+
+@pytest.mark.parametrize("word", ["scene=totem", "scene.path=elsewhere", "++scene.path=elsewhere"])
+def test_a_scene_beside_a_data_set_is_refused(tmp_path, word):
+    blender(tmp_path / "mic")
+    with pytest.raises(SteerbenchError, match="expected one of them"):
+        data_set([word, f"data={tmp_path}"])
+    assert data_set([word]) == ([word], None)
+
+
+@pytest.mark.parametrize("text", ["/data/chair", "/a b,c (d)/it's", "/x=1/${y}#2", "~/Jürgen"])
+def test_any_folder_can_be_named_in_a_command(text):
+    config = composed(["scene=blender", setting("scene.path", text)])
+    assert config.scene._get_node("path")._value() == text
+
+
+def test_every_scene_is_a_job_of_its_own_and_a_command_that_makes_it(tmp_path):
+    for name in ("mic", "chair"):
+        blender(tmp_path / "my data" / name)
+    typed = ["scene.downscale=4", f"data={tmp_path / 'my data'}", "budget=tiny", "seed=0,1"]
+    words, data = data_set(typed)
+    assert words == [typed[0], *typed[2:]]
+    jobs = plan(ALONE, words, data)
+    assert {job.config.scene.downscale for job in jobs} == {4}
+    cells = [(job.scene, job.config.seed) for job in jobs]
+    assert cells == 2 * [("chair", 0), ("mic", 0), ("chair", 1), ("mic", 1)]
+    assert len({job.key for job in jobs}) == len(jobs)
+    for job in jobs:
+        again = composed([text for text in job.command[2:] if text != "hydra.mode=RUN"])
+        assert described(again) == described(job.config)
+        assert again.scene.path == str(tmp_path / "my data" / job.scene)
+    assert jobs[0].name.endswith(", chair, seed 0")

@@ -1,8 +1,9 @@
-"""Packages from pip bring methods and scenes of their own."""
+"""Methods and scenes from elsewhere: a folder beside a package, and packages from pip."""
 
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -12,9 +13,131 @@ from types import MappingProxyType
 
 import pytest
 
-from sweeps import plug_ins
+from bench import sources
+from sweeps import execute
+from sweeps.measurement import obtain
+from sweeps.overrides import PLUG_INS, plug_ins
 
 from .test_documents import WITHOUT_LPIPS, mine  # noqa: F401 (a fixture)
+
+HELPER = "LEVEL = 0.5\n"
+RENDERER = """
+from mine.helper import LEVEL
+from stand_ins import Grey
+
+
+class Mine(Grey):
+    name = "mine"
+
+    def __init__(self):
+        self.level = LEVEL
+"""
+SMALL = (
+    *("scene=totem", "scene.width=16", "scene.train=2", "scene.test=2", "budget=tiny"),
+    *("protocol.name=quick", "protocol.lpips=[]", "trajectory=test"),
+)
+
+
+@pytest.fixture
+def folder(steerbench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Of the package `mine` and the configuration of its method; all further calls find it."""
+    package = tmp_path / "plug-in's" / "mine"
+    package.mkdir(parents=True)
+    (package / "__init__.py").touch()
+    (package / "helper.py").write_text(HELPER)
+    (package / "renderer.py").write_text(RENDERER)
+    config = package.parent / "configs" / "method" / "mine.yaml"
+    config.parent.mkdir(parents=True)
+    config.write_text("# Mine.\n_target_: mine.renderer.Mine\n")
+    monkeypatch.syspath_prepend(package.parent)
+    for name in [name for name in sys.modules if name.partition(".")[0] == "mine"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr("methods.checks.found", lambda name: [])
+    return package.parent
+
+
+@pytest.fixture
+def call(steerbench, folder: Path):
+    """Call a command with the folder of the configuration."""
+    return lambda command, *argv: steerbench(
+        command, "--config-dir", str(folder / "configs"), *argv
+    )
+
+
+def keys(tmp_path: Path) -> set[str]:
+    """The runs of the store."""
+    return {path.parent.name for path in tmp_path.glob("outputs/runs/*/record.json")}
+
+
+def test_a_change_in_a_module_is_a_new_run_of_a_new_process(call, folder, tmp_path, monkeypatch):
+    first = call("run", "method=mine", *SMALL)
+    assert first.status == 0, first.err
+    assert call("run", "method=mine", *SMALL).err.startswith("already measured")
+    for number, name in enumerate(("helper.py", "renderer.py"), 2):
+        with (folder / "mine" / name).open("a") as file:
+            file.write("# changed\n")
+        refused = call("run", "method=mine", *SMALL)
+        assert f"mine/{name} was changed while this process runs" in refused.err
+        monkeypatch.setattr(sources, "_first", {})  # as a new process
+        assert call("run", "method=mine", *SMALL).status == 0
+        assert len(keys(tmp_path)) == number
+
+
+THERE = "There are: diver, gaussians, kilonerf, mine, nerf, ngp, nsvf, plenoctree"
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        *((f"{name} method=mien", f"method 'mien'. Did you mean mine? {THERE}")
+          for name in ("run", "accuracy")),
+        *((f"{name} --config-dir nowhere", "expected a folder, there is none at nowhere")
+          for name in ("list", "report")),
+        ("report --with mein", "Did you mean mine?"),
+        ("report --table table3 --with mine", "--with: table3 compares no methods; table1 does"),
+    ],
+)  # fmt: skip
+def test_a_word_that_leads_nowhere_is_answered(call, argv, said):
+    refused = call(*argv.split())
+    assert refused.status == 2
+    assert said in refused.err
+
+
+@pytest.fixture
+def only_mine(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Measure nothing but the plug-in; the methods of all jobs."""
+    names = []
+
+    def some(jobs):
+        names.extend(job.config.method._target_ for job in jobs)
+        if names[-1] != "mine.renderer.Mine":
+            raise RuntimeError("not measured here")
+        return obtain(jobs)
+
+    monkeypatch.setattr(execute, "obtain", some)
+    return names
+
+
+def line_of(err: str) -> str:
+    """The line of the plug-in in the table on the page that was written."""
+    page = Path(re.search(r"report: (.*)", err)[1]).read_text()
+    (line,) = [line for line in page.splitlines() if line.startswith("| mine |")]
+    return line
+
+
+@pytest.mark.slow
+def test_table_1_has_a_line_for_it_that_is_measured_and_reported(call, only_mine, tmp_path):
+    words = ("--table", "table1", "--with", "mine", *SMALL)
+    measured = call("paper", *words)
+    assert measured.status == 1  # the others failed
+    assert only_mine.count("mine.renderer.Mine") == 1
+    line = line_of(measured.err)
+    assert re.search(r"\d\.\d\d / –", line)  # no published figure
+    assert line_of(call("report", *words).err) == line
+    assert len(keys(tmp_path)) == 1
+
+
+# Packages from pip
 
 
 def called(*words: str | Path, **more: str) -> str:
@@ -39,29 +162,27 @@ def test_the_package_of_the_document_is_installed_listed_and_measured(mine: Path
 
 
 @pytest.fixture
-def plugged(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Callable[..., plug_ins.PlugIn]]:
+def plugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Path | str]]:
     """Install a package `other` with an entry point of a value, and files of its folder."""
     monkeypatch.syspath_prepend(tmp_path / "site")
 
-    def install(value: str, files: Mapping[str, str] = MappingProxyType({})) -> plug_ins.PlugIn:
+    def install(value: str, files: Mapping[str, str] = MappingProxyType({})) -> Path | str:
         info = {
             "METADATA": "Metadata-Version: 2.1\nName: other\nVersion: 2.0\n",
-            "entry_points.txt": f"[{plug_ins.GROUP}]\nother = {value}\n",
+            "entry_points.txt": f"[{PLUG_INS}]\nother = {value}\n",
         }
         there = {f"other-2.0.dist-info/{name}": text for name, text in info.items()}
         for name, text in (there | dict(files)).items():
             path = tmp_path / "site" / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text)
-        plug_ins.installed.cache_clear()
-        (found,) = [one for one in plug_ins.installed() if one.name.startswith("other")]
+        plug_ins.cache_clear()
+        (found,) = [one for name, one in plug_ins().items() if name.startswith("other")]
         return found
 
     yield install
     monkeypatch.undo()
-    plug_ins.installed.cache_clear()
+    plug_ins.cache_clear()
 
 
 def test_a_package_that_cannot_be_imported_is_a_line(plugged, steerbench):
@@ -73,9 +194,7 @@ def test_a_package_that_cannot_be_imported_is_a_line(plugged, steerbench):
 
 
 def test_an_entry_that_leads_nowhere_says_so(plugged):
-    found = plugged("nowhere_at_all")
-    assert found.folder is None
-    assert found.fault == "there is no package nowhere_at_all"
+    assert plugged("nowhere_at_all") == "there is no package nowhere_at_all"
 
 
 def test_a_name_that_is_taken_stays_ours(plugged, steerbench):

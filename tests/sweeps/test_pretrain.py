@@ -3,56 +3,40 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from omegaconf import DictConfig
 
 
-class Recorder:
-    """In place of all that is built: notes the settings, trains nothing."""
-
-    def __init__(self) -> None:
-        self.config: dict[str, dict] = {}
-        self.variants: list[int] = []
-        self.fitted: list[tuple] = []
-
-    def build(self, config: DictConfig, group: str, **extra: object) -> object:
-        self.config[group] = dict(config[group])
-        if group != "scene":
-            return self if group == "method" else group
-        self.variants.append(config.scene.variant)
-        return f"medley {config.scene.variant}"
-
-    def pretrain_renderer(self, scenes: list[str], budget: str, output: Path, log: object) -> None:
-        self.fitted.append((scenes, budget, output))
-
-
 @pytest.fixture
-def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
-    """What `steerbench pretrain` has built and trained."""
-    recorder = Recorder()
-    monkeypatch.setattr("sweeps.commands.pretrain.build", recorder.build)
-    return recorder
+def built(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """The settings of what `steerbench pretrain` has built, and what it has trained: nothing is."""
+    seen: dict[str, Any] = {"trained": []}
+    method = SimpleNamespace(pretrain_renderer=lambda *given: seen["trained"].append(given[:-1]))
+
+    def build(config: DictConfig, group: str, **extra: object) -> object:
+        seen[group] = config[group]
+        return method if group == "method" else f"{group} {config[group].get('variant')}"
+
+    monkeypatch.setattr("sweeps.commands.pretrain.build", build)
+    return seen
 
 
-def test_one_renderer_is_trained_on_as_many_scenes_as_asked_for(steerbench, recorder):
-    outcome = steerbench("pretrain", "--scenes", "3", "--output", "w.safetensors", "seed=5")
-    assert outcome.status == 0
-    scenes = ["medley 0", "medley 1", "medley 2"]
-    assert recorder.fitted == [(scenes, "budget", Path("w.safetensors"))]
-    assert recorder.config["budget"]["name"] == "pretrain"
-    method = recorder.config["method"]
-    assert method["name"] == "steernerf_lean"
-    assert method["seed"] == 5
-    assert method["model"]["channels"] == 3
-    assert method["renderer"]["init"] == "scratch"
-
-
-def test_as_many_threads_are_used_as_asked_for(steerbench, recorder, monkeypatch):
-    asked = []
-    monkeypatch.setattr("torch.set_num_threads", asked.append)
-    assert steerbench("pretrain", "--scenes", "1", "--output", "w", "threads=1").status == 0
-    assert asked == [1]
+def test_one_renderer_is_trained_on_as_many_scenes_as_asked_for(steerbench, built, monkeypatch):
+    threads = []
+    monkeypatch.setattr("torch.set_num_threads", threads.append)
+    words = ("--output", "w.safetensors", "seed=5", "threads=1")
+    assert steerbench("pretrain", "--scenes", "3", *words).status == 0
+    scenes = ["scene 0", "scene 1", "scene 2"]
+    assert built["trained"] == [(scenes, "budget None", Path("w.safetensors"))]
+    assert built["scene"].name == "medley"
+    assert built["budget"].name == "pretrain"
+    method = built["method"]
+    assert (method.name, method.seed) == ("steernerf_lean", 5)
+    assert (method.model.channels, method.renderer.init) == (3, "scratch")
+    assert threads == [1]
 
 
 @pytest.mark.parametrize(
@@ -64,8 +48,8 @@ def test_as_many_threads_are_used_as_asked_for(steerbench, recorder, monkeypatch
         (["--output", "w", "seed=-1"], "seed: expected 0 or more"),
     ],
 )
-def test_a_wrong_word_is_answered_with_what_is_expected(steerbench, recorder, argv, message):
+def test_a_wrong_word_is_answered_with_what_is_expected(steerbench, built, argv, message):
     outcome = steerbench("pretrain", *argv)
     assert outcome.status == 2
     assert message in outcome.err
-    assert recorder.fitted == []
+    assert built == {"trained": []}

@@ -1,14 +1,16 @@
-"""`steerbench run`: from overrides to a table, a stored run and a page."""
+"""`steerbench run`: from overrides to a table, a stored run and a page, and how it is ended."""
 
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
 
 import pytest
 import torch
 
 from reports.trackers import TRACKERS
+from tests.sweeps.conftest import CONFIGS
 
 
 def stored(tmp_path: Path) -> list[Path]:
@@ -16,25 +18,20 @@ def stored(tmp_path: Path) -> list[Path]:
     return sorted(path.parent for path in tmp_path.glob("outputs/runs/*/record.json"))
 
 
-def test_a_run_prints_its_table_and_is_stored(run, tmp_path):
-    outcome = run()
-    assert outcome.status == 0
-    assert outcome.err == ""
-    # Grey 0.5 rounds to 128/255: PSNR = -20 log10(127 / 255) = 6.05 dB.
-    assert "6.05" in outcome.out
-    for title in ("Quality", "Time of a frame", "Memory"):
-        assert title in outcome.out
-    assert len(stored(tmp_path)) == 1
-
-
-def test_a_run_that_is_stored_is_not_measured_again(run, tmp_path):
+def test_a_run_prints_its_table_and_is_stored_and_not_measured_again(run, tmp_path):
     first = run()
+    assert (first.status, first.err) == (0, "")
+    # Grey 0.5 rounds to 128/255: PSNR = -20 log10(127 / 255) = 6.05 dB.
+    for text in ("6.05", "Quality", "Time of a frame", "Memory"):
+        assert text in first.out
     (folder,) = stored(tmp_path)
     before = (folder / "rows.csv").stat()
-    second = run()
+    second = run("report=pages/first")
     assert (folder / "rows.csv").stat() == before
     assert str(folder.relative_to(tmp_path)) in second.err
     assert second.out == first.out
+    assert "pages/first/report.md" in second.err
+    assert "6.05" in (tmp_path / "pages/first/report.md").read_text()
 
 
 @pytest.mark.parametrize(
@@ -67,23 +64,16 @@ def test_the_record_holds_the_command_that_was_typed(run, tmp_path):
     command = json.loads((folder / "record.json").read_text())["command"]
     assert command.startswith("steerbench run ")
     assert command.endswith("seed=3 scene.path=.")
-    assert f"--config-dir={Path(__file__).parent / 'configs'} method=grey" in command
+    assert f"{CONFIGS} method=grey" in command
 
 
 def test_a_job_that_says_nothing_of_threads_has_the_usual_ones(run, tmp_path):
     usual = torch.get_num_threads()
     run("-m", "threads=1,null")
     records = [json.loads((folder / "record.json").read_text()) for folder in stored(tmp_path)]
-    threads = {
-        json.dumps(r["made_of"]["config"]["threads"]): r["machine"]["threads"] for r in records
-    }
-    assert threads == {"1": 1, "null": usual}
-
-
-def test_a_report_is_written_where_it_is_asked_for(run, tmp_path):
-    outcome = run("report=pages/first")
-    assert "pages/first/report.md" in outcome.err
-    assert "6.05" in (tmp_path / "pages/first/report.md").read_text()
+    asked = [record["made_of"]["config"]["threads"] for record in records]
+    had = [record["machine"]["threads"] for record in records]
+    assert dict(zip(asked, had, strict=True)) == {1: 1, None: usual}
 
 
 @pytest.fixture
@@ -114,17 +104,11 @@ def test_a_tracker_that_cannot_be_reached_is_one_line_and_the_run_stands(run, tm
     assert run("tracker=comet").status == 2
 
 
-def test_nothing_but_outputs_is_left_behind(run, tmp_path):
-    run()
-    run("-m", "seed=0,1")
+def test_a_sweep_takes_flags_after_overrides_and_leaves_nothing_but_outputs(run, tmp_path):
+    assert run("seed=0,1", "-m", "scene.frames=2,3").status == 0
+    assert len(stored(tmp_path)) == 4
     assert [path.name for path in tmp_path.iterdir()] == ["outputs"]
     assert {path.name for path in (tmp_path / "outputs").iterdir()} == {"runs", "stages", "sweeps"}
-
-
-def test_a_sweep_takes_flags_after_overrides_and_runs_every_combination(run, tmp_path):
-    outcome = run("seed=0,1", "-m", "scene.frames=2,3")
-    assert outcome.status == 0
-    assert len(stored(tmp_path)) == 4
 
 
 def test_a_job_that_fails_stands_in_the_table_and_on_the_page_and_the_others_run(run, tmp_path):
@@ -157,8 +141,7 @@ def test_a_sweep_says_how_far_it_is_and_ends_with_one_table_and_one_page(run, tm
     assert outcome.out.count("Comparison") == 1
     assert "Time of a frame" not in outcome.out
     assert outcome.err.count("report: ") == 1
-    text = (tmp_path / "page/report.md").read_text()
-    assert text.startswith("# grey, dark on white")
+    assert (tmp_path / "page/report.md").read_text().startswith("# grey, dark on white")
     assert len(list((tmp_path / "page/pictures").iterdir())) == 3 + 2  # the plots, two frames
 
 
@@ -182,8 +165,7 @@ def test_a_second_sweep_is_read_from_the_store_and_knows_nothing_of_the_first(ru
     ("overrides", "methods"), [([], ["grey", "dark"]), (["method=dark"], ["dark"])]
 )
 def test_an_experiment_may_be_a_sweep_and_words_narrow_it(steerbench, tmp_path, overrides, methods):
-    configs = ["--config-dir", str(Path(__file__).parent / "configs")]
-    outcome = steerbench("run", *configs, "+experiment=greys", *overrides)
+    outcome = steerbench("run", CONFIGS, "+experiment=table9", *overrides)
     assert outcome.status == 0
     assert f"{len(methods)} of {len(methods)} jobs done" in outcome.err
     text = (tmp_path / "outputs/greys/report.md").read_text()
@@ -192,8 +174,7 @@ def test_an_experiment_may_be_a_sweep_and_words_narrow_it(steerbench, tmp_path, 
 
 def test_a_sweep_that_cannot_begin_is_one_line(run, tmp_path):
     outcome = run("-m", "seed=0,1", "sed=1")
-    assert outcome.status == 2
-    assert outcome.out == ""
+    assert (outcome.status, outcome.out) == (2, "")
     assert "Did you mean seed" in outcome.err
     assert stored(tmp_path) == []
 
@@ -224,3 +205,51 @@ def test_a_wrong_setting_is_one_line_with_what_was_expected(run, tmp_path, argum
     outcome = run(argument)
     assert (outcome.status, outcome.err) == (2, f"steerbench: {message}\n")
     assert stored(tmp_path) == []
+
+
+# How a run ends that does not end by itself
+
+
+@pytest.fixture
+def hanging(spawn, tmp_path):
+    """A run that is in the middle of its training."""
+    (tmp_path / "hang").touch()
+    process = spawn()
+    try:
+        assert process.stderr.readline() == "hanging\n"
+        (tmp_path / "hang").unlink()
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.parametrize(
+    ("sent", "status", "said"),
+    [(signal.SIGTERM, 143, ""), (signal.SIGINT, 130, "steerbench: interrupted\n")],
+)
+def test_a_signal_ends_a_run_through_its_clean_up(hanging, tmp_path, sent, status, said):
+    hanging.send_signal(sent)
+    out, err = hanging.communicate()
+    assert (hanging.returncode, out, err) == (status, "", said)
+    assert len(list(tmp_path.glob("outputs/stages/*/cleaned-up"))) == 1
+    assert list(tmp_path.glob("outputs/runs/*")) == []
+
+
+def test_a_run_that_was_killed_can_be_run_again(hanging, run, tmp_path):
+    hanging.kill()
+    hanging.wait()
+    assert list(tmp_path.glob("outputs/runs/*")) == []
+    outcome = run()
+    assert outcome.status == 0
+    assert "6.05" in outcome.out
+    assert len(list(tmp_path.glob("outputs/runs/*"))) == 1
+
+
+@pytest.mark.slow
+def test_a_reader_that_goes_away_ends_the_run_quietly(spawn):
+    process = spawn()
+    process.stdout.close()
+    assert process.stderr.read() == ""
+    process.stderr.close()
+    assert process.wait() == 141

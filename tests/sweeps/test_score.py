@@ -28,9 +28,13 @@ def folders(tmp_path: Path) -> tuple[str, str]:
     return "theirs", "true"
 
 
-def test_the_rows_stand_in_the_store_beside_those_of_runs(steerbench, folders):
+def test_the_rows_stand_in_the_store_beside_those_of_runs(steerbench, folders, monkeypatch):
+    sent = []
+    monkeypatch.setattr("reports.trackers.find_spec", lambda name: name)
+    monkeypatch.setitem(TRACKERS, "wandb", lambda run, outputs: sent.append(run.label))
     theirs, true = folders
-    outcome = steerbench("score", theirs, "--truth", true, "--sequence", *QUICK)
+    words = ("--sequence", "pictures=1", "tracker=wandb")
+    outcome = steerbench("score", theirs, "--truth", true, *QUICK, *words)
     assert outcome.status == 0, outcome.err
     assert "2 pictures, matched by name: 0.png is scored against 0.png" in outcome.err
     assert "PSNR" in outcome.out
@@ -42,6 +46,9 @@ def test_the_rows_stand_in_the_store_beside_those_of_runs(steerbench, folders):
     record = Store(Path("outputs")).record(rows["run"].iloc[0])
     assert record["command"].startswith("steerbench score theirs --truth true --match name")
     assert steerbench("results", "--metric", "psnr").status == 0
+    kept = {path.name for path in Path("outputs/runs").glob("*/pictures/*")}
+    assert {name.split("-")[0] for name in kept} == {"0000"}
+    assert sent == ["theirs"]
 
 
 def test_the_same_pictures_are_the_same_run_and_others_are_another(steerbench, folders):
@@ -52,19 +59,6 @@ def test_the_same_pictures_are_the_same_run_and_others_are_another(steerbench, f
         keys.append(re.search(r"run (\w+)", outcome.out)[1])
     assert keys[0] == keys[1]
     assert len(set(keys)) == 3
-
-
-def test_pictures_asked_for_are_kept_and_a_tracker_has_the_run(steerbench, folders, monkeypatch):
-    sent = []
-    monkeypatch.setattr("reports.trackers.find_spec", lambda name: name)
-    monkeypatch.setitem(TRACKERS, "wandb", lambda run, outputs: sent.append(run.label))
-    theirs, true = folders
-    words = ("pictures=1", "tracker=wandb")
-    outcome = steerbench("score", theirs, "--truth", true, *QUICK, *words)
-    assert outcome.status == 0, outcome.err
-    kept = {path.name for path in Path("outputs/runs").glob("*/pictures/*")}
-    assert {name.split("-")[0] for name in kept} == {"0000"}
-    assert sent == ["theirs"]
 
 
 def test_pictures_of_two_programs_are_compared_where_their_truth_is_the_same(steerbench, folders):

@@ -6,7 +6,7 @@ import pytest
 
 from bench.results import Store
 from bench.types import Scene
-from sweeps.identity import described
+from sweeps.measurement import described
 from sweeps.overrides import composed
 from sweeps.plan import chosen, plan
 from tests.sweeps.conftest import STAND_INS
@@ -78,19 +78,13 @@ def test_a_path_to_held_out_views_holds_them_out_without_the_split(run, learned_
     assert [len(scene.splits["train"]) for scene in learned_from] == [14]
 
 
-def test_a_path_to_held_out_views_that_was_asked_for_is_kept():
+def test_the_split_is_its_trajectory_unless_that_was_asked_for():
     words = [SPLIT, "trajectory=smooth", "trajectory.split=validation", "trajectory.degrees=2"]
     assert composed(words).trajectory.degrees == 2
     assert composed([SPLIT, "trajectory=smooth"]).trajectory == composed([SPLIT]).trajectory
-
-
-def test_the_split_and_its_trajectory_are_one_run():
     assert described(composed([SPLIT])) == described(composed(["trajectory=validation"]))
     assert described(composed([SPLIT])) != described(composed([]))
-
-
-def test_the_budget_keeps_some_of_the_held_out_views():
-    assert composed([SPLIT, "budget.frames=5"]).trajectory.limit == 5
+    assert composed([SPLIT, "budget.frames=5"]).trajectory.limit == 5  # of the budget
 
 
 def test_a_scene_with_too_few_training_pictures_is_refused(run):

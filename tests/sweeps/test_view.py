@@ -16,7 +16,7 @@ from PIL import Image
 
 from sweeps import cli
 from sweeps.commands import view
-from sweeps.viewer import AS_GIVEN, Viewer
+from sweeps.commands.view import AS_GIVEN, Viewer
 
 from .conftest import STAND_INS
 
@@ -81,7 +81,7 @@ class Page:
 @contextmanager
 def browser(viewer: Viewer) -> Iterator[Page]:
     protocol = f"viser-v{viser.__version__}"
-    address = f"ws://127.0.0.1:{viewer.port}"
+    address = f"ws://127.0.0.1:{viewer.server.get_port()}"
     with client.connect(address, subprotocols=[protocol], max_size=None) as socket:
         yield Page(viewer, socket)
 
@@ -99,16 +99,6 @@ def opened(steerbench: Callable[..., Any], tmp_path: Path) -> Iterator[Callable[
     yield open_
     for viewer in viewers:
         viewer.stop()
-
-
-def test_a_browser_gets_a_picture_of_its_own_shape(opened):
-    viewer = opened("method.level=0.4")
-    height = viewer.first.height
-    with browser(viewer) as page:
-        page.look()
-        page.until(lambda: page.picture.size > 0)
-        assert page.picture.shape == (height, 2 * height, 3)
-        assert np.abs(page.picture - 102).max() <= 2  # JPEG
 
 
 def test_a_turned_knob_is_another_method(opened):
@@ -187,14 +177,17 @@ def test_a_picture_that_fails_is_named_and_the_next_is_drawn(opened, capfd):
         page.until(lambda: page.picture.size > 0)
 
 
-def test_two_browsers_get_their_own_pictures(opened):
-    viewer = opened()
+def test_browsers_get_pictures_of_their_own_shapes(opened):
+    viewer = opened("method.level=0.4")
+    rows = viewer.first.height
     with browser(viewer) as one, browser(viewer) as two:
         one.look()
         two.look()
-        two.choose("rows", 2 * viewer.first.height)
-        for page, height in ((one, viewer.first.height), (two, 2 * viewer.first.height)):
+        two.choose("rows", 2 * rows)
+        for page, height in ((one, rows), (two, 2 * rows)):
             page.until(lambda page=page, height=height: len(page.picture) == height)
+            assert page.picture.shape == (height, 2 * height, 3)
+            assert np.abs(page.picture - 102).max() <= 2  # JPEG
 
 
 def test_it_serves_this_machine_alone_unless_told_otherwise():

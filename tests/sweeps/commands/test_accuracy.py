@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 
 from bench.errors import SteerbenchError
 from bench.study import Study, Variant
+from sweeps import variants
 from sweeps.commands.accuracy import _last_words, decibels
-from sweeps.variants import Rendered
 
 EXACT = "method.rendering.skip.empty=false"
 
@@ -24,25 +24,20 @@ FIGURES = {"everything off": (100.0, 30.0), "as it is": (100.0, 30.0), "fast": (
 @pytest.fixture
 def measured(monkeypatch: pytest.MonkeyPatch) -> None:
     """`FIGURES`, in place of what the settings take and lose."""
-    variants = [Variant(name, (f"method.rendering.refined={ms / 100}",)) for name, (ms, _) in
-                list(FIGURES.items())[2:]]  # fmt: skip
+    turned = [Variant(name, (f"method.rendering.refined={ms / 100}",)) for name, (ms, _) in
+              list(FIGURES.items())[2:]]  # fmt: skip
+    study = Study({"share": turned[:2], "length": turned[2:]}, exact=(EXACT,))
+    where = {"scene": "totem", "trajectory": "orbit", "resolution": "8x8"}
     rows = [
         {"setting": name, "ms": ms, "ms_lo": ms, "ms_hi": ms, "psnr": psnr,
-         "psnr_to_first": 40.0 if index else math.inf}
+         "psnr_to_first": 40.0 if index else math.inf, **where}
         for index, (name, (ms, psnr)) in enumerate(FIGURES.items())
     ]  # fmt: skip
-
-    def rendered(lines: dict[str, object], *_: object) -> list[Rendered]:
-        there = [row for row in rows if row["setting"] in lines]
-        return [
-            Rendered(row["setting"], "grey", "totem", "orbit", "8x8", 2, study, {}, row)
-            for row in there
-        ]
-
-    study = Study({"share": variants[:2], "length": variants[2:]}, exact=(EXACT,))
-    monkeypatch.setattr("sweeps.commands.accuracy.declared", lambda config: study)
-    monkeypatch.setattr("sweeps.commands.accuracy.computes_with_engine", lambda config: False)
-    monkeypatch.setattr("sweeps.commands.accuracy.render_variants", rendered)
+    monkeypatch.setattr(variants, "declared", lambda config: study)
+    monkeypatch.setattr(variants, "engines", lambda words: [variants.AS_IT_IS])
+    monkeypatch.setattr(
+        variants, "render", lambda lines, *_: [row for row in rows if row["setting"] in lines]
+    )
     monkeypatch.setattr("sweeps.commands.accuracy.experiment_rows", lambda *arguments: [ERROR])
     monkeypatch.setattr("methods.checks.found", lambda name: [])
     monkeypatch.setattr("reports.tradeoff.frontier_plot", lambda rows, path: Figure().savefig(path))
@@ -59,8 +54,10 @@ def test_what_is_no_budget_is_refused(text):
         decibels(text)
 
 
-def test_the_last_line_has_every_row_as_json(steerbench, measured):
-    outcome = steerbench("accuracy")
+def test_every_row_is_printed_as_json_and_left_in_outputs_with_a_report(
+    steerbench, measured, tmp_path
+):
+    outcome = steerbench("accuracy", "outputs=here")
     assert outcome.status == 0
     found = json.loads(outcome.out.splitlines()[-1])
     assert found["kernels"] == [ERROR]
@@ -70,6 +67,8 @@ def test_the_last_line_has_every_row_as_json(steerbench, measured):
     assert settings["fast"]["lost"] == pytest.approx(0.1)
     assert settings["fast"]["instead"] == "fast"
     assert settings["poor"]["instead"] == "fast"
+    names = {path.name for path in (tmp_path / "here" / "accuracy").iterdir()}
+    assert names == {"report.md", "report.html", "pictures", "kernels.csv", "settings.csv"}
 
 
 @pytest.mark.parametrize(
@@ -92,14 +91,8 @@ def test_a_later_word_replaces_one_of_the_same_setting_and_no_folder():
     assert _last_words(words) == ["--config-dir=a", "seed=2", "--config-dir=b"]
 
 
-def test_a_report_a_plot_and_the_rows_are_left_in_outputs(steerbench, measured, tmp_path):
-    steerbench("accuracy", "outputs=here")
-    names = {path.name for path in (tmp_path / "here" / "accuracy").iterdir()}
-    assert names == {"report.md", "report.html", "pictures", "kernels.csv", "settings.csv"}
-
-
 def test_the_kernels_alone_train_and_render_nothing(steerbench, measured, monkeypatch):
-    monkeypatch.setattr("sweeps.commands.accuracy.render_variants", None)
+    monkeypatch.setattr(variants, "render", None)
     outcome = steerbench("accuracy", "--kernels")
     assert json.loads(outcome.out.splitlines()[-1]) == {"kernels": [ERROR], "settings": []}
 
@@ -107,7 +100,6 @@ def test_the_kernels_alone_train_and_render_nothing(steerbench, measured, monkey
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["--repeats", "0"], "--repeats: expected 1 or more, got 0"),
         (["--within", "much"], "--within: expected decibels, 0.1dB for example, got 'much'"),
         (["--filter", "colour"], "no knob has 'colour' in its name; expected part of one of share"),
         (["budget=demmo"], "Did you mean demo?"),

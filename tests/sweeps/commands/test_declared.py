@@ -29,20 +29,10 @@ def trained(name: str, *settings: str) -> dict[str, Any]:
     return {key: value for key, value in node.items() if key not in study(name).chosen}
 
 
-def variants(name: str) -> tuple[list[Variant], list[Variant]]:
-    """All settings of all knobs: those chosen after the training, those that need their own."""
-    found = study(name)
-    first, second = (
-        [variant for some in knobs.values() for variant in some]
-        for knobs in (found.knobs, found.trained)
-    )
-    return first, second
-
-
-@pytest.mark.parametrize("name", METHODS)
-def test_no_two_settings_have_one_name(name):
-    names = [variant.name for some in variants(name) for variant in some]
-    assert len(set(names)) == len(names)
+def variants(name: str, *kinds: str) -> list[Variant]:
+    """All settings of all knobs of these kinds."""
+    knobs = [each for kind in kinds for each in getattr(study(name), kind).values()]
+    return [variant for some in knobs for variant in some]
 
 
 @pytest.mark.slow
@@ -51,26 +41,24 @@ def test_one_training_serves_all_that_is_chosen_afterwards(name):
     found = study(name)
     off = [Variant(words, (f"{setting}=false",)) for words, setting in found.skips.items()]
     exact = Variant("everything off", found.exact)
-    for variant in (*variants(name)[0], *found.savings, *off, exact):
+    for variant in (*variants(name, "knobs"), *found.savings, *off, exact):
         assert trained(name, *variant.settings) == trained(name), variant.name
 
 
 @pytest.mark.parametrize("name", METHODS)
 def test_other_knobs_need_a_training_each(name):
     trainings = [trained(name)]
-    for variant in variants(name)[1]:
+    for variant in variants(name, "trained"):
         trainings.append(trained(name, *variant.settings))
         assert trainings.count(trainings[-1]) == 1, variant.name
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_what_is_chosen_afterwards_is_a_setting_of_the_method(name):
-    assert set(study(name).chosen) <= composed([f"method={name}"]).method.keys()
-
-
-@pytest.mark.parametrize("name", METHODS)
-def test_axes_and_other_methods_can_be_set(name):
+def test_what_is_declared_can_be_set_and_has_names_of_its_own(name):
     found = study(name)
+    names = [variant.name for variant in variants(name, "knobs", "trained")]
+    assert len(set(names)) == len(names)
+    assert set(found.chosen) <= composed([f"method={name}"]).method.keys()
     for axis in found.axes.values():
         for value in axis.values:
             composed([f"method={name}", f"{axis.setting}={value}"])

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import json
+import math
 from typing import Any
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
+from bench.errors import SteerbenchError, Unavailable
 from bench.study import Study
-from sweeps.variants import engines
+from sweeps.commands.scaling import growth
+from sweeps.overrides import engine_kinds
+from sweeps.variants import fitted
 from tests.sweeps.conftest import STAND_INS, Outcome
 
 FRAMES = ["--frames", "2", "--repeats", "1"]
+TORCH = [f"torch, {precision}" for precision in engine_kinds(())["torch"].precisions]
 
 
 @pytest.fixture
@@ -62,22 +69,16 @@ def test_accuracy_renders_a_method_without_knobs_as_it_is_and_says_so(study):
 
 def test_skips_shows_the_work_with_each_skip_alone(study):
     found = {row["skipped"]: row for row in rows(study("skips", "shades"))}
-    halves = {name: row["halves"] for name, row in found.items()}
-    assert halves == {
-        "nothing": 2,
-        "left half": 1,
-        "right half": 1,
-        "all of these": 0,
-        "and half as bright": 0,
-    }
+    halves = {"nothing": 2, "left half": 1, "right half": 1}
+    halves |= {"all of these": 0, "and half as bright": 0}
+    assert {name: row["halves"] for name, row in found.items()} == halves
     assert found["and half as bright"]["lost"] > 0
 
 
 def test_breakdown_divides_the_frame_and_names_every_line(study):
     found = {row["line"]: row for row in rows(study("breakdown", "shades", "method.level=0.3"))}
     ends = ("", ", nothing skipped", ", a twin")
-    lines = [variant.name + end for end in ends for variant in engines() if "torch" in variant.name]
-    assert list(found) == [*lines, "plain grey"]
+    assert list(found) == [*(line + end for end in ends for line in TORCH), "plain grey"]
     for row in found.values():
         assert sum(row["parts"].values()) == pytest.approx(row["frame_ms"])
     assert set(found["torch, fp32"]["parts"]) == {"painting", "varnish", "other"}
@@ -132,8 +133,10 @@ NO_GPU = pytest.mark.skipif(torch.cuda.is_available(), reason="for a machine wit
         (("skips", "grey"), "stand_ins.Grey declares nothing in `study.skips`"),
         (("parity", "grey"), "expected a method with the setting method.engine"),
         pytest.param(("breakdown", "grey", "--device-waits"), "a GPU is needed", marks=NO_GPU),
+        (("scaling", "shades", "engine=openvino"), "--axis threads: expected engine=torch"),
+        (("scaling", "shades", "--axis=width"), "unknown axis 'width'"),
     ],
-    ids=lambda x: x[0],
+    ids=lambda x: " ".join(x) if isinstance(x, tuple) else "",
 )
 def test_what_cannot_be_studied_is_refused(study, argv, message):
     outcome = study(*argv)
@@ -166,19 +169,75 @@ def test_scaling_has_pixels_and_threads_for_every_method(study):
     assert {row["axis"] for row in found} == {"pixels", "threads"}
 
 
+@given(power=st.floats(-3, 3), factor=st.floats(1e-3, 1e3))
+def test_the_exponent_of_a_power_is_found(power, factor):
+    rows = [{"value": value, "ms": factor * value**power} for value in (1.0, 4.0, 9.0, 100.0)]
+    assert growth(rows, "ms") == pytest.approx(power, abs=1e-9)
+
+
+def test_a_value_of_0_is_left_out_and_a_single_one_has_no_exponent():
+    rows = [{"value": value, "ms": 5.0 + value} for value in (0.0, 1.0, 7.0)]
+    assert growth(rows, "ms") == pytest.approx(math.log(2) / math.log(7))
+    assert math.isnan(growth([{"value": 2.0, "ms": 1.0}, {"value": 2.0, "ms": 2.0}], "ms"))
+
+
+def test_a_stage_is_counted_with_the_innermost_that_is_declared():
+    study = Study(parts={"renderer": "renderer", "renderer/network": "network"})
+    parts = map(study.part_of, ("renderer/other", "renderer/network/layer", "some stage/inside"))
+    assert list(parts) == ["renderer", "network", "some stage/inside"]
+
+
+# Variants on common ground
+
+ABSENT = 0.9
+"""The level of a grey that cannot be used."""
+
+
+@pytest.fixture
+def trained(elsewhere: None, monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The levels of the greys that were fitted."""
+    import stand_ins
+
+    levels: list[float] = []
+    make = stand_ins.Grey.__init__
+
+    def made(self, seed: int, device: str, backend: str, level: float) -> None:
+        if level == ABSENT:
+            raise Unavailable("it is not installed")
+        make(self, seed, device, backend, level)
+
+    monkeypatch.setattr(stand_ins.Grey, "__init__", made)
+    monkeypatch.setattr(stand_ins.Grey, "fit", lambda self, *_: levels.append(self.level))
+    return levels
+
+
+def greys(*levels: float, more: tuple[str, ...] = ()) -> dict[str, list[str]]:
+    return {str(level): [*STAND_INS, f"method.level={level}", *more] for level in levels}
+
+
+def test_what_cannot_be_used_is_left_out_unless_it_is_the_first(trained):
+    with fitted(greys(0.1, ABSENT, 0.3), 2) as (methods, _, _):
+        assert list(methods) == ["0.1", "0.3"]
+    assert trained == [0.1, 0.3]
+    with pytest.raises(Unavailable), fitted(greys(ABSENT, 0.3), 2):
+        pass
+
+
 @pytest.mark.parametrize(
-    ("stage", "part"),
+    ("memory", "more", "message"),
     [
-        ("field", "field"),
-        ("field/march", "field"),
-        ("renderer", "renderer"),
-        ("renderer/network", "network"),
-        ("renderer/network/layer", "network"),
-        ("renderer/other", "renderer"),
-        ("some stage", "some stage"),
-        ("some stage/inside", "some stage/inside"),
+        (2, (), "give more frames"),
+        (0, ("+protocol.memory=cold", "protocol.name=cold"), r"protocol\.memory: expected steady"),
     ],
 )
-def test_a_stage_is_counted_with_the_innermost_that_is_declared(stage, part):
-    parts = {"field": "field", "renderer": "renderer", "renderer/network": "network"}
-    assert Study(parts=parts).part_of(stage) == part
+def test_what_cannot_be_compared_is_refused_at_once(trained, monkeypatch, memory, more, message):
+    monkeypatch.setattr("stand_ins.Grey.memory", memory)
+    with pytest.raises(SteerbenchError, match=message), fitted(greys(0.1, more=more), 2):
+        pass
+    assert trained == []
+
+
+def test_pictures_too_small_for_lpips_are_not_refused_where_it_is_not_computed(trained):
+    with fitted(greys(0.1, more=("protocol=steerbench-1",)), 1) as (_, ground, _):
+        assert len(ground.trajectory.steps) == 1
+        assert ground.protocol.lpips == ()

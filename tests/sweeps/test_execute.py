@@ -1,28 +1,71 @@
-"""Trainings side by side: how many, which of them, and that measurements find them again."""
+"""How jobs end and what they leave behind; trainings side by side, which measurements find."""
 
 from __future__ import annotations
 
 import os
-from concurrent.futures import Future
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import pytest
 
 from bench.errors import SteerbenchError
-from sweeps import train_ahead
+from sweeps import execute
+from sweeps.commands.run import label
+from sweeps.execute import Ended, read
+from sweeps.measurement import Job
 from sweeps.overrides import composed
-from sweeps.plan import Planned, chosen, plan
-from tests.sweeps.conftest import HERE
+from sweeps.plan import chosen, plan
+from tests.sweeps.conftest import HERE, STAND_INS
 
 TABLES = {table.name: replace(table, curve=False) for table in chosen(None, [])}
+
+
+def test_jobs_are_read_as_they_were_written_in_the_order_of_the_sweep(tmp_path):
+    job = Ended(0, "ngp", "outputs", None, begun=1.0)
+    ended = [replace(job, number=number, run=f"run {number}") for number in range(12)]
+    for each in reversed(ended):
+        each.write(tmp_path)
+    assert read(tmp_path) == ended
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["method"], "ngp"),
+        (["scene.seed", "seed"], "ngp (scene.seed=1, seed=2)"),
+        (["scene.seed", "elsewhere"], "ngp (seed=1)"),
+    ],
+)
+def test_a_label_has_method_and_what_varies_by_whole_names_where_ends_are_alike(names, expected):
+    words = ("+experiment=demo", "scene.seed=1", "seed=2", "method=ngp")
+    assert label("ngp", words, names) == expected
+
+
+def test_a_failure_that_cannot_be_kept_is_printed_all_the_same(tmp_path, monkeypatch, capsys):
+    def obtain(jobs: list[Job]) -> None:
+        raise SteerbenchError("the cause")
+
+    runtime = SimpleNamespace(output_dir=str(tmp_path / "sweep"))
+    monkeypatch.setattr(execute.HydraConfig, "get", lambda: SimpleNamespace(runtime=runtime))
+    monkeypatch.setattr(execute, "obtain", obtain)
+    (tmp_path / "outputs").touch()  # no folder can be made there
+    job = Job(composed([f"outputs={tmp_path / 'outputs'}"]), [], "a job")
+    with pytest.raises(SteerbenchError, match="the cause"):
+        execute.attempt([job], 0, 1)
+    printed = capsys.readouterr().err
+    assert "failed: a job: the cause" in printed
+    assert "cannot write to" in printed
+
+
+# Trainings side by side
 
 
 @cache
 def trainings(name: str) -> set[str]:
     """The different ones of the jobs of a table with one seed; composing them takes seconds."""
     jobs = plan(TABLES[name], ["budget=paper", "seed=0"])
-    return {train_ahead._training(job) for job in jobs}
+    return {execute._training(job) for job in jobs}
 
 
 def test_what_is_chosen_afterwards_is_no_training_of_its_own():
@@ -35,25 +78,22 @@ def test_what_is_chosen_afterwards_is_no_training_of_its_own():
 def test_nothing_is_trained_for_a_line_whose_fellow_is_measured(monkeypatch):
     """Say one that fails each time, at a precision that this CPU does not have."""
     jobs = plan(replace(TABLES["table5"], beyond=None), ["budget=paper", "seed=0,1"])
-    monkeypatch.setattr(train_ahead, "room", lambda config: 2)
-    monkeypatch.setattr(train_ahead, "processes", None)  # it would be called
-    train_ahead.train_ahead(jobs, {job.key for job in jobs})
+    monkeypatch.setattr(execute, "room", lambda config: 2)
+    monkeypatch.setattr(execute, "processes", None)  # it would be called
+    execute.train_ahead(jobs, {job.key for job in jobs})
 
 
 def test_a_method_that_declares_nothing_is_trained_for_each_of_its_settings(monkeypatch):
     """A plug-in may train with a setting that others choose afterwards."""
     monkeypatch.syspath_prepend(HERE)
-    words = [f"--config-dir={HERE / 'configs'}", "method=grey", "scene=white"]
-    configs = [composed([*words, f"+method.stop={stop}"]) for stop in (0.1, 0.2)]
-    jobs = [Planned("table1", "", "grey", config, []) for config in configs]
-    assert len({train_ahead._training(job) for job in jobs}) == 2
+    configs = [composed([*STAND_INS, f"+method.stop={stop}"]) for stop in (0.1, 0.2)]
+    assert len({execute._training(Job(config, [])) for config in configs}) == 2
 
 
 @pytest.mark.parametrize(("name", "lines"), [("table3", 4), ("table4", 3), ("table5", 2)])
 def test_each_line_of_an_ablation_is_a_training_of_its_own(name, lines):
-    whole = replace(TABLES[name], beyond=None)
-    jobs = plan(whole, ["budget=paper", "seed=0,1"])
-    assert len({train_ahead._training(job) for job in jobs}) == 2 * lines
+    jobs = plan(replace(TABLES[name], beyond=None), ["budget=paper", "seed=0,1"])
+    assert len({execute._training(job) for job in jobs}) == 2 * lines
 
 
 @pytest.mark.parametrize(
@@ -63,13 +103,7 @@ def test_each_line_of_an_ablation_is_a_training_of_its_own(name, lines):
 def test_there_are_as_many_at_a_time_as_cores_have_room_for(threads, device, together, monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(6)))
     config = composed([f"budget.threads={threads}", f"device={device}"])
-    assert train_ahead.room(config) == together
-
-
-def test_a_failed_training_says_why():
-    ended: Future[float] = Future()
-    ended.set_exception(SteerbenchError("no room\nfor it"))
-    assert train_ahead._said(ended) == "failed: no room for it"
+    assert execute.room(config) == together
 
 
 SMALL = [
