@@ -11,7 +11,7 @@ from itertools import compress
 from omegaconf import DictConfig
 
 from bench.accuracy import steady_frames
-from bench.probes import OTHER
+from bench.probes import OTHER, Line, device_waits
 from bench.study import Study
 from bench.types import NullProbe
 from reports.tables import Table, decimal, spread

@@ -15,14 +15,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from omegaconf import DictConfig
-from reports.scenes import over_scenes
 
 from bench.errors import SteerbenchError, Unavailable
 from bench.results import Store
 from reports import export
 from reports.outliers import outlier_table, outliers
 from reports.paper_page import write_paper_page
-from reports.runs import Repeated, Run, over_common_frames, readable
+from reports.runs import Repeated, Run, over_common_frames, over_scenes, readable
 from sweeps.configured import scene_digest, scene_folder
 from sweeps.execute import Launcher, attempt, divided, room, say, train_ahead
 from sweeps.measurement import job_key, stored

@@ -20,7 +20,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench import paths
 from bench.cameras import pack_camera
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable, install_command
@@ -232,7 +231,7 @@ class Viewer:
         self.folder.mkdir(parents=True, exist_ok=True)
         numbered = (self.folder / f"path-{number}.json" for number in count(1))
         file = next(path for path in numbered if not path.exists())
-        paths.write(file, cameras, self.scene)
+        write_path(file, cameras, self.scene)
         note = f"{len(cameras)} views: trajectory=path trajectory.path={file}"
         self.log.info(note)
         browser.client.add_notification("path saved", note)

@@ -13,7 +13,7 @@ from types import MappingProxyType
 
 import pytest
 
-from bench import sources
+from bench import provenance
 from sweeps import execute
 from sweeps.measurement import obtain
 from sweeps.overrides import PLUG_INS, plug_ins
@@ -78,7 +78,7 @@ def test_a_change_in_a_module_is_a_new_run_of_a_new_process(call, folder, tmp_pa
             file.write("# changed\n")
         refused = call("run", "method=mine", *SMALL)
         assert f"mine/{name} was changed while this process runs" in refused.err
-        monkeypatch.setattr(sources, "_first", {})  # as a new process
+        monkeypatch.setattr(provenance, "_first", {})  # as a new process
         assert call("run", "method=mine", *SMALL).status == 0
         assert len(keys(tmp_path)) == number
 
