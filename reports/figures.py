@@ -215,7 +215,8 @@ def _circle(axes: Axes, rows: pd.DataFrame, column: str) -> None:
     """Circle the points of `rows`, and name each on its left unless another name is there."""
     style: dict[str, Any] = {"textcoords": "offset points", "size": 8, "ha": "right", "va": "top"}
     names: list[np.ndarray] = []
-    for setting, *place in zip(rows["setting"], rows["ms"], _rms(rows[column]), strict=True):
+    for setting, ms, error in zip(rows["setting"], rows["ms"], _rms(rows[column]), strict=True):
+        place = (ms, error)
         axes.plot(*place, "o", markersize=11, fillstyle="none", color="black")
         on_page = axes.transData.transform(place)
         if all((abs(on_page - other) > NAME_SIZE).any() for other in names):

@@ -104,14 +104,15 @@ def _values(rows: pd.DataFrame, prefix: str = "") -> dict[str, float]:
 
 
 def _quality(rows: pd.DataFrame, suffix: str) -> Table:
-    figures = rows.set_index("metric")
+    columns = (rows[name] for name in ("metric", "value", "lo", "hi", "n"))
+    figures = {metric: of for metric, *of in zip(*columns, strict=True)}
     lines = []
     for metric, (label, decimals) in QUALITY.items():
-        if metric in figures.index:
-            value, low, high = figures.loc[metric, ["value", "lo", "hi"]]
+        if metric in figures:
+            value, low, high, _ = figures[metric]
             interval = spread(low, high, decimals) if math.isfinite(low) else ""
             lines.append((label, decimal(value, decimals), interval))
-    title = f"Quality{suffix}, mean of {figures['n']['psnr']} frames"
+    title = f"Quality{suffix}, mean of {figures['psnr'][-1]} frames"
     return Table(title, ("metric", "mean", "95 % interval"), tuple(lines))
 
 
