@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -90,6 +89,6 @@ def pad(samples: Tensor) -> Tensor:
     return functional.pad(samples, (0, 0) * (samples.dim() - 1) + (0, padding))
 
 
-def cat(parts: Sequence[Tensor]) -> Tensor:
+def cat(parts: tuple[Tensor, ...] | list[Tensor]) -> Tensor:
     """`torch.cat` of one or more tensors; a single one is not copied."""
     return parts[0] if len(parts) == 1 else torch.cat(parts)
