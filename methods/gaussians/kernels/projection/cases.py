@@ -102,14 +102,15 @@ def _given(count: int) -> Given:
 
 
 def _slopes_error(backend: str, device: str, precision: str) -> float:
-    *drawn, camera = placed(_given(1000), device).values()
-    drawn = [x.to(DTYPES[precision]) for x in drawn]
-    pixels, depth = project(camera, drawn[0])
+    drawn = placed(_given(1000), device)
+    camera = drawn.pop("camera")
+    drawn = {name: x.to(DTYPES[precision]) for name, x in drawn.items()}
+    pixels, depth = project(camera, drawn["means"])
     size = pixels.new_tensor((camera.width, camera.height))
-    seen = (depth > 0.1) & ((pixels > 0) & (pixels < size)).all(dim=1) & (drawn[3] > 0.01)
-    drawn = [x[seen] for x in drawn]
-    ellipses = project_gaussians(*drawn, camera, backend=backend)
-    means, scales, rotations, opacities = (x.double().cpu() for x in drawn)
+    seen = (depth > 0.1) & ((pixels > 0) & (pixels < size)).all(dim=1) & (drawn["opacities"] > 0.01)
+    drawn = {name: x[seen] for name, x in drawn.items()}
+    ellipses = project_gaussians(**drawn, camera=camera, backend=backend)
+    means, scales, rotations, opacities = (x.double().cpu() for x in drawn.values())
 
     def centre(point: Tensor) -> Tensor:
         return project(CAMERA, point[None])[0][0]
@@ -142,9 +143,9 @@ def _shown(changed: dict[str, float], backend: str, device: str, precision: str)
     place = CAMERA.c2w[:, 3] + changed.get("depth", 1.0) * CAMERA.c2w[:, 2]
     scales = torch.full((1, 3), changed.get("scale", 0.01), **how)
     given = place[None].to(**how), scales, torch.tensor([[1.0, 0, 0, 0]], **how)
-    learned = [x.requires_grad_() for x in given]
-    opacity = torch.tensor([changed.get("opacity", 0.5)], **how)
-    found = project_gaussians(*learned, opacity, placed(CAMERA, device), backend=backend)
+    means, scales, rotations = learned = [x.requires_grad_() for x in given]
+    opacity, camera = torch.tensor([changed.get("opacity", 0.5)], **how), placed(CAMERA, device)
+    found = project_gaussians(means, scales, rotations, opacity, camera, backend=backend)
     slopes = torch.autograd.grad(found.centres.sum() + found.conics.sum(), learned)
     wrong = found.extents.count_nonzero() + sum((~x.isfinite()).sum() for x in slopes)
     return float(wrong)
