@@ -20,7 +20,7 @@ from sweeps.variants import Row
 
 USUAL = (variants.METHOD, "trajectory=smooth")
 COMPARED = ("PSNR to the first, dB ↑", "PSNR, dB ↑", "lost, dB ↓", "frame, ms ↓", "of rounds")
-OF_ENGINES = ("p99 / p50 ↓", "worst pixel ↓", "network, ms ↓", "network, MB ↓")
+OF_ENGINES: tuple[str, ...] = ("p99 / p50 ↓", "worst pixel ↓", "network, ms ↓", "network, MB ↓")
 
 
 def main(options: argparse.Namespace) -> int:
@@ -44,10 +44,11 @@ def main(options: argparse.Namespace) -> int:
     rendered = variants.render(wanted, options, launcher)
     first = rendered[0]
     title, work = f"{first['method']}, {first['frames']} frames", _work(first)
-    label, columns = ("engine", ("engine, precision", *COMPARED, *OF_ENGINES))
+    label, first_column, further = "engine", "engine, precision", OF_ENGINES
     if not parity:
         title += ": mean work of a frame, and its share"
-        label, columns = "skipped", ("skipped", *COMPARED, *(x.replace("_", " ") for x in work))
+        label = first_column = "skipped"
+        further = tuple(name.replace("_", " ") for name in work)
     rows, lines = [], []
     for each in rendered:
         own, cells = _of_engine(each, study) if parity else _of_skip(each, work)
@@ -61,7 +62,7 @@ def main(options: argparse.Namespace) -> int:
         }
         rows.append(row)
         lines.append((row[label], *_compared(row), *cells))
-    show(Table(title, columns, tuple(lines)))
+    show(Table(title, (first_column, *COMPARED, *further), tuple(lines)))
     print_rows(rows)
     return 0
 
