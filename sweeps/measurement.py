@@ -62,19 +62,12 @@ def reason(error: BaseException) -> str:
 
 @dataclass(frozen=True)
 class Job:
-    """A run that is wanted.
+    """A run that is wanted. Jobs with the same `turns` are measured in turns: they share scene,
+    trajectory, protocol and seed; a job without `turns` is measured alone."""
 
-    Attributes:
-        config: the composed run.yaml.
-        command: the words of the command line that makes it alone, for the record.
-        name: its name at the terminal.
-        turns: jobs with the same `turns` are measured in turns: they share scene, trajectory,
-            protocol and seed. If it is empty, the job is measured alone.
-    """
-
-    config: DictConfig
-    command: Sequence[str]
-    name: str = ""
+    config: DictConfig  # the composed run.yaml
+    command: Sequence[str]  # the words that make it alone, for the record
+    name: str = ""  # at the terminal
     turns: str = ""
 
     @cached_property

@@ -132,19 +132,12 @@ def offsets_of(counts: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Intervals:
-    """The positions of samples on R rays, ray by ray, front to back.
+    """The positions of samples on R rays, ray by ray, front to back."""
 
-    Attributes:
-        t: [S] position along the ray (z-depth for rays of `bench.cameras.cast`).
-        delta: [S] length of the interval a sample represents, scene units.
-        offsets: [R + 1] int64, ray r owns samples offsets[r] to offsets[r + 1].
-        longest: samples of the ray that has the most, or more than that; None: unknown, it follows
-            from `offsets`.
-    """
-
-    t: Tensor
-    delta: Tensor
-    offsets: Tensor
+    t: Tensor  # [S] position along the ray (z-depth for rays of `bench.cameras.cast`)
+    delta: Tensor  # [S] length of the interval a sample represents, scene units
+    offsets: Tensor  # [R + 1] int64, ray r owns samples offsets[r] to offsets[r + 1]
+    # Samples of the ray that has the most, or more than that; None: unknown, as `offsets` say.
     longest: int | None = field(default=None, kw_only=True)
     of_a_sample: ClassVar[tuple[str, ...]] = "t", "delta"  # what has a row for each sample
 
@@ -169,19 +162,12 @@ class Intervals:
 
 @dataclass(frozen=True)
 class Samples(Intervals):
-    """Samples of R rays, ray by ray, front to back.
+    """Samples of R rays, ray by ray, front to back."""
 
-    Attributes:
-        ray: [S] int32, the ray that a sample belongs to.
-        positions: [S, 3] in the unit cube.
-        resume: [R] int32, the step to resume from; -1 if the ray has no more samples.
-        encoded: [S, E] encoding of the positions by a field; None: unknown.
-    """
-
-    ray: Tensor
-    positions: Tensor
-    resume: Tensor
-    encoded: Tensor | None = field(default=None, kw_only=True)
+    ray: Tensor  # [S] int32, the ray that a sample belongs to
+    positions: Tensor  # [S, 3] in the unit cube
+    resume: Tensor  # [R] int32, the step to resume from; -1 if the ray has no more samples
+    encoded: Tensor | None = field(default=None, kw_only=True)  # [S, E] positions, by a field
     of_a_sample: ClassVar[tuple[str, ...]] = "t", "delta", "ray", "positions", "encoded"
 
     def chosen(self, index: Tensor, offsets: Tensor, longest: int | None) -> Self:

@@ -36,14 +36,10 @@ class Voxels:
 
     A two-level tree with branching 8^3: a map of bricks of 8^3 cells, and the cells of the bricks
     that contain any voxel. Both hold int32 numbers, -1 for empty.
-
-    Attributes:
-        coordinates: [V, 3] integers from 0 to G - 1, distinct (x, y, z); row v is voxel v.
-        resolution: G, a multiple of 8, at most `MAX_RESOLUTION`.
     """
 
-    coordinates: Tensor
-    resolution: int
+    coordinates: Tensor  # [V, 3] integers from 0 to G - 1, distinct (x, y, z); row v is voxel v
+    resolution: int  # G, a multiple of 8, at most `MAX_RESOLUTION`
 
     def __post_init__(self) -> None:
         coordinates, size = self.coordinates, self.resolution
@@ -108,18 +104,12 @@ class Crossings(Intervals):
     """Parts of R rays inside voxels, ray by ray, front to back.
 
     `t` is the middle of each, `delta` its world length; see `Intervals`.
-
-    Attributes:
-        near: [S] t where the ray enters the voxel.
-        far: [S] t where it leaves; for touching voxels it equals `near` of the next one.
-        ray: [S] int32, the ray that a crossing belongs to.
-        voxel: [S] int32 row of `Voxels.coordinates`.
     """
 
-    near: Tensor
-    far: Tensor
-    ray: Tensor
-    voxel: Tensor
+    near: Tensor  # [S] t where the ray enters the voxel
+    far: Tensor  # [S] t where it leaves; for touching voxels it equals `near` of the next one
+    ray: Tensor  # [S] int32, the ray that a crossing belongs to
+    voxel: Tensor  # [S] int32 row of `Voxels.coordinates`
     of_a_sample: ClassVar[tuple[str, ...]] = "t", "delta", "near", "far", "ray", "voxel"
 
 
