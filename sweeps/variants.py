@@ -56,15 +56,10 @@ def render(
 ) -> list[Row]:
     """Render the first `options.frames` of the trajectory with all usable variants in turns.
 
-    Stages are trained unless they are stored already. `options.repeats` rounds are timed.
-
-    Args:
-        variants: by name, the words of each variant, as for `steerbench run`. Scene, trajectory and
-            protocol are those of the first one, which must be usable here.
-
-    Returns:
-        The rows of `bench.accuracy.render_in_turns`, with the names of method, scene, trajectory
-        and resolution, the number of `frames`, and as bytes.* the sizes of the method.
+    `variants` are words as for `steerbench run`, by name. Scene, trajectory and protocol are those
+    of the first one, which must be usable here. Stages are trained unless they are stored already;
+    `options.repeats` rounds are timed. Returns the rows of `bench.accuracy.render_in_turns`, with
+    method, scene, trajectory, resolution, number of `frames` and, as bytes.*, sizes of the method.
     """
     work = partial(_rendered, frames=options.frames, repeats=options.repeats)
     (rows,) = launcher.run(work, [variants])

@@ -43,17 +43,12 @@ def score(
     match: given.Match = "name",
     sequence: bool = False,
 ) -> Run:
-    """Score a folder of pictures against true ones, as `steerbench score` does.
+    """Score a folder of pictures, as `steerbench score` does, against the folder `truth` or, without
+    it, the split of the scene in `settings`, which are those of `steerbench run`.
 
-    Args:
-        truth: the folder of true pictures; None: the split of the scene in `settings`.
-        settings: as for `steerbench run`: protocol, scene, split, outputs, pictures, tracker.
-        name: name of the method in the rows; None: the name of the folder.
-        match: how pictures are matched to true ones: by "name" or by "order".
-        sequence: whether the pictures are consecutive frames, so that flicker is scored, too.
-
-    Raises:
-        SteerbenchError: a setting is wrong; pictures are missing, damaged or of another size.
+    Rows show `name`, or else that of the folder. Pictures are matched to true ones by "name" or by
+    "order". Those of a `sequence` are consecutive frames: their flicker is scored, too. Raises
+    SteerbenchError if a setting is wrong, or a picture missing, damaged or of another size.
     """
     folder, config = Path(pictures), composed(settings)
     plain = checked_settings(config)

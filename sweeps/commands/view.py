@@ -83,12 +83,9 @@ def opened(options: argparse.Namespace) -> Viewer:
 class Viewer:
     """Serves the page and renders until it is stopped.
 
-    Args:
-        wanted: the words of one method, as for `steerbench run`, or of two to compare. The first
-            ones choose the scene, the first camera and the folder of outputs.
-
-    Raises:
-        SteerbenchError: viser is not installed, or the address cannot be served.
+    `wanted` are the words of one method, as for `steerbench run`, or of two to compare; the first
+    ones choose the scene, the first camera and the folder of outputs. Raises SteerbenchError if
+    viser is not installed, or the address cannot be served.
     """
 
     def __init__(self, wanted: Sequence[Sequence[str]], host: str, port: int) -> None:
