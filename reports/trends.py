@@ -31,21 +31,16 @@ class Trend:
 
 @dataclass(frozen=True)
 class Difference:
-    """The growth of a metric from one line of a trend to the next.
-
-    `paper` is that in the paper (nan if the paper does not give both figures), `by` the mean here,
-    over what `over` says, and `half` half its 95 % interval (nan if unknown). `proves` says whether
-    the interval accounts for differences between trainings.
-    """
+    """The growth of a metric from one line of a trend to the next."""
 
     metric: str
     smaller: str
     larger: str
-    paper: float
-    by: float
-    half: float
+    paper: float  # in the paper; nan if it does not give both figures
+    by: float  # the mean here, over what `over` says
+    half: float  # half its 95 % interval; nan if unknown
     over: str
-    proves: bool
+    proves: bool  # whether the interval accounts for differences between trainings
 
     @property
     def verdict(self) -> str:

@@ -43,7 +43,7 @@ def score(
     match: given.Match = "name",
     sequence: bool = False,
 ) -> Run:
-    """Score a folder of pictures, as `steerbench score` does, against the folder `truth` or, without
+    """Score a folder of pictures as `steerbench score` does: against the folder `truth` or, without
     it, the split of the scene in `settings`, which are those of `steerbench run`.
 
     Rows show `name`, or else that of the folder. Pictures are matched to true ones by "name" or by
