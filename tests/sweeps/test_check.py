@@ -89,7 +89,7 @@ def test_what_is_no_baseline_is_refused_with_the_way_to_make_one(text, outputs, 
 def test_two_runs_are_compared_by_the_beginning_of_their_keys(outputs, stored_run, capsys):
     assert dispatch(["compare", stored_run[:6], stored_run, "--outputs", str(outputs)]) == 0
     assert "psnr" in capsys.readouterr().out
-    with pytest.raises(SteerbenchError, match="expected the beginning of one key, 0 runs"):
+    with pytest.raises(SteerbenchError, match="the beginning of one key, got 0 runs"):
         dispatch(["compare", "nothing", stored_run, "--outputs", str(outputs)])
 
 
