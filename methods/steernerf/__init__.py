@@ -1,1 +1,1 @@
-"""SteerNeRF (Li et al. 2022), in the order of Section 3 of the paper."""
+"""SteerNeRF (Li et al. 2022): pipeline, buffer and unet render; patches and stage2 train them."""

@@ -18,7 +18,7 @@ from bench.types import Camera
 from methods.rendering.frame import FeatureFrame
 from methods.steernerf.kernels.splat import splat
 
-CLEAR_ALPHA = 0.1  # the expected depth of a pixel is reliable if its opacity is more than this
+RELIABLE_ALPHA = 0.1  # the expected depth of a pixel is reliable if its opacity is more than this
 
 
 @dataclass(frozen=True)
@@ -35,27 +35,27 @@ class Cloud:
     def of(cls, frame: FeatureFrame) -> Cloud:
         """Unproject the pixels of `frame`."""
         camera, alpha = frame.camera, frame.alpha.flatten()
-        depth = frame.depth.flatten().nan_to_num(posinf=0) * alpha
+        depth = frame.depth.flatten().nan_to_num(posinf=0) * alpha  # sum w t again; inf where empty
         depth = torch.where(alpha > 0, depth, 0) + 1e-12
         corners = pixel_grid(camera.width, camera.height, alpha.device) - 0.5
         points = unproject(camera, corners, depth)  # Eq. 6
         return cls(camera, points, frame.values.flatten(0, 1), alpha)
 
     @property
-    def clear(self) -> Tensor:
+    def reliable(self) -> Tensor:
         """[N] bool, which points have a reliable expected depth."""
-        return self.alpha > CLEAR_ALPHA
+        return self.alpha > RELIABLE_ALPHA
 
     def expected(self) -> Cloud:
-        """The same with depths sum w t / sum w; no view sees points that are not clear."""
-        alpha, centre = torch.where(self.clear, self.alpha, torch.nan), self.camera.c2w[:, 3]
+        """The same with depths sum w t / sum w; no view sees points that are not reliable."""
+        alpha, centre = torch.where(self.reliable, self.alpha, torch.nan), self.camera.c2w[:, 3]
         return replace(self, points=centre + (self.points - centre) / alpha[:, None])
 
     def splat(self, camera: Camera, backend: str) -> tuple[Tensor, Tensor]:
         """The point that each pixel of `camera` shows, as [H, W] int32 indices, -1 for none; and
         the z-depth [N] of all points."""
         pixels, depth = project(camera, self.points)  # Eq. 7 at low resolution, Eq. 9 at full
-        size = camera.width, camera.height
+        size = camera.width, camera.height  # + 0.5: corners are rounded to the nearest one
         return splat(pixels + 0.5, depth, *size, backend=backend), depth  # Eq. 8, Eq. 10
 
     def interval(self, camera: Camera, epsilon: float, backend: str) -> Tensor:

@@ -104,12 +104,14 @@ class SteerNerf:
         device: str = "auto",
         seed: int = 0,
     ) -> None:
-        mode, off = rendering.range.mode, "off without preceding frames (L = 0)"
-        expect(model.frames > 0 or mode == "off", "rendering.range.mode", off, mode)
+        mode, possible = rendering.range.mode, "off without preceding frames (L = 0)"
+        expect(model.frames > 0 or mode == "off", "rendering.range.mode", possible, mode)
         self.stage2 = self.kind(model, renderer, joint, after)
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
         engine.check(self.setup.device)
-        with torch.random.fork_rng(devices=[]):  # it refuses what it cannot do before a training
+        with torch.random.fork_rng(
+            devices=[]
+        ):  # refuses what it cannot do before hours of training
             self.stage2.make(self.setup)
         self.rendering, self.engine, self.name = rendering, engine, name
         self.steps, self.train_s = steps, 0.0

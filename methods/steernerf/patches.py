@@ -110,12 +110,13 @@ class Examples:
         options, frames = self.options, self.pipeline.model.frames
         if old and old.lasting:
             number, buffer = old.number, old.buffer.copy()
-            back = self._before(number)
+            back = self._before(number)  # half of it and back: the view is again the last frame
             back = back[len(back) // 2 :]
             path = [self.cameras[number], *reversed(back), *back[1:]]
         else:
-            further = self._chance() < options.distilled_share and self._distilled
-            number = self._real + self.random(further) if further else self.random(self._real)
+            distilled = self._chance() < options.distilled_share and self._distilled > 0
+            number = self.random(self._distilled if distilled else self._real)
+            number += self._real if distilled else 0
             path, buffer = self._before(number), Buffer(maxlen=frames)
         if frames:
             for camera in path:
@@ -235,7 +236,7 @@ class Patches(Examples):
             how, occupancy = self.rendering.sampling, self.pipeline.occupancy
             pixels, _ = render_batch(field, rays, occupancy, how, jitter=jitter)
             ends = accumulate(map(len, chosen))
-            of_each = (
+            of_each = (  # in the order of `_rendered`
                 (some, pixels.take(slice(end - len(some), end)))
                 for some, end in zip(chosen, ends, strict=True)
             )

@@ -180,6 +180,7 @@ def train_stage2(
     folder = log.stage_dir("steernerf", key)
     finished = folder / "steernerf.safetensors"
     count = 0 if finished.exists() else joint.distilled(steps, model.frames)
+    # These show the field of stage 1, which is changed from here on.
     distilled, distilled_s = distilled_views(setup, trained, scene, budget, count, log)
     random = torch.Generator().manual_seed(setup.seed) if joint.features == "random" else None
     trained.field.widen(model.channels, random)

@@ -72,7 +72,9 @@ class UNet(Renderer2d):
         inputs = torch.stack([self._inputs(o) for o in observations])
         (correction,) = self.run(probe, inputs)  # Eq. 11
         rgb = torch.stack([o.frame.values[..., :3] for o in observations]).permute(0, 3, 1, 2)
-        base = functional.interpolate(rgb, None, self.scale, "bilinear", not self.aligned)
+        base = functional.interpolate(
+            rgb, scale_factor=self.scale, mode="bilinear", align_corners=not self.aligned
+        )
         return base.permute(0, 2, 3, 1) + correction.to(inputs).permute(0, 2, 3, 1)
 
     def _inputs(self, observation: Observation) -> Tensor:

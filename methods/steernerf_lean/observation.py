@@ -52,9 +52,9 @@ def overlap(cloud: Cloud, camera: Camera) -> Tensor:
     two views of it: on a ball, the share of the visible disc that both cameras see. Occlusion is
     ignored.
     """
-    number = cloud.clear.cumsum(dim=0)  # from 1
+    number = cloud.reliable.cumsum(dim=0)  # from 1
     every = (number[-1:] + OVERLAP_POINTS - 1) // OVERLAP_POINTS
-    sampled = cloud.clear & ((number - 1) % every.clamp(min=1) == 0)
+    sampled = cloud.reliable & ((number - 1) % every.clamp(min=1) == 0)
     kept = kept_indices(sampled)
     points = cloud.points[kept]
     pixels, depth = project(camera, points)

@@ -18,7 +18,7 @@ from methods.kernels.types import Occupancy
 from methods.rendering.frame import FeatureFrame, everywhere, render_frame
 from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import Sampling
-from methods.steernerf.buffer import CLEAR_ALPHA, Cloud
+from methods.steernerf.buffer import RELIABLE_ALPHA, Cloud
 from methods.steernerf.kernels.splat import gather
 from methods.steernerf.options import RangeReduction
 from tests.methods.conftest import Work, look_at_the_middle
@@ -99,7 +99,7 @@ def test_summed_depths_are_too_near_unless_the_opacity_is_divided_out() -> None:
     low = low_camera(4)
     frame = frame_of(low)
     frame.alpha[:3] = 0.5
-    frame.alpha[3, 2:4] = torch.tensor([CLEAR_ALPHA, CLEAR_ALPHA * 1.01])
+    frame.alpha[3, 2:4] = torch.tensor([RELIABLE_ALPHA, RELIABLE_ALPHA * 1.01])
     frame.depth[5], frame.alpha[5] = math.inf, 0.0
     summed = Cloud.of(frame)
     _, z = project(low, summed.points)
@@ -169,7 +169,7 @@ def test_a_surface_is_found_inside_the_interval_alone() -> None:
 def test_the_interval_is_that_of_the_pixel_alone_and_everything_where_nothing_is_known() -> None:
     frame, _ = render(Solid(ball()))
     interval = interval_of(frame)
-    seen = frame.alpha > CLEAR_ALPHA
+    seen = frame.alpha > RELIABLE_ALPHA
     assert torch.equal(interval[..., 1].isfinite(), seen)
     assert 0 < seen.sum() < SIZE**2
     assert (interval[~seen][:, 0] == 0).all()

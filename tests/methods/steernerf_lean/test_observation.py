@@ -85,7 +85,7 @@ def ball_cloud() -> Cloud:
 @pytest.mark.parametrize("degrees", [0, 30, 60, 90, 135, 180])
 def test_two_views_of_a_ball_overlap_by_what_faces_both(degrees: float) -> None:
     cloud, other = ball_cloud(), far_view(math.radians(degrees))
-    faces_both = float((cloud.points[cloud.clear] @ other.c2w[:3, 2] < 0).float().mean())
+    faces_both = float((cloud.points[cloud.reliable] @ other.c2w[:3, 2] < 0).float().mean())
     # 2,000 pixels, of which the outline of what faces both crosses 100, and every eighth of those.
     assert overlap(cloud, other) == pytest.approx(faces_both, abs=0.05)
 
