@@ -109,9 +109,7 @@ class SteerNerf:
         self.stage2 = self.kind(model, renderer, joint, after)
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
         engine.check(self.setup.device)
-        with torch.random.fork_rng(
-            devices=[]
-        ):  # refuses what it cannot do before hours of training
+        with torch.random.fork_rng(devices=[]):  # refuses before hours of training
             self.stage2.make(self.setup)
         self.rendering, self.engine, self.name = rendering, engine, name
         self.steps, self.train_s = steps, 0.0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bench.errors import SteerbenchError, Unavailable
-from bench.video import recorded
+from sweeps.commands.render import recorded
 
 
 def test_a_video_shows_its_pictures_in_turn_and_what_is_no_video_is_one_line(
