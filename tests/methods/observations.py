@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -145,25 +144,6 @@ def doubled(observation: AnyObservation) -> AnyObservation:
     return replace(twice(observation), backend="reference")
 
 
-def cut(observation: LeanObservation, rows: slice, columns: slice) -> LeanObservation:
-    """The low-resolution pixels `rows` x `columns` of an observation, and all that is in them."""
-    frame, history, surface = observation.frame, observation.history, observation.surface
-    alpha = frame.alpha[rows, columns]
-    cells = cells_with(alpha)
-
-    def inside(part: Tensor, otherwise: float = 0) -> Tensor:
-        return everywhere(part, observation, otherwise)[rows, columns].flatten(0, 1)[cells]
-
-    values, depth = frame.values[rows, columns], frame.depth[rows, columns]
-    return replace(
-        observation,
-        frame=replace(frame, values=values, depth=depth, alpha=alpha),
-        cells=cells,
-        history=history and (inside(history[0]), inside(history[1])),
-        surface=replace(surface, index=inside(surface.index, -1)),
-    )
-
-
 def shaken(renderer: AnyRenderer, seed: int = 0) -> AnyRenderer:
     """The renderer with no weight that is 0, as after some training."""
     generator = torch.Generator().manual_seed(seed)
@@ -171,15 +151,6 @@ def shaken(renderer: AnyRenderer, seed: int = 0) -> AnyRenderer:
         for parameter in renderer.parameters():
             parameter.add_(0.02 * torch.randn(parameter.shape, generator=generator))
     return renderer
-
-
-def features_of(observation: Observation | LeanObservation) -> Iterator[Tensor]:
-    """All that a field may learn from: of the present, of preceding frames, of the surface."""
-    yield observation.frame.values
-    if isinstance(observation, LeanObservation):
-        yield observation.surface.values
-    else:
-        yield from (points.values for points in observation.preceding)
 
 
 def new_renderer(

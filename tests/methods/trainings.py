@@ -12,11 +12,14 @@ import pytest
 import torch
 
 from bench.metrics import psnr
-from bench.types import Budget, Method, NullProbe, Scene, composite
+from bench.types import EMPTY_ALPHA, Budget, Method, NullProbe, Scene, composite
 from methods.instant_ngp.stage1 import Setup
 from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.encode import HashGrid
 from methods.training import loop
+
+PIXEL = 1.6 / 40
+"""Width of a pixel of the ball's pictures, in its middle."""
 
 GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
 
@@ -36,7 +39,18 @@ def quality(method: Method, scene: Scene, split: str = "test", view: int = 1) ->
     """PSNR of a view of `scene`, in dB; of the ball a white picture has 11.4."""
     some = scene.splits[split]
     truth = composite(some.images[view], scene.background)
-    return psnr(method.render(some.cameras[view], NullProbe()).rgb, truth)
+    return psnr(method.render(some.cameras[view], NullProbe()).rgb.cpu(), truth)
+
+
+def shows_the_ball(method: Method, scene: Scene, least: float, off: float) -> None:
+    """Assert that a view has a PSNR of `least` dB, shows the background where nothing is, and in
+    its middle the depth of the front of the ball, 1.6 - 0.3 from the camera, to `off`: in the
+    median, as the ball has one colour, which leaves the depth of a single pixel to chance."""
+    assert quality(method, scene) > least
+    frame = method.render(scene.splits["test"].cameras[1], NullProbe())
+    assert abs(frame.depth[14:19, 14:19].median().item() - 1.3) < off
+    assert torch.equal(frame.depth.isinf(), frame.alpha <= EMPTY_ALPHA)
+    assert (frame.rgb[frame.alpha == 0] == 1).all()
 
 
 def goes_on_after_a_kill(new: Callable[[], loop.Training], killed_at: int, folder: Path) -> None:

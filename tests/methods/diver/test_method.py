@@ -1,4 +1,4 @@
-"""DIVeR as a method: what it learns, what a training leaves, what it refuses."""
+"""DIVeR as a method: how it begins, what it prunes, what a training leaves, what it refuses."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene
+from bench.types import Budget, Log, Scene
 from methods.diver.method import Diver
 from methods.diver.training import DiverLessons
 from methods.instant_ngp.stage1 import TrainedField
@@ -25,18 +25,6 @@ def fitted(scene: Scene, log: Log, budget: Budget = TAUGHT, **options) -> Diver:
     method = method_of(**options)
     method.fit(scene, budget, log)
     return method
-
-
-@pytest.mark.slow
-def test_it_learns_a_ball(ball_scene: Scene, shared_log: Log) -> None:
-    method = fitted(ball_scene, shared_log, replace(TAUGHT, renderer_steps=200))
-    assert quality(method, ball_scene) > 24
-    frame = method.render(ball_scene.splits["test"].cameras[1], NullProbe())
-    # The depth is that of the front of the ball, 1.6 - 0.3 from the camera, to two voxels. The ball
-    # has one colour, which leaves the depth of a single pixel to chance.
-    assert abs(frame.depth[14:19, 14:19].median().item() - 1.3) < 2 / 32
-    assert torch.equal(frame.depth.isinf(), frame.alpha <= EMPTY_ALPHA)
-    assert (frame.rgb[frame.alpha == 0] == 1).all()
 
 
 def test_it_begins_with_the_encoding_of_the_teacher(

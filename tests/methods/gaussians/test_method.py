@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene, Unavailable
+from bench.types import Budget, Log, NullProbe, Scene, Unavailable
 from methods.gaussians.method import GaussianSplatting
 from methods.gaussians.training import Fitting
-from tests.methods.trainings import GRID, QUICK, TAUGHT, quality
+from tests.methods.trainings import GRID, PIXEL, QUICK, TAUGHT, quality, shows_the_ball
 
 
 def fitted(scene: Scene, log: Log, budget: Budget = TAUGHT, **options) -> GaussianSplatting:
@@ -24,13 +24,8 @@ def fitted(scene: Scene, log: Log, budget: Budget = TAUGHT, **options) -> Gaussi
 @pytest.mark.slow
 def test_they_learn_a_ball(ball_scene: Scene, shared_log: Log) -> None:
     method = fitted(ball_scene, shared_log, replace(TAUGHT, renderer_steps=300))
-    assert quality(method, ball_scene) > 24
-    frame = method.render(ball_scene.splits["test"].cameras[1], NullProbe())
-    # Depth is that of the front of the ball, 1.6 - 0.3 from the camera, to four pixels' widths:
-    # it is that of the centres of Gaussians, which reach out of the ball.
-    assert abs(frame.depth[16, 16].item() - 1.3) < 4 * 1.6 / 40
-    assert torch.equal(frame.depth.isinf(), frame.alpha <= EMPTY_ALPHA)
-    assert (frame.rgb[frame.alpha == 0] == 1).all()
+    # Depth is that of the centres of Gaussians, which reach out of the ball.
+    shows_the_ball(method, ball_scene, 24, 4 * PIXEL)
 
 
 @pytest.mark.slow

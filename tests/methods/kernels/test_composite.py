@@ -105,18 +105,6 @@ def test_pixels_composited_in_parts_are_those_of_one_go(
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("stop", [1e-4, 1e-2, 0.3])
-def test_the_early_stop_changes_a_pixel_by_less_than_its_threshold(
-    backend: str, stop: float
-) -> None:
-    inputs = samples([40] * 50)
-    whole = composite(*inputs, stop=0.0, backend=backend)
-    stopped = composite(*inputs, stop=stop, backend=backend)
-    difference = (whole.alpha - stopped.alpha).abs().max().item()
-    assert 0 < difference <= stop + 1e-6
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_visible_samples_are_those_with_a_weight_which_is_the_gradient_of_their_value(
     backend: str,
 ) -> None:

@@ -58,13 +58,6 @@ def test_the_occupancy_has_every_leaf_and_no_other_cell() -> None:
     assert torch.equal(found, (octree.voxels.coordinates // 4).unique(dim=0))
 
 
-def test_what_a_file_holds_comes_back() -> None:
-    octree = some_octree()
-    again = Octree.of(octree.tensors(), torch.device("cpu"))
-    assert torch.equal(again.voxels.leaves, octree.voxels.leaves)
-    assert torch.equal(again.light.harmonics, octree.light.harmonics)
-
-
 def test_rounded_leaves_are_16_bit_numbers_and_positive() -> None:
     octree = some_octree()
     octree.light.density[:2] = torch.tensor([1e6, 1e-9])  # opaque, and 0 with 16 bits

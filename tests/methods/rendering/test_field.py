@@ -1,4 +1,4 @@
-"""What a radiance field is: two fields that have nothing in common are rendered alike."""
+"""A radiance field that is no network: its rays, its density grid, padding."""
 
 from __future__ import annotations
 
@@ -6,29 +6,16 @@ import pytest
 import torch
 
 from bench.cameras import cast
-from bench.types import NullProbe
-from methods.instant_ngp.field import HashField
 from methods.kernels.types import Occupancy
 from methods.rendering.batch import render_batch
-from methods.rendering.field import BATCH_QUANTUM, Field, pad, query
+from methods.rendering.field import BATCH_QUANTUM, pad
 from methods.rendering.frame import render_rays
 from methods.rendering.occupancy import RESOLUTION, DensityGrid
 from methods.rendering.sampling import Sampling
-from tests.methods.conftest import GRID, Work, look_at_the_middle
+from tests.methods.conftest import Work, look_at_the_middle
 from tests.methods.solids import DENSITY, Solid, ball
 
 EVERYWHERE = Occupancy(torch.ones(32, 32, 32, dtype=torch.bool))
-
-
-@pytest.mark.parametrize("field", [Solid(ball()), HashField(GRID)], ids=["solid", "hash"])
-def test_a_field_answers_in_the_shapes_that_are_promised(field: Field) -> None:
-    positions = torch.rand(7, 3)
-    assert field.device == torch.device("cpu")
-    encoded = field.encode_directions(torch.rand(2, 3))
-    sigma, values = query(field, positions, torch.tensor([0, 0, 0, 1, 1, 1, 1]), encoded)
-    assert sigma.shape == (7,)
-    assert values.shape == (7, field.channels)
-    field.count(NullProbe(), 7, 3)
 
 
 def test_rays_of_a_solid_end_at_its_surface() -> None:

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.cameras import project, scale_camera, unproject
+from bench.cameras import project, scale_camera
 from bench.types import Camera
 from methods.kernels.types import Occupancy
 from methods.rendering.frame import FeatureFrame, everywhere, render_frame
@@ -112,18 +112,6 @@ def test_summed_depths_are_too_near_unless_the_opacity_is_divided_out() -> None:
     assert torch.equal(expected.isnan(), unclear)
     true = frame.depth.flatten()[~unclear]
     torch.testing.assert_close(expected[~unclear], true, rtol=0, atol=10 * error)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_of_two_points_in_a_pixel_the_last_is_shown(backend: str) -> None:
-    target = replace(low_camera(1), c2w=torch.eye(3, 4), cx=4.0, cy=3.0, fx=8.0, fy=8.0)
-    pixels = torch.tensor([[4.0, 3.0], [4.1, 2.9], [1.0, 1.0], [1.0, 1.0]])
-    depth = torch.tensor([1.0, 2.0, 1.0, 2.0])
-    cloud = Cloud(target, unproject(target, pixels, depth), torch.zeros(4, 3), torch.ones(4))
-    index, seen = cloud.splat(target, backend)
-    assert (index[3, 4].item(), index[1, 1].item()) == (1, 3)
-    assert (index >= 0).sum() == 2
-    torch.testing.assert_close(seen, depth)
 
 
 EVERYWHERE = Occupancy(torch.ones(32, 32, 32, dtype=torch.bool))

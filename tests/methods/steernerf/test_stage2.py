@@ -26,7 +26,7 @@ from tests.methods.models import (
     small_motion,
     trained_field,
 )
-from tests.methods.trainings import killed
+from tests.methods.trainings import goes_on_after_a_kill
 
 MOTION = small_motion(pool=3, uses=4, length=2)
 OPTIONS = small_joint(patch=4, batch=2, motion=MOTION)
@@ -185,28 +185,13 @@ def test_weights_on_the_way_are_kept(ball_scene: Scene, tmp_path: Path, quiet_lo
 
 
 def test_a_killed_training_ends_as_if_it_had_never_stopped(
-    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+    ball_scene: Scene, tmp_path: Path
 ) -> None:
     """The examples go on, too: there and back, or are replaced when they are used up. Kernels of
     the U-Net are channels last, and files keep no order; a fused optimiser reads both as they
     lie."""
     options = replace(OPTIONS, motion=small_motion(pool=2, uses=3, longer=0.5))
-    whole, half, again, found = (new_training(ball_scene, options, steps=8) for _ in range(4))
-    for _ in range(8):
-        whole.advance()
-    finished = tmp_path / "steernerf.safetensors"
-    with killed(JointTraining, 5):
-        loop.train(half, finished, "training", quiet_log)
-    loop.train(again, finished, "training", quiet_log)
-    assert {path.name for path in tmp_path.iterdir()} == {"steernerf.safetensors", "lock"}
-    monkeypatch.delattr(JointTraining, "advance")
-    loop.train(found, finished, "training", quiet_log)
-    assert found.seconds == again.seconds
-    for name, tensor in whole.result().items():
-        assert torch.equal(tensor, again.result()[name]), name
-        assert torch.equal(tensor, found.result()[name]), name
-    for name, tensor in whole.state()[0].items():
-        assert torch.equal(tensor, again.state()[0][name]), name
+    goes_on_after_a_kill(lambda: new_training(ball_scene, options, steps=8), 5, tmp_path)
 
 
 def test_a_loss_that_is_no_number_stops_and_names_what_is_not_finite(ball_scene: Scene) -> None:

@@ -28,10 +28,8 @@ from tests.methods.observations import (
     ROUNDING,
     at_surface,
     before,
-    cut,
     doubled,
     enlarged,
-    features_of,
     new_renderer,
     observe,
     shaken,
@@ -108,13 +106,13 @@ def dense(renderer: LeanRenderer, observation: LeanObservation) -> Tensor:
 
 @pytest.mark.parametrize("history", [False, True])
 @pytest.mark.parametrize("share", [0.03, 1.0])
-@pytest.mark.parametrize(("channels", "scale"), [(6, 4), (3, 2), (4, 1)])
+@pytest.mark.parametrize(("channels", "scale", "blocks"), [(6, 4, 2), (3, 2, 1), (4, 1, 3)])
 def test_cells_are_drawn_as_by_a_dense_network(
-    history: bool, share: float, channels: int, scale: int
+    history: bool, share: float, channels: int, scale: int, blocks: int
 ) -> None:
     matter = torch.rand(12, 14, generator=torch.Generator().manual_seed(2)) < share
     observation = observe(12, 14, channels=channels, scale=scale, matter=matter)
-    renderer = shaken(new_renderer(channels, scale, history=history))
+    renderer = shaken(new_renderer(channels, scale, history=history, blocks=blocks))
     assert (reached(observation).float().mean() < 0.9) == (share < 1)
     want = dense(renderer.double(), doubled(observation))
     assert (want != 1).any()
@@ -128,18 +126,13 @@ def test_cells_are_drawn_as_by_a_dense_network(
     torch.testing.assert_close(frozen.error, quick.error, rtol=0, atol=FLOAT32_ERROR)
 
 
-def test_a_picture_and_a_surface_that_are_missing_show_nothing() -> None:
+def test_a_picture_that_is_missing_shows_nothing() -> None:
     renderer, warm = shaken(new_renderer()), observe()
     assert warm.history is not None
     unknown = warm.history[0], torch.zeros_like(warm.history[1])
     cold = renderer([replace(warm, history=None)]).pictures
     assert torch.equal(renderer([replace(warm, history=unknown)]).pictures, cold)
     assert (renderer([warm]).pictures - cold).abs().max() > 1e-3
-    empty = replace(warm.surface, index=torch.full_like(warm.surface.index, -1))
-    other = replace(empty, values=torch.rand_like(empty.values))
-    bare, same = (renderer([replace(warm, surface=s)]).pictures for s in (empty, other))
-    assert torch.equal(bare, same)
-    assert (renderer([warm]).pictures - bare).abs().max() > 1e-3
 
 
 @pytest.mark.parametrize("wrong", [-2, 20])
@@ -156,8 +149,9 @@ def test_gradients_reach_every_parameter_and_the_features_of_all_that_is_shown(
 ) -> None:
     renderer = shaken(new_renderer(history=history))
     observation = observe(history=history)
-    features = [tensor.requires_grad_() for tensor in features_of(observation)]
-    assert len(features) == 2  # of the present and the surface
+    features = observation.frame.values, observation.surface.values
+    for tensor in features:
+        tensor.requires_grad_()
     drawing = renderer([observation])
     (drawing.pictures.square().sum() + drawing.error.sum()).backward()
     for name, parameter in renderer.named_parameters():
@@ -177,31 +171,6 @@ def test_an_untrained_network_draws_the_present_colours_enlarged(scale: int) -> 
     # With scales of 2^n, weights and values are multiples of 1/4096: nothing is rounded.
     rounded = BLENDING if scale == 3 else 0
     torch.testing.assert_close(picture, enlarged(observation, scale), rtol=0, atol=rounded)
-
-
-@pytest.mark.parametrize("share", [0.0, 1.0])
-def test_the_preceding_picture_is_blended_in_where_it_is_known(share: float) -> None:
-    scale, renderer, observation = 4, new_renderer(), observe()
-    with torch.no_grad():
-        renderer.network.leave.bias[-(scale**2) :] = 40.0 if share else -200.0
-    picture, valid = before(observation, scale)
-    base = enlarged(observation, scale)
-    want = torch.where(valid > 0, share * picture + (1 - share) * base, base)
-    assert 0.5 < valid.mean() < 0.8
-    torch.testing.assert_close(renderer([observation]).pictures[0], want, rtol=0, atol=BLENDING)
-
-
-def test_the_surface_covers_the_base_as_far_as_it_is_opaque() -> None:
-    """Where the matrix of every cell is the identity on RGB and looks at nothing else."""
-    scale, renderer, observation = 4, new_renderer(history=False), observe()
-    with torch.no_grad():
-        renderer.network.read.bias.view(3, -1)[:, :3] = torch.eye(3)
-    values, known = at_surface(observation, scale)
-    base = enlarged(observation, scale)
-    covered = base + values[..., -1:] * (values[..., :3] - base)
-    want = torch.where(known[..., None] > 0, covered, base)
-    assert 0.5 < known.mean() < 0.8
-    torch.testing.assert_close(renderer([observation]).pictures[0], want, rtol=0, atol=BLENDING)
 
 
 def test_where_nothing_is_the_picture_is_the_background() -> None:
@@ -227,25 +196,6 @@ def test_a_batch_of_two_is_one_after_the_other(row: int, column: int) -> None:
         torch.testing.assert_close(got, torch.cat(parts), rtol=0, atol=ROUNDING)
     assert second.error.shape == (len(observations[1].cells),)
     assert second.error.std() > 0
-
-
-@pytest.mark.parametrize("blocks", [1, 3])
-def test_a_patch_is_drawn_as_the_whole_frame(blocks: int) -> None:
-    """A cell sees as far as there are blocks, and whether the last one it sees is there depends on
-    what is within REACH of that."""
-    scale, size = 4, 24
-    halo = blocks + REACH
-    matter = torch.rand(size, size, generator=torch.Generator().manual_seed(5)) < 0.03
-    observation = doubled(observe(size, size, matter=matter))
-    renderer = shaken(new_renderer(blocks=blocks)).double()
-    begin, end = 9, 15
-    side = slice(begin - halo, end + halo)
-    inside = slice(scale * halo, scale * (halo + end - begin))
-    there = slice(scale * begin, scale * end)
-    want = renderer([observation]).pictures[0, there, there]
-    assert (want != 1).any()
-    got = renderer([cut(observation, side, side)]).pictures[0, inside, inside]
-    torch.testing.assert_close(got, want, rtol=0, atol=ROUNDING)
 
 
 def test_its_products_are_those_that_torch_counts_and_nine_for_each_channel_of_a_block() -> None:

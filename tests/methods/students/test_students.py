@@ -1,5 +1,5 @@
 """What the methods that start from a trained field have in common: a training survives a kill and
-is found again; wrong settings are refused."""
+is found again; they learn a ball; wrong settings are refused."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from bench.types import Budget, Log, NullProbe, Scene, Unavailable
 from methods.diver.method import Diver
 from methods.diver.training import DiverLessons
 from methods.instant_ngp.stage1 import train_field
+from methods.kilonerf.kernels.grouped_mlp import SHAPES
 from methods.kilonerf.method import KiloLessons, KiloNerf
 from methods.nerf.method import Nerf
 from methods.nsvf.method import Nsvf
@@ -24,7 +25,14 @@ from methods.plenoctree.octree import Extraction
 from methods.students.fields import FieldLessons
 from methods.students.method import Student
 from methods.training import loop
-from tests.methods.trainings import EXACT_TEACHER, TAUGHT, TEACHER, goes_on_after_a_kill, quality
+from tests.methods.trainings import (
+    EXACT_TEACHER,
+    PIXEL,
+    TAUGHT,
+    TEACHER,
+    goes_on_after_a_kill,
+    shows_the_ball,
+)
 
 LEAVES = {"resolution": 128, "degree": 1, "rays": 20_000, "points": 2, "directions": 8}
 SMALL: dict[str, Callable[..., Student]] = {
@@ -76,23 +84,48 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(
     goes_on_after_a_kill(training, killed_at, tmp_path)
 
 
+def fitted(name: str, scene: Scene, log: Log, steps: int = 2, **options: Any) -> Student:
+    method = SMALL[name](**options)
+    method.fit(scene, budget(name, steps), log)
+    return method
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["nerf", "nsvf"])
-def test_a_large_network_learns_a_ball(name: str, ball_scene: Scene, shared_log: Log) -> None:
-    method = SMALL[name](**{"start": "teacher"} if name == "nsvf" else {})
-    method.fit(ball_scene, budget(name, 60), shared_log)
-    assert quality(method, ball_scene) > 16
+@pytest.mark.parametrize(
+    ("name", "steps", "least", "off"),
+    [
+        ("diver", 200, 24, 2 / 32),  # voxels
+        ("kilonerf", 40, 20, 4 * PIXEL),
+        ("nerf", 60, 16, 1.0),
+        ("nsvf", 60, 16, 1.0),
+    ],
+)
+def test_it_learns_a_ball(
+    name: str, steps: int, least: float, off: float, ball_scene: Scene, shared_log: Log
+) -> None:
+    start = {"start": "teacher"} if name == "nsvf" else {}
+    shows_the_ball(fitted(name, ball_scene, shared_log, steps, **start), ball_scene, least, off)
 
 
 @names
 def test_a_training_is_found_again(name: str, ball_scene: Scene, shared_log: Log) -> None:
-    first, again = SMALL[name](), SMALL[name](stop=1e-2)
-    for method in (first, again):
-        method.fit(ball_scene, budget(name, 2), shared_log)
+    first = fitted(name, ball_scene, shared_log)
+    again = fitted(name, ball_scene, shared_log, stop=1e-2)
     assert again.train_s == first.train_s > 0
     camera = ball_scene.splits["test"].cameras[0]
     pictures = [method.render(camera, NullProbe()).rgb for method in (first, again)]
     assert torch.equal(*pictures)
+
+
+def test_sizes_of_kilonerf_are_those_of_its_networks(ball_scene: Scene, shared_log: Log) -> None:
+    student = fitted("kilonerf", ball_scene, shared_log)
+    parameters = sum(i * o + o for i, o in SHAPES.values())
+    assert parameters == 6212  # of the publication
+    assert student.sizes() == {
+        "networks": student.grid.count * parameters * 4,
+        "network_grid": student.grid.networks.numel() * 2,
+        "occupancy": 128**3 // 8,
+    }
 
 
 @names
