@@ -113,16 +113,17 @@ def obtain(jobs: Sequence[Job]) -> tuple[list[str], bool]:
     """The keys of the runs of `jobs`, whose `turns` are equal, and whether they are measured now.
 
     They are measured unless the store has all of them: figures that are compared come from the same
-    hour. Earlier failures are forgotten.
+    hour. Earlier failures are forgotten. The runs are sent to their tracker.
     """
     log = ConsoleLog(jobs[0].outputs)
-    ready = _ready(jobs, log)
-    if _stored(ready):
-        return _told(ready, False, log), False
-    with device_lock(ready[0].method.settings()["device"], log):
-        measured = not _stored(ready)  # by another process meanwhile
-        if measured:
-            _measure(ready, log)
+    ready, measured = _ready(jobs, log), False
+    if not _stored(ready):
+        with device_lock(ready[0].method.settings()["device"], log):
+            measured = not _stored(ready)  # by another process meanwhile
+            if measured:
+                _measure(ready, log)
+    for each in ready:
+        send(each.job.config, each.run, each.method.name)
     return _told(ready, measured, log), measured
 
 
@@ -196,20 +197,19 @@ def _stored(ready: Sequence[_Ready]) -> bool:
 
 
 def _told(ready: Sequence[_Ready], measured: bool, log: Log) -> list[str]:
-    """Forget earlier failures of runs that the store has now, and send them to their tracker."""
+    """Forget earlier failures of runs that the store has now; their keys."""
     for each in ready:
-        job, run = each.job, each.run
         if not measured:
-            log.info(f"already measured; to measure again, remove {job.store.folder / run}")
-        job.failure_file.unlink(missing_ok=True)
-        send(job.config, run, each.method.name)
+            folder = each.job.store.folder / each.run
+            log.info(f"already measured; to measure again, remove {folder}")
+        each.job.failure_file.unlink(missing_ok=True)
     return [each.run for each in ready]
 
 
 def _measure(ready: Sequence[_Ready], log: Log) -> None:
     """Measure all, and put them in the place of what an interruption has left of them."""
     measurements = measure([each.method for each in ready], ready[0].task, log)
-    for each in ready:
+    for each in ready if len(ready) > 1 else ():
         each.job.store.remove(each.run)
     for each, measurement in zip(ready, measurements, strict=True):
         command, place = shlex.join(each.job.command), scene_folder(each.job.config)

@@ -46,6 +46,7 @@ STUDY = Study(
         "range reduction": RANGES,
     },
     trained={
+        "L, trained": turned("L", "method.model.frames", (0, 1, 3)),
         "K, trained": turned("K", "method.model.channels", (3, 9)),
         "log2 T, trained": turned("log2 T", "method.grid.log2_table", (15, 19)),
         "field, trained": turned("field", "method.precision", ("fp32",)),

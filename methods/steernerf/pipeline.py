@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -133,5 +134,8 @@ class Pipeline:
 
     def occupied(self, rendering: Rendering) -> Occupancy:
         """Where rays take samples."""
-        cells = self.occupancy.cells
-        return self.occupancy if rendering.skip.empty else Occupancy(torch.ones_like(cells))
+        return self.occupancy if rendering.skip.empty else self._cube
+
+    @cached_property
+    def _cube(self) -> Occupancy:
+        return Occupancy(torch.ones_like(self.occupancy.cells))

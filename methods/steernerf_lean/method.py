@@ -18,6 +18,7 @@ REFINED_STEPS = turned("refined step", f"{HOW}.refined_step", (1, 1.5, 3))
 STEPS = turned("step", f"{HOW}.step", (1, 1.5, 3, 4))
 SHARES = [REFINED[0], *REFINED[2:]]
 SCRATCH = "method.renderer.init=scratch"
+REFINED_AS_IT_IS = "method.joint.refined_step=2"  # it would follow the step
 PARTS = {"feature_reprojection/surface": "surface", "refinement": "refinement"}
 PAPERS = ("method=steernerf", "method.renderer.width=64", "budget.renderer_steps=8")
 """The release's network; its cost does not depend on how well it is trained."""
@@ -49,7 +50,7 @@ class SteerNerfLean(SteerNerf):
             **STUDY.trained,
             "L, trained": turned("L", "method.model.frames", (0,)),
             "s, trained": turned("s", "method.model.scale", (2, 4, 8), SCRATCH),
-            "step, trained": turned("trained step", "method.model.step", (1, 3)),
+            "step, trained": turned("trained step", "method.model.step", (1, 3), REFINED_AS_IT_IS),
         },
         exact=(
             *STUDY.exact,

@@ -52,6 +52,7 @@ def overlap(cloud: Cloud, camera: Camera) -> Tensor:
     two views of it: on a ball, the share of the visible disc that both cameras see. Occlusion is
     ignored.
     """
+    cloud = cloud.expected()
     number = cloud.reliable.cumsum(dim=0)  # from 1
     every = (number[-1:] + OVERLAP_POINTS - 1) // OVERLAP_POINTS
     sampled = cloud.reliable & ((number - 1) % every.clamp(min=1) == 0)

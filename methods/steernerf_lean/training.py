@@ -16,6 +16,7 @@ from torch.nn import functional
 from bench.errors import explained
 from bench.types import Budget, Log, NullProbe, Rays, Scene, Split, SteerbenchError
 from methods.instant_ngp.stage1 import Setup, train_field
+from methods.kernels.dispatch import refuse_gpu
 from methods.rendering.batch import render_batch
 from methods.rendering.compaction import compacts, indices_where
 from methods.steernerf.patches import Batch, Example, Patch, Patches
@@ -184,6 +185,11 @@ class LeanStage2(Stage2):
 
     joint: LeanJointOptions
     pipeline, patches, training = LeanPipeline, LeanPatches, LeanTraining
+
+    def make(self, setup: Setup) -> Renderer2d:
+        """As of `Stage2`; raises Unavailable for backend "gpu"."""
+        refuse_gpu(setup.backend, "steernerf_lean")
+        return super().make(setup)
 
     def pretrain(
         self, setup: Setup, scenes: Sequence[Scene], budget: Budget, output: Path, log: Log

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from itertools import chain
+from itertools import chain, groupby
 from pathlib import Path
 from typing import NamedTuple
 
@@ -88,12 +88,15 @@ def _run(jobs: Sequence[Planned], launcher: Launcher) -> int:
     jobs = [job for job in jobs if distinct[job.key] is job]
     scenes, seeds = [job.scene for job in jobs], [job.config.seed for job in jobs]
     jobs.sort(key=lambda job: (scenes.index(job.scene), seeds.index(job.config.seed)))
-    ahead = launcher.in_process and room(jobs[0].config) > 1
-    groups, measured = _groups(jobs, look_up=ahead)
-    if ahead:
-        train_ahead(jobs, measured)
-    total = sum(len(group) for _, group in groups)
-    return sum(launcher.run(partial(_attempted, total=total), groups))
+    ahead, failed = launcher.in_process and room(jobs[0].config) > 1, 0
+    of_scenes = [list(some) for _, some in groupby(jobs, lambda job: job.scene)]
+    for some in of_scenes if ahead else [jobs]:
+        groups, measured = _groups(some, look_up=ahead)
+        if ahead:
+            train_ahead(some, measured)
+        total = sum(len(group) for _, group in groups)
+        failed += sum(launcher.run(partial(_attempted, total=total), groups))
+    return failed
 
 
 def _groups(

@@ -72,20 +72,21 @@ def far_view(angle: float, aside: float = 0.0) -> Camera:
     return Camera(c2w, focal, focal, 32.0, 32.0, 64, 64)
 
 
-def ball_cloud() -> Cloud:
+def ball_cloud(opacity: float = 1.0) -> Cloud:
     """A ball of radius 0.5 around the origin, as `far_view(0)` sees it; it fills half of the
     picture."""
     pixels = (pixel_grid(64, 64) - 32) * 1.25 / 64
     height = 0.25 - pixels.square().sum(dim=1)
     depth = torch.where(height > 0, 1000 - height.clamp(min=0).sqrt(), math.inf).view(64, 64)
     values = torch.zeros(64, 64, 4)
-    return Cloud.of(FeatureFrame(far_view(0.0), values, depth, (depth < math.inf).float()))
+    return Cloud.of(FeatureFrame(far_view(0.0), values, depth, opacity * (depth < math.inf)))
 
 
+@pytest.mark.parametrize("opacity", [0.3, 1.0])
 @pytest.mark.parametrize("degrees", [0, 30, 60, 90, 135, 180])
-def test_two_views_of_a_ball_overlap_by_what_faces_both(degrees: float) -> None:
-    cloud, other = ball_cloud(), far_view(math.radians(degrees))
-    faces_both = float((cloud.points[cloud.reliable] @ other.c2w[:3, 2] < 0).float().mean())
+def test_two_views_of_a_ball_overlap_by_what_faces_both(degrees: float, opacity: float) -> None:
+    cloud, other = ball_cloud(opacity), far_view(math.radians(degrees))
+    faces_both = float((ball_cloud().points[cloud.reliable] @ other.c2w[:3, 2] < 0).float().mean())
     # 2,000 pixels, of which the outline of what faces both crosses 100, and every eighth of those.
     assert overlap(cloud, other) == pytest.approx(faces_both, abs=0.05)
 
