@@ -29,7 +29,7 @@ METHODS = (
 METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "work.samples", "work.products")
 
 
-def test_the_baseline_is_of_methods_that_have_learnt() -> None:
+def test_the_baseline_is_of_methods_that_have_learnt():
     baseline = json.loads(BASELINE.read_text())
     assert baseline["limits"].keys() >= set(METRICS)
     for seeds in baseline["runs"].values():
@@ -40,9 +40,7 @@ def test_the_baseline_is_of_methods_that_have_learnt() -> None:
 
 
 @pytest.mark.slow
-def test_the_methods_are_as_good_as_the_recorded_baseline(
-    tmp_path: Path, lpips_weights: Path, real_lpips_weights: Path | None
-) -> None:
+def test_methods_are_as_good_as_the_recorded_baseline(tmp_path, lpips_weights, real_lpips_weights):
     """The limits are what other rounding does to one training, rounded up: docs/log.md. A change
     must also be sure over three trainings.
 

@@ -124,9 +124,7 @@ def plain_lpips(net: str, weights: dict, heads: dict, a: Tensor, b: Tensor) -> f
 
 @torch.no_grad()
 @pytest.mark.parametrize(("net", "file"), [("alex", "alexnet"), ("vgg", "vgg16")])
-def test_lpips_is_the_published_formula_on_the_named_backbone(
-    net, file, lpips_weights, quiet_log, device
-):
+def test_lpips_is_the_published_formula(net, file, lpips_weights, quiet_log, device):
     weights = torch.load(lpips_weights / f"{file}_features.pth", weights_only=True)
     package = Path(importlib.util.find_spec("lpips").origin).parent
     heads = torch.load(package / "weights" / "v0.1" / f"{net}.pth", "cpu", weights_only=True)

@@ -227,9 +227,7 @@ def test_what_a_plugin_imports_of_ours_counts_and_not_where_it_lies(plugin, tree
     assert digest(thing) == before
 
 
-def test_a_single_file_counts_with_the_module_beside_it_that_it_imports(
-    tree, tmp_path, monkeypatch
-):
+def test_a_single_file_counts_with_the_module_that_it_imports(tree, tmp_path, monkeypatch):
     write(tmp_path / "site", {"single_file.py": "import its_helper\n", "its_helper.py": "A = 1\n"})
     monkeypatch.syspath_prepend(tmp_path / "site")
     importlib.invalidate_caches()

@@ -254,7 +254,7 @@ def viewer(*keyframes: dict[str, Any]) -> dict[str, Any]:
     return {"render_width": 40, "render_height": 30, "camera_path": list(keyframes)}
 
 
-def test_a_path_comes_back_as_it_was_written(scene: Scene, tmp_path: Path) -> None:
+def test_a_path_comes_back_as_it_was_written(scene, tmp_path):
     first = scene.splits["test"].cameras[0]
     second = replace(first, c2w=first.c2w + torch.tensor([0.0, 0, 0, 0.125]))
     write_path(tmp_path / "there.json", [first, second], scene)
@@ -269,9 +269,7 @@ def test_a_path_comes_back_as_it_was_written(scene: Scene, tmp_path: Path) -> No
         assert step.camera.fy == pytest.approx(camera.fy)
 
 
-def test_a_key_frame_of_the_viewer_is_read_as_nerfstudio_means_it(
-    scene: Scene, tmp_path: Path
-) -> None:
+def test_a_key_frame_of_the_viewer_is_read_as_nerfstudio_means_it(scene, tmp_path):
     (step,) = follow(scene, stored(tmp_path, viewer(keyframe()))).steps
     camera = step.camera
     # 90 degrees from top to bottom: the focal length is half the height. y and z change signs.
@@ -280,9 +278,7 @@ def test_a_key_frame_of_the_viewer_is_read_as_nerfstudio_means_it(
     torch.testing.assert_close(camera.c2w, expected)  # (3, 0, 8) of the data set
 
 
-def test_a_transforms_file_gives_intrinsics_or_leaves_them_to_the_test_camera(
-    scene: Scene, tmp_path: Path
-) -> None:
+def test_a_transforms_file_gives_intrinsics_or_leaves_them_to_the_test_camera(scene, tmp_path):
     pose = [[1.0, 0, 0, 3], [0, 1, 0, 0], [0, 0, 1, 8], [0, 0, 0, 1]]
     given = {"fl_x": 30.0, "fl_y": 31.0, "cx": 9.0, "cy": 14.0}
     usual = replace(scene.splits["test"].cameras[0], fy=44.0, cx=15.0)
@@ -314,9 +310,7 @@ def test_a_transforms_file_gives_intrinsics_or_leaves_them_to_the_test_camera(
         ({"nothing": 1}, "frames: expected a list with at least one entry, got nothing"),
     ],
 )
-def test_a_damaged_path_is_named_with_what_was_expected(
-    scene: Scene, tmp_path: Path, record: dict, message: str
-) -> None:
+def test_a_damaged_path_is_named_with_what_was_expected(scene, tmp_path, record, message):
     with pytest.raises(SteerbenchError, match=message):
         follow(scene, stored(tmp_path, record))
     with pytest.raises(SteerbenchError, match=r"gone\.json: expected a file, got nothing there"):
@@ -327,9 +321,7 @@ def moved(camera: Camera, along: float) -> Camera:
     return replace(camera, c2w=camera.c2w + torch.tensor([0.0, 0, 0, along]))
 
 
-def test_the_keys_of_a_spline_are_a_splits_cameras_or_those_of_a_file(
-    scene: Scene, tmp_path: Path
-) -> None:
+def test_the_keys_of_a_spline_are_a_splits_cameras_or_those_of_a_file(scene, tmp_path):
     first = scene.splits["test"].cameras[0]
     cameras = [moved(first, 0.1 * index) for index in range(5)]
     images = scene.splits["test"].images * 5
@@ -347,7 +339,7 @@ def test_the_keys_of_a_spline_are_a_splits_cameras_or_those_of_a_file(
 
 
 @pytest.mark.parametrize(("option", "value"), [("degrees", 0.0), ("keys", 1)])
-def test_a_spline_refuses_what_is_no_path(scene: Scene, option: str, value: float) -> None:
+def test_a_spline_refuses_what_is_no_path(scene, option, value):
     with pytest.raises(SteerbenchError, match=f"trajectory.{option}: expected"):
         spline(scene, None, **{option: value})
 
@@ -359,7 +351,7 @@ def ring(degrees: list[float]) -> list[Camera]:
     return list(orbit_of(degrees).splits["test"].cameras)
 
 
-def test_a_spline_goes_through_its_keys_in_even_steps() -> None:
+def test_a_spline_goes_through_its_keys_in_even_steps():
     keys = ring([0, 30, 50, 90])
     pieces = leading(keys, TARGET, degrees=2.0)
     assert [piece[-1] for piece in pieces] == keys[1:]
@@ -370,7 +362,7 @@ def test_a_spline_goes_through_its_keys_in_even_steps() -> None:
         assert degrees.min() > 0.9 * degrees.max()
 
 
-def test_a_spline_has_no_corners() -> None:
+def test_a_spline_has_no_corners():
     keys = ring([0, 30, 60, 90, 120])
     path = [keys[0], *chain(*leading(keys, TARGET, degrees=1.0))]
     steps = torch.stack([camera.c2w[:, 3].double() for camera in path]).diff(dim=0)
@@ -379,7 +371,7 @@ def test_a_spline_has_no_corners() -> None:
     assert bends.max() < 2.0  # a circle bends by 1 degree a step, a chord's end by 30
 
 
-def test_a_camera_that_only_moves_is_led_in_steps_seen_from_the_target() -> None:
+def test_a_camera_that_only_moves_is_led_in_steps_seen_from_the_target():
     (first,) = ring([0])
     aside = torch.cat((torch.zeros(3, 3), torch.tensor([[0.0], [1.0], [0.0]])), dim=1)
     (piece,) = leading([first, replace(first, c2w=first.c2w + aside)], TARGET, degrees=1.0)
@@ -388,7 +380,7 @@ def test_a_camera_that_only_moves_is_led_in_steps_seen_from_the_target() -> None
 
 
 @pytest.mark.parametrize("case", ["one key", "the same pose twice", "another size"])
-def test_a_spline_needs_different_keys_of_one_size(case: str) -> None:
+def test_a_spline_needs_different_keys_of_one_size(case):
     first, second = ring([0, 10])
     keys = {
         "one key": [first],

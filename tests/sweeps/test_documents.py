@@ -86,9 +86,7 @@ def typed(command: str) -> list[str]:
 WITHOUT_LPIPS = ("protocol.lpips=[]", "protocol.name=quick")
 
 
-def test_method_and_scene_of_the_document_are_listed_measured_and_studied_from_outside(
-    steerbench, mine, monkeypatch
-):
+def test_what_the_document_makes_is_listed_measured_and_studied(steerbench, mine, monkeypatch):
     assert "The mean colour of the training pictures." in steerbench(*typed("list")).out
     measured = steerbench(*typed("run"), *WITHOUT_LPIPS)
     assert measured.status == 0, measured.err

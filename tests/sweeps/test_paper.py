@@ -95,9 +95,7 @@ def test_the_jobs_go_where_hydras_launcher_puts_them(steerbench, measured, launc
     assert launched == [len(measured)]
 
 
-def test_what_cannot_run_here_says_so_in_its_line_and_does_not_fail(
-    steerbench, monkeypatch, outputs
-):
+def test_what_cannot_run_here_says_so_and_does_not_fail(steerbench, monkeypatch, outputs):
     def obtain(*_: object) -> None:
         raise Unavailable("no bfloat16 on this CPU")
 
@@ -108,9 +106,7 @@ def test_what_cannot_run_here_says_so_in_its_line_and_does_not_fail(
     assert labels(page)[0] == "L = 0: failed: no bfloat16 on this CPU"
 
 
-def test_a_report_has_what_is_there_and_measures_nothing(
-    steerbench, measured, outputs, store, stored_run
-):
+def test_a_report_has_what_is_there_alone(steerbench, measured, outputs, store, stored_run):
     jobs = plan(TABLE3, [outputs, "seed=0"])
     put(store, stored_run, jobs[1].config)
     jobs[2].keep_failure("killed")
@@ -192,9 +188,7 @@ def scenes(store: Store, stored_run: str, tmp_path: Path) -> Store:
         ("gone", None, ["b"]),  # not here: the last run is shown
     ],
 )
-def test_of_folders_with_one_name_each_shows_its_own(
-    scenes, tmp_path, monkeypatch, tiny_scene, folder, digest, found
-):
+def test_folders_show_their_own(scenes, tmp_path, monkeypatch, tiny_scene, folder, digest, found):
     def loaded(*contents: object) -> Scene:
         assert digest, f"loads {contents}"
         return replace(tiny_scene, digest=digest)

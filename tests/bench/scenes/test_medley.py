@@ -25,19 +25,19 @@ def picture(model: Solids, pose: torch.Tensor) -> torch.Tensor:
     return torch.cat((frame.rgb, frame.alpha[..., None]), -1)
 
 
-def test_the_stream_is_the_one_that_python_promises() -> None:
+def test_the_stream_is_the_one_that_python_promises():
     # The sequence of the Mersenne twister from an integer seed is part of Python's interface.
     assert Draw(7).share() == pytest.approx(0.32383276483316237, abs=1e-15)
 
 
-def test_parts_are_few_and_lie_in_their_ball() -> None:
+def test_parts_are_few_and_lie_in_their_ball():
     for variant in range(60):
         model = medley(variant)
         assert 8 <= len(model.parts) <= 16
         assert model.boxes().norm(dim=-1).max() <= REACH * (1 + 1e-5)
 
 
-def test_pictures_are_filled_and_not_cut() -> None:
+def test_pictures_are_filled_and_not_cut():
     for variant in FIRST:
         shown = picture(medley(variant), train_poses(12, variant)[variant])[..., 3]
         border = torch.cat((shown[0], shown[-1], shown[:, 0], shown[:, -1]))
@@ -45,7 +45,7 @@ def test_pictures_are_filled_and_not_cut() -> None:
         assert 0.06 < shown.mean() < 0.4
 
 
-def test_the_core_touches_its_first_part() -> None:
+def test_the_core_touches_its_first_part():
     for variant in FIRST:
         first, *others = medley(variant).parts[:CORE]
         for part in others:
@@ -54,7 +54,7 @@ def test_the_core_touches_its_first_part() -> None:
             assert first.shape.distance(local[None]) <= 1e-5
 
 
-def test_every_solid_and_every_texture_occurs_fine_and_coarse() -> None:
+def test_every_solid_and_every_texture_occurs_fine_and_coarse():
     parts = [part for variant in FIRST for part in medley(variant).parts]
     assert {*BULKY, *SMALLER} == SHAPES.keys()
     shapes = {type(part.shape) for part in parts}
