@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import shutil
 import struct
@@ -15,7 +14,7 @@ from PIL import Image
 from bench.cameras import move_camera
 from bench.scenes import blender
 from bench.types import SteerbenchError
-from tests.bench.scenes.conftest import edit_json, picture, png
+from tests.bench.scenes.conftest import edit_json, encoded, picture, png
 
 
 def test_pictures_are_read_byte_for_byte(blender_folder, log):
@@ -134,12 +133,6 @@ def test_bad_camera_file_names_file_and_field(blender_folder, log, change, messa
         blender.load(blender_folder, log=log)
 
 
-def encoded(*shape: int, dtype: str = "uint8") -> bytes:
-    file = io.BytesIO()
-    Image.fromarray(np.ones(shape, dtype)).save(file, "png")
-    return file.getvalue()
-
-
 # Black RGB of 16 bits a channel. Pillow cannot write it, and reads half of each number.
 DEEP = png(struct.pack(">2I5B", 8, 6, 16, 2, 0, 0, 0), bytes(6 * (1 + 6 * 8)))
 
@@ -152,10 +145,10 @@ DEEP = png(struct.pack(">2I5B", 8, 6, 16, 2, 0, 0, 0), bytes(6 * (1 + 6 * 8)))
         ("transforms_test.json", b"[" * 100_000, r": expected JSON, got"),
         ("transforms_test.json", b"\xff\xfe\x00{", r": .* readable text file"),
         ("transforms_test.json", None, r": expected a file"),
-        ("train/r_2.png", encoded(6, 8, 3)[:-40], r": expected a whole picture"),
+        ("train/r_2.png", encoded("RGB")[:-40], r": expected a whole picture"),
         ("train/r_0.png", b"not a picture", r": expected a whole picture"),
-        ("train/r_1.png", encoded(6, 7), r": expected 8 x 6 pixels, got 7 x 6"),
-        ("train/r_1.png", encoded(6, 8, dtype="uint16"), r": expected 8 bits a channel"),
+        ("train/r_1.png", encoded("L", size=(7, 6)), r": expected 8 x 6 pixels, got 7 x 6"),
+        ("train/r_1.png", encoded("I;16"), r": expected 8 bits a channel"),
         ("train/r_1.png", DEEP, r": expected 8 bits a channel"),
     ],
 )

@@ -11,18 +11,11 @@ import torch
 from bench.scenes import textures
 from bench.scenes.analytic import train_poses
 from bench.scenes.medley import BULKY, CORE, REACH, SHAPES, SMALLER, Draw, medley
-from bench.scenes.raytrace import Solids, render
+from bench.scenes.raytrace import render
 from bench.scenes.solids import Box, Capsule, Carved, Common, Cylinder, Ellipsoid
 from bench.types import Camera
 
 FIRST = range(12)
-
-
-def picture(model: Solids, pose: torch.Tensor) -> torch.Tensor:
-    focal = 32 / math.tan(0.345)
-    camera = Camera(pose.float(), focal, focal, 32, 32, 64, 64)
-    frame = render(model, camera, torch.ones(3), 4)
-    return torch.cat((frame.rgb, frame.alpha[..., None]), -1)
 
 
 def test_the_stream_is_the_one_that_python_promises():
@@ -38,8 +31,11 @@ def test_parts_are_few_and_lie_in_their_ball():
 
 
 def test_pictures_are_filled_and_not_cut():
+    focal = 32 / math.tan(0.345)
     for variant in FIRST:
-        shown = picture(medley(variant), train_poses(12, variant)[variant])[..., 3]
+        pose = train_poses(12, variant)[variant].float()
+        camera = Camera(pose, focal, focal, 32, 32, 64, 64)
+        shown = render(medley(variant), camera, torch.ones(3), 4).alpha
         border = torch.cat((shown[0], shown[-1], shown[:, 0], shown[:, -1]))
         assert (border == 0).all()
         assert 0.06 < shown.mean() < 0.4
