@@ -9,20 +9,31 @@ import hashlib
 import io
 import socket
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 import torch
 
 from bench import published
-from bench.published import BACKBONES, fetch, get, load_features, locate, verify
+from bench.published import BACKBONES, Published, fetch, get, load_features, locate, verify
 from bench.types import SteerbenchError, Unavailable
-from tests.bench.scenes.releases import publish
+from sweeps.commands import scenes
 from tests.web import Web
 
 CONTENT = bytes(range(256)) * 600
 FILES = {"mic/train/r_0.png": b"a", "mic/test/r_0.png": b"b", "mic/test/r_0_depth_0000.png": b"c"}
 STATE = {"features.0.weight": torch.ones(2), "classifier.1.weight": torch.zeros(3)}
+
+
+def publish(monkeypatch: pytest.MonkeyPatch, files: Mapping[str, bytes], **where: str) -> Published:
+    """A data set of these files by their paths, the only one that is known."""
+    data = Published("release", "blender", "free", **where)
+    hashes = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    data.__dict__["hashes"] = hashes  # as if they had been read
+    for module in (published, scenes):
+        monkeypatch.setattr(module, "published", lambda: [data])
+    return data
 
 
 def found(folder: Path) -> dict[str, bytes]:
