@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from bench.cameras import look_at, scale_camera
+from bench.cameras import scale_camera
 from bench.motion import rotation_between
 from bench.trajectories import (
     Step,
@@ -34,6 +34,7 @@ from bench.trajectories import (
     write_path,
 )
 from bench.types import Camera, Scene, Split, SteerbenchError
+from tests.conftest import camera_on_orbit
 
 CONFIGS = Path(__file__).parents[2] / "sweeps" / "configs" / "trajectory"
 
@@ -83,11 +84,7 @@ def test_a_split_that_is_not_there_or_empty_is_named_with_those_that_are(tiny_sc
 
 def orbit_of(degrees: list[float]) -> Scene:
     """Cameras on a circle of radius 2 around the middle of the unit cube, looking at it."""
-    middle, up = torch.full((3,), 0.5), torch.tensor([0.0, 0.0, 1.0])
-    cameras = []
-    for angle in map(math.radians, degrees):
-        eye = middle + 2 * torch.tensor([math.cos(angle), math.sin(angle), 0.0])
-        cameras.append(Camera(look_at(eye, middle, up)[:3].float(), 60, 60, 20, 16, 40, 32))
+    cameras = [camera_on_orbit(angle / 360) for angle in degrees]
     images = [torch.zeros(32, 40, 4, dtype=torch.uint8)] * len(cameras)
     split = Split(cameras, images, [str(i) for i in range(len(cameras))])
     bounds = torch.tensor([[0.0] * 3, [1.0] * 3])
@@ -157,6 +154,8 @@ REFUSED = [
     (loop, {"frames": 0}, "frames: expected 1 or more, got 0"),
     (jump, {"every": 3}, "every: expected 1 to 2, .* got 3"),
     (jump, {"every": 0}, "every: expected 1 to 2"),
+    (spline, {"degrees": 0}, "degrees: expected"),
+    (spline, {"keys": 1}, "keys: expected"),
     (approached, {"lead": -1}, "lead: expected 0 or more"),
     (approached, {"degrees": 0}, "degrees: expected more than 0"),
     (approached, {"degrees": math.nan}, "degrees: expected more than 0"),
@@ -166,8 +165,8 @@ REFUSED = [
 
 @pytest.mark.parametrize(("make", "setting", "message"), REFUSED)
 def test_a_setting_out_of_its_range_is_refused_by_name(make, setting, message):
-    usual = {"split": "test", "lead": 3, "degrees": 3.3, "seed": 0, "limit": 0}
-    settings = (usual if make is approached else {}) | setting
+    approach = {"split": "test", "lead": 3, "degrees": 3.3, "seed": 0, "limit": 0}
+    settings = {approached: approach, spline: {"path": None}}.get(make, {}) | setting
     with pytest.raises(SteerbenchError, match=r"trajectory\." + message):
         make(orbit_of([0, 1, 2]), **settings)
 
@@ -209,12 +208,8 @@ def test_each_camera_is_approached_once_after_a_cut_from_a_motion_of_its_own(tin
     assert path.preceding == [0, 1, 2] * 6  # steady for a method that looks back on `lead` frames
     starts = [turn_deg(step.camera, path.steps[0].camera) for step in path.steps[::3]]
     assert len({round(start, 1) for start in starts}) == 6
-
     turns = [turn_deg(a.camera, b.camera) for a, b in pairwise(path.steps) if not b.cut]
     assert turns == pytest.approx([3.3] * 12, abs=0.05)
-
-
-def test_approaches_depend_on_lead_limit_and_seed(tiny_scene):
     path = approached(tiny_scene, "test", lead=0, degrees=3.3, seed=0, limit=0)
     assert [(step.truth, step.cut) for step in path.steps] == [(n, True) for n in range(6)]
     limited = approached(tiny_scene, "test", lead=1, degrees=3.3, seed=0, limit=3)
@@ -256,7 +251,7 @@ def viewer(*keyframes: dict[str, Any]) -> dict[str, Any]:
 
 def test_a_path_comes_back_as_it_was_written(scene, tmp_path):
     first = scene.splits["test"].cameras[0]
-    second = replace(first, c2w=first.c2w + torch.tensor([0.0, 0, 0, 0.125]))
+    second = moved(first, 0.125)
     write_path(tmp_path / "there.json", [first, second], scene)
     trajectory = follow(scene, str(tmp_path / "there.json"))
     assert trajectory.name == "there"
@@ -338,12 +333,6 @@ def test_the_keys_of_a_spline_are_a_splits_cameras_or_those_of_a_file(scene, tmp
     assert of_file.reads == (tmp_path / "keys.json",)
 
 
-@pytest.mark.parametrize(("option", "value"), [("degrees", 0.0), ("keys", 1)])
-def test_a_spline_refuses_what_is_no_path(scene, option, value):
-    with pytest.raises(SteerbenchError, match=f"trajectory.{option}: expected"):
-        spline(scene, None, **{option: value})
-
-
 TARGET = torch.full((3,), 0.5)
 
 
@@ -379,13 +368,10 @@ def test_a_camera_that_only_moves_is_led_in_steps_seen_from_the_target():
     assert len(piece) == math.ceil(math.degrees(math.asinh(1 / 2)))
 
 
-@pytest.mark.parametrize("case", ["one key", "the same pose twice", "another size"])
-def test_a_spline_needs_different_keys_of_one_size(case):
+def test_a_spline_needs_different_keys_of_one_size():
     first, second = ring([0, 10])
-    keys = {
-        "one key": [first],
-        "the same pose twice": [first, first, second],
-        "another size": [first, scale_camera(second, 20, 16)],
-    }[case]
-    with pytest.raises(SteerbenchError, match="of one size" if "size" in case else "two cameras"):
-        leading(keys, TARGET, degrees=1.0)
+    for keys in ([first], [first, first, second]):
+        with pytest.raises(SteerbenchError, match="two cameras"):
+            leading(keys, TARGET, degrees=1.0)
+    with pytest.raises(SteerbenchError, match="of one size"):
+        leading([first, scale_camera(second, 20, 16)], TARGET, degrees=1.0)
