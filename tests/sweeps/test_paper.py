@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
@@ -23,6 +22,7 @@ from sweeps.commands import paper
 from sweeps.commands.paper import gather, newest
 from sweeps.measurement import Job, described
 from sweeps.plan import DataSet, Planned, chosen, plan
+from tests.reports.conftest import rewrite
 from tests.sweeps.conftest import CONFIGS, HERE
 from tests.sweeps.test_plan import blender
 
@@ -59,17 +59,16 @@ def measured(
     return asked
 
 
-def put(store: Store, source: str, config: DictConfig) -> str:
+def put(store: Store, source: str, config: DictConfig, key: str = "") -> str:
     """A copy of the run `source` as that of `config`."""
     parts = {"config": described(config)}
-    key = store.key(parts)
+    key = key or store.key(parts)
     if store.find(key) is None:
         folder = shutil.copytree(store.folder / source, store.folder / key)
         for file in ("rows.csv", "record.json"):
             text = (folder / file).read_text().replace(source, key)
             (folder / file).write_text(text)
-        record = json.loads((folder / "record.json").read_text()) | {"made_of": parts}
-        (folder / "record.json").write_text(json.dumps(record))
+        rewrite(store, key, made_of=parts)
     return key
 
 
@@ -164,17 +163,11 @@ def job(folder: Path) -> Planned:
 def scenes(store: Store, stored_run: str, tmp_path: Path) -> Store:
     """A store with the job measured in a/mic and then in b/mic, scenes that differ."""
     for number, name in enumerate("ab"):
-        key = f"{number}{stored_run[1:]}"
-        folder = shutil.copytree(store.folder / stored_run, store.folder / key)
         path = tmp_path / name / "mic"
         path.mkdir(parents=True)
-        record = json.loads((folder / "record.json").read_text())
-        record["made_of"] = {"config": described(job(path).config)}
-        record["scene"]["digest"], record["scene_path"] = name, str(path)
-        (folder / "record.json").write_text(json.dumps(record))
-        rows = (folder / "rows.csv").read_text().replace(stored_run, key)
-        (folder / "rows.csv").write_text(rows)
-        os.utime(folder, (number, number))
+        key = put(store, stored_run, job(path).config, f"{number}{stored_run[1:]}")
+        rewrite(store, key, scene={"digest": name}, scene_path=str(path))
+        os.utime(store.folder / key, (number, number))
     return store
 
 
