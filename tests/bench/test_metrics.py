@@ -135,12 +135,7 @@ def test_lpips_is_the_published_formula(net, file, lpips_weights, quiet_log, dev
     assert measured == pytest.approx(plain_lpips(net, weights, heads, a, b), rel=1e-3)
 
 
-NERFBASELINES = {
-    "psnr": 25.050917,
-    "ssim": 0.894081,
-    "lpips_alex": 0.017315,
-    "lpips_vgg": 0.056838,
-}
+NERFBASELINES = {"psnr": 25.050917, "ssim": 0.894081, "lpips_alex": 0.017315, "lpips_vgg": 0.056838}
 """What the functions of nerfbaselines/metrics.py say of `waves`, at commit cde53bda36e6."""
 
 

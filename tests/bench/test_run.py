@@ -34,14 +34,13 @@ def run(tiny_scene, quiet_log):
     return measured
 
 
-def value(rows, metric: str) -> float:
-    (found,) = rows.loc[rows["metric"] == metric, "value"]
-    return found
-
-
 def row(rows, metric: str) -> dict:
     (found,) = rows[rows["metric"] == metric].to_dict("records")
     return found
+
+
+def value(rows, metric: str) -> float:
+    return row(rows, metric)["value"]
 
 
 def test_the_rows_have_every_column_but_what_the_store_adds(run, offset_method, device):
