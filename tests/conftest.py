@@ -28,7 +28,7 @@ from bench.published import BACKBONES
 from bench.results import Store
 from bench.run import Task, measure
 from bench.trajectories import from_split
-from bench.types import Budget, Camera, Frame, Log, Probe, Scene, Split
+from bench.types import Budget, Camera, Frame, Log, Probe, Scene, Split, composite
 from tests.pretended_gpu import PretendedGpu, pretended_gpu
 from tests.web import Web, served
 
@@ -133,11 +133,11 @@ def _tiny_split(count: int, seed: int) -> Split:
         for _ in range(count)
     ]
     return Split(
-        [_orbit(i / count) for i in range(count)], images, [f"r_{i}" for i in range(count)]
+        [camera_on_orbit(i / count) for i in range(count)], images, [f"r_{i}" for i in range(count)]
     )
 
 
-def _orbit(turn: float) -> Camera:
+def camera_on_orbit(turn: float) -> Camera:
     """A camera 2 units from the middle of the unit cube, looking at it."""
     angle = 2 * math.pi * turn
     forward = torch.tensor([math.cos(angle), math.sin(angle), 0.0])
@@ -163,7 +163,7 @@ class OffsetMethod:
         self.train_s = 12.5
         test = scene.splits["test"]
         self._known = [
-            (name, camera, _on_white(image))
+            (name, camera, composite(image, scene.background))
             for name, camera, image in zip(test.names, test.cameras, test.images, strict=True)
         ]
 
@@ -190,11 +190,6 @@ class OffsetMethod:
             "engine": "torch",
             "precision": "fp32",
         }
-
-
-def _on_white(image: Tensor) -> Tensor:
-    rgba = image.double() / 255.0
-    return (rgba[..., :3] * rgba[..., 3:] + 1.0 - rgba[..., 3:]).float()
 
 
 @pytest.fixture

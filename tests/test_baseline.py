@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -12,9 +10,9 @@ import pytest
 from bench.results import Store
 from reports.regression import Figures
 from reports.runs import readable
+from tests.test_end_to_end import called
 
 BASELINE = Path(__file__).with_name("baseline.json")
-STEERBENCH = Path(sys.executable).with_name("steerbench")
 RUN = [
     *("-m", "seed=0,1,2", "trajectory=orbit"),
     *("scene=cloud", "scene.width=64", "scene.train=24", "scene.test=6"),
@@ -29,7 +27,7 @@ METHODS = (
 METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "work.samples", "work.products")
 
 
-def test_the_baseline_is_of_methods_that_have_learnt() -> None:
+def test_the_baseline_is_of_methods_that_have_learnt():
     baseline = json.loads(BASELINE.read_text())
     assert baseline["limits"].keys() >= set(METRICS)
     for seeds in baseline["runs"].values():
@@ -40,9 +38,7 @@ def test_the_baseline_is_of_methods_that_have_learnt() -> None:
 
 
 @pytest.mark.slow
-def test_the_methods_are_as_good_as_the_recorded_baseline(
-    tmp_path: Path, lpips_weights: Path, real_lpips_weights: Path | None
-) -> None:
+def test_methods_are_as_good_as_the_recorded_baseline(tmp_path, lpips_weights, real_lpips_weights):
     """The limits are what other rounding does to one training, rounded up: docs/log.md. A change
     must also be sure over three trainings.
 
@@ -50,8 +46,7 @@ def test_the_methods_are_as_good_as_the_recorded_baseline(
     order of its random numbers.
     """
     for method in METHODS:
-        words = [*RUN, *method, f"weights_dir={lpips_weights}"]
-        done = _steerbench("run", *words, folder=tmp_path)
+        done = called(tmp_path, "run", *RUN, *method, f"weights_dir={lpips_weights}")
         assert done.returncode == 0, done.stderr
     held = json.loads(BASELINE.read_text())
     # The scene was drawn here: on other processors some pixels differ by a level of 255.
@@ -65,10 +60,5 @@ def test_the_methods_are_as_good_as_the_recorded_baseline(
         held["limits"] = {name: one for name, one in limits if not name.startswith("lpips")}
     baseline = tmp_path / "baseline.json"
     baseline.write_text(json.dumps(held))
-    checked = _steerbench("check", baseline, folder=tmp_path)
+    checked = called(tmp_path, "check", baseline)
     assert checked.returncode == 0, checked.stdout
-
-
-def _steerbench(command: str, *words: str | Path, folder: Path) -> subprocess.CompletedProcess[str]:
-    line = [STEERBENCH, command, *words]
-    return subprocess.run(line, cwd=folder, capture_output=True, text=True, check=False)

@@ -62,9 +62,7 @@ def first(tmp_path_factory: pytest.TempPathFactory, lpips_weights: Path) -> tupl
     return folder, done.stdout
 
 
-def test_the_table_and_the_report_compare_all_methods_and_stages_add_up_to_frames(
-    first: tuple[Path, str],
-) -> None:
+def test_the_table_and_the_report_compare_all_methods_and_stages_add_up_to_frames(first):
     outputs, printed = first[0] / "outputs", first[1]
     for word in ("PSNR", "SSIM", "LPIPS alex", "FPS", "model, MB", *METHODS):
         assert word in printed
@@ -84,27 +82,21 @@ def test_the_table_and_the_report_compare_all_methods_and_stages_add_up_to_frame
             assert of_stages.sum() == pytest.approx(values["frame_ms"], rel=1e-9)
 
 
-def test_the_same_seed_gives_the_same_rows(
-    first: tuple[Path, str], tmp_path: Path, lpips_weights: Path
-) -> None:
+def test_the_same_seed_gives_the_same_rows(first, tmp_path, lpips_weights):
     assert demo(tmp_path, lpips_weights).returncode == 0
     kept = [repeatable(first[0]), repeatable(tmp_path)]
     assert {"psnr", "ssim", "lpips_alex", "work.samples"} <= set(kept[0]["metric"])
     pd.testing.assert_frame_equal(*kept, check_exact=True)
 
 
-def test_what_was_measured_is_not_measured_again(
-    first: tuple[Path, str], lpips_weights: Path
-) -> None:
+def test_what_was_measured_is_not_measured_again(first, lpips_weights):
     before = rows(first[0])
     again = demo(first[0], lpips_weights)
     assert "already measured" in again.stderr
     pd.testing.assert_frame_equal(rows(first[0]), before, check_exact=True)
 
 
-def test_training_is_shared_by_methods_and_by_runs_that_differ_in_rendering_only(
-    first: tuple[Path, str], lpips_weights: Path
-) -> None:
+def test_training_is_shared_by_methods_and_runs_that_render_differently(first, lpips_weights):
     done = demo(first[0], lpips_weights, "method=ngp", "method.stop=1e-3")
     assert "trained field found" in done.stderr
     assert len(rows(first[0])["run"].unique()) == len(METHODS) + 1
@@ -131,9 +123,7 @@ def mortal(folder: Path, last: int) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
-def test_wherever_it_is_killed_again_and_again_a_sweep_ends_with_the_same_rows(
-    tmp_path: Path,
-) -> None:
+def test_wherever_it_is_killed_again_and_again_a_sweep_ends_with_the_same_rows(tmp_path):
     """Killed once in every fifth of what the undisturbed sweep does, somewhere in it."""
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     undisturbed = mortal(whole, 0)
@@ -149,7 +139,7 @@ def test_wherever_it_is_killed_again_and_again_a_sweep_ends_with_the_same_rows(
     pd.testing.assert_frame_equal(*map(repeatable, (whole, killed)), check_exact=True)
 
 
-def test_parity_compares_every_engine_with_torch_in_fp32(tmp_path: Path) -> None:
+def test_parity_compares_every_engine_with_torch_in_fp32(tmp_path):
     words = ("--frames", "4", *SMALLEST, "scene.test=3", "budget.frames=0")
     found, _ = study(tmp_path, "parity", *words)
     standard = found["torch, fp32"]
@@ -163,9 +153,7 @@ def test_parity_compares_every_engine_with_torch_in_fp32(tmp_path: Path) -> None
         assert 0 < row["network_ms"] < row["frame_ms"]
 
 
-def test_skips_lists_the_work_of_a_frame_with_and_without_each_switch(
-    first: tuple[Path, str],
-) -> None:
+def test_skips_lists_the_work_of_a_frame_with_and_without_each_switch(first):
     found, _ = study(first[0], "skips", "--frames", "3", "scene=totem", *SMALL)
     dense = found.pop("nothing")
     assert dense["cells"] == 16 * 16
@@ -173,7 +161,7 @@ def test_skips_lists_the_work_of_a_frame_with_and_without_each_switch(
     assert found["all of these"]["samples"] <= found["empty space"]["samples"]
 
 
-def test_breakdown_divides_the_frame_and_names_every_line(first: tuple[Path, str]) -> None:
+def test_breakdown_divides_the_frame_and_names_every_line(first):
     words = ("--frames", "3", "engine=torch", "device=cpu", "scene=totem", *SMALL)
     found, said = study(first[0], "breakdown", *words, "budget.renderer_steps=9")  # others train 8
     assert "torch, fp16: " in said  # and why it cannot be had

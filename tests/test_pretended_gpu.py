@@ -6,7 +6,6 @@ The last tests plant bugs in the project, each of a kind that only a GPU shows.
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from torch import Tensor, nn
 
 from bench.cameras import place_camera
 from bench.probes import device_waits
-from bench.types import Log, NullProbe
+from bench.types import NullProbe
 from methods.engines.torch_engine import TorchEngine
 from methods.kernels import dispatch
 from methods.kernels.encode import HashGrid, encode
@@ -24,7 +23,7 @@ from methods.rendering.frame import everywhere, render_frame
 from methods.rendering.sampling import Sampling
 from tests.methods.conftest import look_at_the_middle
 from tests.methods.models import misty_field, shell
-from tests.pretended_gpu import PretendedGpu, pretended_gpu
+from tests.pretended_gpu import pretended_gpu
 
 
 def there(*values: float) -> Tensor:
@@ -35,7 +34,7 @@ HERE = torch.tensor([1.0, 2.0, 3.0])
 LATTICE, MIDDLE = HashGrid(levels=1, log2_table=6, n_min=4, n_max=4), torch.full((2, 3), 0.5)
 
 
-def test_a_tensor_there_says_so_and_so_does_what_is_computed_from_it(gpu: PretendedGpu) -> None:
+def test_a_tensor_there_says_so_and_so_does_what_is_computed_from_it(gpu):
     x = torch.arange(3.0, device="cuda")
     for result in (x + 1, x.sum(), x.new_zeros(2), torch.zeros_like(x), x.view(3, 1), x[1:]):
         assert result.device == torch.device("cuda", 0)
@@ -64,13 +63,13 @@ REFUSED: dict[str, tuple[type[Exception], Callable[[], object]]] = {
 
 
 @pytest.mark.parametrize("what", REFUSED)
-def test_what_cuda_refuses_is_refused(gpu: PretendedGpu, what: str) -> None:
+def test_what_cuda_refuses_is_refused(gpu, what):
     error, act = REFUSED[what]
     with pytest.raises(error, match=r"same device|numpy|generator"):
         act()
 
 
-def test_a_triton_kernel_takes_no_tensor_of_the_cpu(gpu: PretendedGpu) -> None:
+def test_a_triton_kernel_takes_no_tensor_of_the_cpu(gpu):
     pytest.importorskip("triton")
     table, positions = torch.ones(LATTICE.entries, 2), MIDDLE.to("cuda")
     assert encode(positions, table.cuda(), LATTICE, backend="gpu").tolist() == [[1, 1], [1, 1]]
@@ -116,7 +115,7 @@ WAITS: dict[str, tuple[int, Callable[[Tensor], object]]] = {
 
 
 @pytest.mark.parametrize("what", WAITS)
-def test_the_host_waits_as_often_as_for_cuda(gpu: PretendedGpu, what: str) -> None:
+def test_the_host_waits_as_often_as_for_cuda(gpu, what):
     expected, act = WAITS[what]
     x = there(1, 2, 3)
     with device_waits() as waits:
@@ -124,7 +123,7 @@ def test_the_host_waits_as_often_as_for_cuda(gpu: PretendedGpu, what: str) -> No
     assert waits.total() == expected
 
 
-def test_the_host_waits_for_a_moment_unless_it_has_waited_since(gpu: PretendedGpu) -> None:
+def test_the_host_waits_for_a_moment_unless_it_has_waited_since(gpu):
     x = there(1, 2, 3)
     moment = torch.cuda.current_stream().record_event()
     with device_waits() as waits:
@@ -138,7 +137,7 @@ def test_the_host_waits_for_a_moment_unless_it_has_waited_since(gpu: PretendedGp
     assert not waits
 
 
-def test_told_to_raise_it_raises_where_it_would_wait(gpu: PretendedGpu) -> None:
+def test_told_to_raise_it_raises_where_it_would_wait(gpu):
     torch.cuda.set_sync_debug_mode("error")
     with pytest.raises(RuntimeError, match="synchronizing"):
         there(1)
@@ -150,7 +149,7 @@ def captured(compute: Callable[[], Tensor]) -> tuple[torch.cuda.CUDAGraph, Tenso
         return graph, compute()
 
 
-def test_a_graph_computes_again_from_what_is_in_its_memory(gpu: PretendedGpu) -> None:
+def test_a_graph_computes_again_from_what_is_in_its_memory(gpu):
     x = there(1, 2, 3)
     graph, result = captured(lambda: (x * 2).sum().expand(2) + torch.ones(2, device="cuda"))
     x.fill_(10)
@@ -159,7 +158,7 @@ def test_a_graph_computes_again_from_what_is_in_its_memory(gpu: PretendedGpu) ->
     assert result.tolist() == [61, 61]
 
 
-def test_a_graph_launches_kernels_of_triton_again(gpu: PretendedGpu) -> None:
+def test_a_graph_launches_kernels_of_triton_again(gpu):
     pytest.importorskip("triton")
     table, positions = torch.ones(LATTICE.entries, 2, device="cuda"), MIDDLE.to("cuda")
     encode(positions, table, LATTICE, backend="gpu")  # what never changes is copied once
@@ -171,7 +170,7 @@ def test_a_graph_launches_kernels_of_triton_again(gpu: PretendedGpu) -> None:
 
 
 @pytest.mark.parametrize("enabled", [True, False])
-def test_autocast_lowers_products(gpu: PretendedGpu, enabled: bool) -> None:
+def test_autocast_lowers_products(gpu, enabled):
     x = torch.eye(2, device="cuda", requires_grad=True)
     with torch.autocast("cuda", torch.bfloat16, enabled=enabled):
         product = x @ x
@@ -182,7 +181,7 @@ def test_autocast_lowers_products(gpu: PretendedGpu, enabled: bool) -> None:
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
-def test_afterwards_there_is_none() -> None:
+def test_afterwards_there_is_none():
     with pretended_gpu():
         x = there(1)
     assert not torch.cuda.is_available()
@@ -199,14 +198,12 @@ def draw(background: Tensor) -> Tensor:
     return render_frame(camera, occupancy, background, NullProbe(), render).values
 
 
-def test_planted_a_background_on_the_cpu_is_found(gpu: PretendedGpu) -> None:
+def test_planted_a_background_on_the_cpu_is_found(gpu):
     with pytest.raises(RuntimeError, match="same device"):
         draw(torch.ones(4))
 
 
-def test_planted_a_kernel_of_the_cpu_is_found(
-    gpu: PretendedGpu, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_planted_a_kernel_of_the_cpu_is_found(gpu, monkeypatch):
     monkeypatch.setattr(dispatch, "resolve", lambda backend, device: "cpu")
     with pytest.raises(TypeError, match="numpy"):
         draw(torch.ones(4, device="cuda"))
@@ -225,9 +222,7 @@ class Asking(nn.Module):
         return (x * self.factor.item(),)
 
 
-def test_planted_a_wait_in_a_network_is_found(
-    gpu: PretendedGpu, tmp_path: Path, quiet_log: Log
-) -> None:
+def test_planted_a_wait_in_a_network_is_found(gpu, tmp_path, quiet_log):
     network, inputs = Asking().to("cuda"), [(torch.ones(2, 3, device="cuda"),)]
     with pytest.raises(RuntimeError, match="stream is capturing"):
         TorchEngine().build(network, lambda: inputs, lambda: tmp_path, quiet_log)

@@ -11,6 +11,7 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -80,9 +81,12 @@ def test_every_pin_suits_the_range_in_pyproject():
         assert requirement.specifier.contains(version), f"{requirement}: pinned to {version}"
 
 
-def test_the_changelog_tells_of_the_current_version():
+def test_the_changelog_and_the_citation_are_of_the_current_version():
     version = PYPROJECT["project"]["version"]
     assert f"## {version}" in (ROOT / "CHANGELOG.md").read_text()
+    citation = OmegaConf.load(ROOT / "CITATION.cff")
+    assert (citation.version, citation.license) == (version, "MIT")
+    assert "2212.08476" in (ROOT / "CITATION.cff").read_text()
 
 
 def test_make_explains_which_python_it_needs(tmp_path):

@@ -23,7 +23,7 @@ QUICK = (
 )
 
 
-def test_every_name_is_documented_and_every_documented_name_is_there() -> None:
+def test_every_name_is_documented_and_every_documented_name_is_there():
     assert steerbench.__doc__ is not None
     table = [line for line in steerbench.__doc__.splitlines() if line.startswith("| `")]
     named = [name for line in table for name in re.findall(r"`(\w+)`", line.split("|")[1])]
@@ -32,9 +32,7 @@ def test_every_name_is_documented_and_every_documented_name_is_there() -> None:
         assert getattr(steerbench, name).__doc__
 
 
-def test_a_run_is_measured_once_and_a_method_renders_what_it_measured(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_is_measured_once_and_a_method_renders_what_it_measured(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = steerbench.run(*QUICK)
     again = steerbench.run(*QUICK, "report=page")
@@ -51,12 +49,12 @@ def test_a_run_is_measured_once_and_a_method_renders_what_it_measured(
     assert np.array_equal(shown, kept)
 
 
-def test_choices_come_with_what_they_are() -> None:
+def test_choices_come_with_what_they_are():
     assert steerbench.methods()["ngp"].startswith("Instant-NGP")
     assert "totem" in steerbench.scenes()
 
 
-def test_a_wrong_setting_is_an_error_with_the_nearest_name() -> None:
+def test_a_wrong_setting_is_an_error_with_the_nearest_name():
     with pytest.raises(steerbench.SteerbenchError, match="Did you mean ngp"):
         steerbench.run("method=npg")
 
@@ -67,7 +65,7 @@ def cells() -> list[str]:
 
 
 @pytest.mark.slow
-def test_the_tour_runs(tmp_path: Path) -> None:
+def test_the_tour_runs(tmp_path):
     """Its cells one after the other; what the last line of a cell is, a notebook would show."""
     done = subprocess.run(
         [sys.executable, "-c", "\n".join(cells())],
@@ -79,7 +77,7 @@ def test_the_tour_runs(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_the_tour_uses_what_the_door_has() -> None:
+def test_the_tour_uses_what_the_door_has():
     used = {
         node.attr
         for node in ast.walk(ast.parse("\n".join(cells())))
@@ -91,7 +89,7 @@ def test_the_tour_uses_what_the_door_has() -> None:
     assert len(used) >= 6
 
 
-def test_the_import_changes_nothing_of_the_process() -> None:
+def test_the_import_changes_nothing_of_the_process():
     """The command line sets variables and the allocator for itself, not for who imports."""
     program = """
 import os, torch, numba  # both set variables of their own

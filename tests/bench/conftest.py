@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
 
@@ -25,9 +24,6 @@ class RememberingLog:
 
     def advance(self, steps: int = 1, note: str = "") -> None:
         self.done += steps
-
-    def stage_dir(self, kind: str, key: Mapping[str, object]) -> Path:
-        raise AssertionError("nothing is trained here")
 
 
 @pytest.fixture

@@ -83,14 +83,10 @@ def terminal(monkeypatch, tmp_path, clock) -> ConsoleLog:
     return ConsoleLog(tmp_path, clock=clock)
 
 
-def test_a_bar_runs_no_thread_beside_what_is_measured(terminal):
+def test_on_a_terminal_nested_bars_show_how_far_it_is_without_a_thread(terminal, clock, capsys):
     before = threading.active_count()
-    with terminal.progress("rendering", 2):
-        assert threading.active_count() == before
-
-
-def test_on_a_terminal_nested_bars_show_percentage_time_left_and_note(terminal, clock, capsys):
     with terminal.progress("outer [1]", 2) as outer:
+        assert threading.active_count() == before
         with terminal.progress("inner", 4) as inner:
             for _ in range(3):
                 clock.now += 2.0

@@ -124,9 +124,7 @@ def plain_lpips(net: str, weights: dict, heads: dict, a: Tensor, b: Tensor) -> f
 
 @torch.no_grad()
 @pytest.mark.parametrize(("net", "file"), [("alex", "alexnet"), ("vgg", "vgg16")])
-def test_lpips_is_the_published_formula_on_the_named_backbone(
-    net, file, lpips_weights, quiet_log, device
-):
+def test_lpips_is_the_published_formula(net, file, lpips_weights, quiet_log, device):
     weights = torch.load(lpips_weights / f"{file}_features.pth", weights_only=True)
     package = Path(importlib.util.find_spec("lpips").origin).parent
     heads = torch.load(package / "weights" / "v0.1" / f"{net}.pth", "cpu", weights_only=True)
@@ -137,12 +135,7 @@ def test_lpips_is_the_published_formula_on_the_named_backbone(
     assert measured == pytest.approx(plain_lpips(net, weights, heads, a, b), rel=1e-3)
 
 
-NERFBASELINES = {
-    "psnr": 25.050917,
-    "ssim": 0.894081,
-    "lpips_alex": 0.017315,
-    "lpips_vgg": 0.056838,
-}
+NERFBASELINES = {"psnr": 25.050917, "ssim": 0.894081, "lpips_alex": 0.017315, "lpips_vgg": 0.056838}
 """What the functions of nerfbaselines/metrics.py say of `waves`, at commit cde53bda36e6."""
 
 

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from bench import pictures
 from bench.protocol import EvaluationProtocol
-from bench.results import Store
-from bench.types import Log, Scene, Split, SteerbenchError
+from bench.types import Split, SteerbenchError
 
 QUICK = EvaluationProtocol(name="quick", lpips=())
 FACTS = {"method": "theirs", "scene": "a"}
@@ -34,9 +33,7 @@ def noise(channels: int = 3, size: tuple[int, int] = (16, 20), seed: int = 0) ->
 GREY = torch.full((16, 20, 3), 100, dtype=torch.uint8)
 
 
-def test_the_psnr_is_that_of_the_difference_and_equal_pictures_have_none(
-    tmp_path: Path, quiet_log: Log
-) -> None:
+def test_the_psnr_is_that_of_the_difference_and_equal_pictures_have_none(tmp_path, quiet_log):
     ours = write(tmp_path / "ours", {"a.png": GREY + 10, "b.png": GREY})
     true = write(tmp_path / "true", {"a.png": GREY, "b.png": GREY})
     pairs = pictures.pairs_with_folder(ours, true)
@@ -47,7 +44,7 @@ def test_the_psnr_is_that_of_the_difference_and_equal_pictures_have_none(
     assert set(found.rows["resolution"]) == {"20x16"}
 
 
-def test_a_sequence_has_a_flicker_where_the_error_changes(tmp_path: Path, quiet_log: Log) -> None:
+def test_a_sequence_has_a_flicker_where_the_error_changes(tmp_path, quiet_log):
     shown = {"1.png": GREY + 51, "2.png": GREY + 51, "10.png": GREY}  # off by 0.2, then not
     ours = write(tmp_path / "ours", shown)
     true = write(tmp_path / "true", dict.fromkeys(shown, GREY))
@@ -58,9 +55,7 @@ def test_a_sequence_has_a_flicker_where_the_error_changes(tmp_path: Path, quiet_
 
 
 @pytest.mark.parametrize(("background", "level"), [("white", 255), ("black", 0)])
-def test_alpha_is_put_on_the_background_of_the_protocol(
-    tmp_path: Path, quiet_log: Log, background: str, level: int
-) -> None:
+def test_alpha_is_put_on_the_background_of_the_protocol(tmp_path, quiet_log, background, level):
     clear = torch.zeros(16, 20, 4, dtype=torch.uint8)
     plain = torch.full((16, 20, 3), level, dtype=torch.uint8)
     ours, true = write(tmp_path / "ours", {"a.png": clear}), write(tmp_path / "b", {"a.png": plain})
@@ -70,7 +65,7 @@ def test_alpha_is_put_on_the_background_of_the_protocol(
         assert found.frames["psnr"][0] == math.inf
 
 
-def test_names_match_without_their_endings_and_folders(tmp_path: Path, quiet_log: Log) -> None:
+def test_names_match_without_their_endings_and_folders(tmp_path, quiet_log):
     images = [noise(seed=number) for number in (9, 10)]
     ours = write(tmp_path / "ours", {"r_9.bmp": images[0], "r_10.bmp": images[1]})
     split = Split([], images, ["test/r_9.png", "test/r_10.png"])
@@ -79,7 +74,7 @@ def test_names_match_without_their_endings_and_folders(tmp_path: Path, quiet_log
     assert found.frames["name"].tolist() == split.names
 
 
-def test_by_order_the_tenth_comes_after_the_ninth(tmp_path: Path) -> None:
+def test_by_order_the_tenth_comes_after_the_ninth(tmp_path):
     ours = write(tmp_path / "ours", {f"{number}.png": noise() for number in range(11)})
     true = write(tmp_path / "true", {f"r_{number}.png": noise() for number in range(11)})
     pairs = pictures.pairs_with_folder(ours, true, "order")
@@ -99,7 +94,7 @@ def test_by_order_the_tenth_comes_after_the_ninth(tmp_path: Path) -> None:
         ("order", ["a.png"], "2 pictures, as many as true ones, got 1"),
     ],
 )
-def test_pictures_that_do_not_match_are_named(tmp_path: Path, match, names, said) -> None:
+def test_pictures_that_do_not_match_are_named(tmp_path, match, names, said):
     ours = write(tmp_path / "ours", dict.fromkeys(names, noise()))
     true = write(tmp_path / "true", dict.fromkeys(["a.png", "b.png"], noise()))
     with pytest.raises(SteerbenchError, match=said):
@@ -108,7 +103,7 @@ def test_pictures_that_do_not_match_are_named(tmp_path: Path, match, names, said
         pictures.listed(tmp_path / "nowhere")
 
 
-def test_two_truths_of_one_name_have_no_picture_of_their_own(tmp_path: Path) -> None:
+def test_two_truths_of_one_name_have_no_picture_of_their_own(tmp_path):
     ours = write(tmp_path / "ours", {"0001.png": noise(), "0002.png": noise()})
     said = "--match order takes both in their order, got several of 0001"
     with pytest.raises(SteerbenchError, match=said):
@@ -124,9 +119,7 @@ def test_two_truths_of_one_name_have_no_picture_of_their_own(tmp_path: Path) -> 
         (None, noise(), r"ours/a.png: expected a whole picture"),
     ],
 )
-def test_a_picture_that_cannot_be_scored_is_named(
-    tmp_path: Path, quiet_log: Log, ours: Tensor | None, true: Tensor, message: str
-) -> None:
+def test_a_picture_that_cannot_be_scored_is_named(tmp_path, quiet_log, ours, true, message):
     theirs = write(tmp_path / "ours", {"a.png": noise() if ours is None else ours})
     if ours is None:  # a file cut in half
         whole = (theirs / "a.png").read_bytes()
@@ -136,19 +129,15 @@ def test_a_picture_that_cannot_be_scored_is_named(
         pictures.score(pairs, QUICK, {}, FACTS, quiet_log)
 
 
-def test_what_a_run_rendered_has_its_figures_to_the_last_digit(
-    store: Store, stored_run: str, tiny_scene: Scene, tmp_path: Path, quiet_log: Log
-) -> None:
+def test_what_a_run_rendered_has_its_figures(store, stored_run, tiny_scene, tmp_path, quiet_log):
     kept = sorted((store.folder / stored_run / "pictures").glob("*-rendered.png"))
     measured = store.frames(stored_run).set_index("frame")
     measured = measured.loc[[int(path.stem.partition("-")[0]) for path in kept]]
-    images = {f"{name}.png": noise() for name in measured["name"]}
-    folder = write(tmp_path / "theirs", images)
-    for path, name in zip(kept, images, strict=True):
-        (folder / name).write_bytes(path.read_bytes())
+    names, folder = list(measured["name"]), write(tmp_path / "theirs", {})
+    for path, name in zip(kept, names, strict=True):
+        (folder / f"{name}.png").write_bytes(path.read_bytes())
     split = tiny_scene.splits["test"]
     truths = dict(zip(split.names, split.images, strict=True))
-    names = list(measured["name"])
     pairs = pictures.pairs_with_split(folder, Split([], [truths[name] for name in names], names))
     found = pictures.score(pairs, QUICK, {}, FACTS, quiet_log).frames
     for metric in ("psnr", "ssim"):

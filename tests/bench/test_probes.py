@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from bench import probes
 from bench.errors import Unavailable
 from bench.probes import FrameRecord, MemoryMeter, StageClock, device_waits, p99_to_p50
-from tests.pretended_gpu import PretendedGpu
 
 
 def clock_reading(times: Iterable[int]) -> StageClock:
@@ -171,7 +170,7 @@ def test_on_a_gpu_the_meter_reads_the_allocator(monkeypatch):
     assert "device" in meter.source
 
 
-def test_the_line_that_waits_or_calls_what_waits_in_torch_is_named(gpu: PretendedGpu) -> None:
+def test_the_line_that_waits_or_calls_what_waits_in_torch_is_named(gpu):
     x = torch.ones(3, device="cuda")
     with device_waits() as waits:
         for _ in range(2):
@@ -188,7 +187,7 @@ def test_the_line_that_waits_or_calls_what_waits_in_torch_is_named(gpu: Pretende
     assert (line.path, count) == (__file__, 1)
 
 
-def test_a_wait_in_a_backward_pass_is_that_of_its_line(gpu: PretendedGpu) -> None:
+def test_a_wait_in_a_backward_pass_is_that_of_its_line(gpu):
     class Asking(torch.autograd.Function):
         @staticmethod
         def forward(ctx, x):
@@ -206,7 +205,7 @@ def test_a_wait_in_a_backward_pass_is_that_of_its_line(gpu: PretendedGpu) -> Non
     assert (line.number, count) == (Asking.backward.__code__.co_firstlineno + 2, 1)
 
 
-def test_other_warnings_are_shown_as_ever_and_afterwards_none_is_counted(gpu: PretendedGpu) -> None:
+def test_other_warnings_are_shown_as_ever_and_afterwards_none_is_counted(gpu):
     with pytest.warns(UserWarning, match="of something else"), device_waits() as waits:
         warnings.warn("of something else", stacklevel=1)
     torch.ones(1, device="cuda").item()
@@ -215,6 +214,6 @@ def test_other_warnings_are_shown_as_ever_and_afterwards_none_is_counted(gpu: Pr
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="for a machine without a GPU")
-def test_without_a_gpu_it_says_that_one_is_needed() -> None:
+def test_without_a_gpu_it_says_that_one_is_needed():
     with pytest.raises(Unavailable, match="a GPU is needed"), device_waits():
         pass

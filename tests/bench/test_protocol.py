@@ -71,9 +71,7 @@ def test_every_metric_is_scored_and_a_missing_backbone_is_nan():
     assert scores["lpips_vgg"] == 0.5
 
 
-def test_backbones_that_cannot_be_had_are_named_with_the_reason_once_in_a_process(
-    monkeypatch, tmp_path, log, lpips_weights
-):
+def test_backbones_that_cannot_be_had_are_named_once(monkeypatch, tmp_path, log, lpips_weights):
     monkeypatch.setattr("bench.protocol._named", set())
     monkeypatch.setattr("bench.published._unreachable", ["no network"])
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))

@@ -227,9 +227,7 @@ def test_what_a_plugin_imports_of_ours_counts_and_not_where_it_lies(plugin, tree
     assert digest(thing) == before
 
 
-def test_a_single_file_counts_with_the_module_beside_it_that_it_imports(
-    tree, tmp_path, monkeypatch
-):
+def test_a_single_file_counts_with_the_module_that_it_imports(tree, tmp_path, monkeypatch):
     write(tmp_path / "site", {"single_file.py": "import its_helper\n", "its_helper.py": "A = 1\n"})
     monkeypatch.syspath_prepend(tmp_path / "site")
     importlib.invalidate_caches()
@@ -246,12 +244,9 @@ def test_libraries_are_those_that_the_sources_import_and_a_class_lists(tree):
     assert libraries(thing) == {"scipy": metadata.version("scipy")}
 
 
-def test_the_libraries_of_the_real_things_are_found_through_their_backends():
+def test_a_real_training_stands_on_its_backends_and_not_on_how_results_are_shown():
     assert {"torch", "numba"} <= libraries(train_field).keys()
     assert {"torch", "scipy", "torchvision", "scikit-image", "lpips"} <= libraries(measure).keys()
-
-
-def test_a_training_does_not_stand_on_how_results_are_kept_and_shown():
     names = provenance.sources(train_field)
     assert "methods/instant_ngp/training.py" in names
     assert not [name for name in names if name.startswith(("bench/results", "bench/console"))]

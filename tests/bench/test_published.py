@@ -9,20 +9,31 @@ import hashlib
 import io
 import socket
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 import torch
 
 from bench import published
-from bench.published import BACKBONES, fetch, get, load_features, locate, verify
+from bench.published import BACKBONES, Published, fetch, get, load_features, locate, verify
 from bench.types import SteerbenchError, Unavailable
-from tests.bench.scenes.releases import publish
+from sweeps.commands import scenes
 from tests.web import Web
 
 CONTENT = bytes(range(256)) * 600
 FILES = {"mic/train/r_0.png": b"a", "mic/test/r_0.png": b"b", "mic/test/r_0_depth_0000.png": b"c"}
 STATE = {"features.0.weight": torch.ones(2), "classifier.1.weight": torch.zeros(3)}
+
+
+def publish(monkeypatch: pytest.MonkeyPatch, files: Mapping[str, bytes], **where: str) -> Published:
+    """A data set of these files by their paths, the only one that is known."""
+    data = Published("release", "blender", "free", **where)
+    hashes = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    data.__dict__["hashes"] = hashes  # as if they had been read
+    for module in (published, scenes):
+        monkeypatch.setattr(module, "published", lambda: [data])
+    return data
 
 
 def found(folder: Path) -> dict[str, bytes]:
@@ -53,9 +64,7 @@ def download(web: Web, folder: Path, log) -> bytes:
     ],
     ids=["broken off", "another content", "not there"],
 )
-def test_a_download_that_fails_says_why_and_leaves_nothing(
-    web, tmp_path, quiet_log, files, end, said
-):
+def test_a_failed_download_says_why_and_leaves_nothing(web, tmp_path, quiet_log, files, end, said):
     web.files |= files
     web.breaks_after = end
     with pytest.raises(Unavailable, match=said):
@@ -71,7 +80,7 @@ def test_without_a_connection_the_message_says_so_in_two_words(tmp_path, quiet_l
         fetch(address, tmp_path / "file", None, quiet_log)
 
 
-def test_the_list_of_nerf_synthetic_is_the_whole_release() -> None:
+def test_the_list_of_nerf_synthetic_is_the_whole_release():
     official = next(data for data in published.published() if data.name == "nerf_synthetic")
     scenes = {"chair", "drums", "ficus", "hotdog", "lego", "materials", "mic", "ship"}
     assert official.scenes == scenes
@@ -82,7 +91,7 @@ def test_the_list_of_nerf_synthetic_is_the_whole_release() -> None:
     assert all(len(digest) == 64 for digest in official.hashes.values())
 
 
-def test_a_copy_of_fox_has_the_checksums_of_its_list(shared_data, quiet_log) -> None:
+def test_a_copy_of_fox_has_the_checksums_of_its_list(shared_data, quiet_log):
     if shared_data is None:
         pytest.skip("no data")
     report = verify(shared_data / "fox", quiet_log)
@@ -142,9 +151,7 @@ def release(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "release"
 
 
-def test_every_difference_is_named_and_links_out_of_the_copy_are_not_followed(
-    release, tmp_path, quiet_log
-) -> None:
+def test_every_difference_is_named_and_no_link_out_is_followed(release, tmp_path, quiet_log):
     for part, count in ((".", 3), ("chair", 2)):  # a release, or a scene of it
         report = verify(release / part, quiet_log)
         assert str(report) == f"{count} ok, 0 wrong, 0 missing, 0 extra"
@@ -187,9 +194,7 @@ def cache(tmp_path: Path) -> Path:
     return tmp_path / "torch" / "hub" / "checkpoints"
 
 
-def test_weights_dir_comes_before_the_environment_and_that_before_the_cache(
-    publisher, monkeypatch, tmp_path, quiet_log
-):
+def test_weights_dir_precedes_environment_and_cache(publisher, monkeypatch, tmp_path, quiet_log):
     folders = [tmp_path / "given", tmp_path / "environment", cache(tmp_path)]
     for folder in folders:
         folder.mkdir(parents=True)
@@ -200,9 +205,7 @@ def test_weights_dir_comes_before_the_environment_and_that_before_the_cache(
         (folder / "alexnet_features.pth").unlink()
 
 
-def test_weights_with_their_published_name_are_read_unless_they_are_damaged(
-    tmp_path, weights, quiet_log
-):
+def test_weights_with_their_published_name_are_read_unless_damaged(tmp_path, weights, quiet_log):
     name, content = weights
     (tmp_path / name).write_bytes(content)
     path, features = load_features("alex", tmp_path, quiet_log)
@@ -227,9 +230,7 @@ def test_a_file_that_would_run_code_is_refused_and_runs_none(tmp_path, quiet_log
     assert not (tmp_path / "attacked").exists()
 
 
-def test_weights_that_cannot_be_had_are_asked_for_once_and_the_message_says_what_to_do(
-    publisher, quiet_log
-):
+def test_missing_weights_are_asked_for_once_and_the_message_says_what_to_do(publisher, quiet_log):
     for net in ("vgg", "alex", "vgg"):
         with pytest.raises(Unavailable) as caught:
             locate(net, None, quiet_log)
@@ -238,9 +239,7 @@ def test_weights_that_cannot_be_had_are_asked_for_once_and_the_message_says_what
         assert part in str(caught.value)
 
 
-def test_downloaded_weights_are_kept_in_the_cache_if_they_are_right(
-    tmp_path, publisher, weights, quiet_log, monkeypatch
-):
+def test_downloaded_weights_are_kept_if_right(tmp_path, publisher, weights, quiet_log, monkeypatch):
     name, content = weights
     publisher.files[f"/{name}"] = content[:-1]
     with pytest.raises(Unavailable, match="SHA-256"):

@@ -34,19 +34,16 @@ def run(tiny_scene, quiet_log):
     return measured
 
 
-def value(rows, metric: str) -> float:
-    (found,) = rows.loc[rows["metric"] == metric, "value"]
-    return found
-
-
 def row(rows, metric: str) -> dict:
     (found,) = rows[rows["metric"] == metric].to_dict("records")
     return found
 
 
-def test_the_rows_have_every_column_of_the_store_but_what_the_store_adds(
-    run, offset_method, device
-):
+def value(rows, metric: str) -> float:
+    return row(rows, metric)["value"]
+
+
+def test_the_rows_have_every_column_but_what_the_store_adds(run, offset_method, device):
     rows = run(offset_method).rows
     assert set(rows.columns) == set(COLUMNS) - {"run", "commit"}
     what = {"method": "offset", "scene": "tiny", "split": "test", "trajectory": "test"}
@@ -72,9 +69,7 @@ def test_every_picture_is_decoded_before_the_training(run, offset_method, tiny_s
     assert offset_method.calls[:3] == ["decode", "decode", "fit"]
 
 
-def test_quality_is_the_mean_over_the_frames_of_the_protocols_scores(
-    run, offset_method, tiny_scene
-):
+def test_quality_is_the_mean_over_frames_of_the_protocols_scores(run, offset_method, tiny_scene):
     measured = run(offset_method)
     scores = []
     for image in tiny_scene.splits["test"].images:
@@ -220,9 +215,7 @@ def test_frames_without_ground_truth_are_timed_but_not_scored(run, offset_method
     assert math.isnan(value(run(offset_method, trajectory=unscored).rows, "psnr"))
 
 
-def test_the_exact_picture_of_a_scene_serves_flicker_when_the_protocol_asks(
-    run, offset_method, tiny_scene
-):
+def test_the_exact_picture_serves_flicker_when_the_protocol_asks(run, offset_method, tiny_scene):
     asked = []
 
     def exact(camera):
@@ -267,9 +260,7 @@ def test_a_rendering_with_nan_in_it_stops_the_run(run, offset_method):
         run(offset_method)
 
 
-def test_a_scene_on_another_background_stops_the_run_before_training(
-    run, offset_method, tiny_scene
-):
+def test_another_background_stops_the_run_before_training(run, offset_method, tiny_scene):
     with pytest.raises(SteerbenchError, match="background"):
         run(offset_method, scene=replace(tiny_scene, background=torch.zeros(3)))
     assert offset_method.calls == []
@@ -292,9 +283,7 @@ def test_frames_are_let_go_once_they_are_scored(run, offset_method):
     assert most <= 1
 
 
-def test_methods_in_turns_draw_each_frame_one_after_the_other_as_they_would_alone(
-    run, offset_method, tiny_scene, quiet_log
-):
+def test_methods_in_turns_draw_frames_as_if_alone(run, offset_method, tiny_scene, quiet_log):
     other = type(offset_method)(offset_method.settings()["device"], 16 / 255)
     task = Task(tiny_scene, from_split(tiny_scene), QUICK, BUDGET, seed=5)
     drawn = []

@@ -71,9 +71,7 @@ def test_a_file_that_is_not_ended_leaves_the_earlier_one_and_nothing_else(tmp_pa
 
 
 @pytest.mark.parametrize(("killed", "then"), [(False, "there"), (True, "to make")])
-def test_of_two_processes_the_second_waits_for_what_the_first_makes_or_for_its_end(
-    maker, killed, then
-):
+def test_of_two_processes_the_second_waits_for_the_first_or_its_end(maker, killed, then):
     with maker() as first:
         assert first.stdout.readline() == "to make\n"
         with maker() as second:

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from bench.cameras import look_at, scale_camera
+from bench.cameras import scale_camera
 from bench.motion import rotation_between
 from bench.trajectories import (
     Step,
@@ -34,6 +34,7 @@ from bench.trajectories import (
     write_path,
 )
 from bench.types import Camera, Scene, Split, SteerbenchError
+from tests.conftest import camera_on_orbit
 
 CONFIGS = Path(__file__).parents[2] / "sweeps" / "configs" / "trajectory"
 
@@ -83,11 +84,7 @@ def test_a_split_that_is_not_there_or_empty_is_named_with_those_that_are(tiny_sc
 
 def orbit_of(degrees: list[float]) -> Scene:
     """Cameras on a circle of radius 2 around the middle of the unit cube, looking at it."""
-    middle, up = torch.full((3,), 0.5), torch.tensor([0.0, 0.0, 1.0])
-    cameras = []
-    for angle in map(math.radians, degrees):
-        eye = middle + 2 * torch.tensor([math.cos(angle), math.sin(angle), 0.0])
-        cameras.append(Camera(look_at(eye, middle, up)[:3].float(), 60, 60, 20, 16, 40, 32))
+    cameras = [camera_on_orbit(angle / 360) for angle in degrees]
     images = [torch.zeros(32, 40, 4, dtype=torch.uint8)] * len(cameras)
     split = Split(cameras, images, [str(i) for i in range(len(cameras))])
     bounds = torch.tensor([[0.0] * 3, [1.0] * 3])
@@ -157,6 +154,8 @@ REFUSED = [
     (loop, {"frames": 0}, "frames: expected 1 or more, got 0"),
     (jump, {"every": 3}, "every: expected 1 to 2, .* got 3"),
     (jump, {"every": 0}, "every: expected 1 to 2"),
+    (spline, {"degrees": 0}, "degrees: expected"),
+    (spline, {"keys": 1}, "keys: expected"),
     (approached, {"lead": -1}, "lead: expected 0 or more"),
     (approached, {"degrees": 0}, "degrees: expected more than 0"),
     (approached, {"degrees": math.nan}, "degrees: expected more than 0"),
@@ -166,8 +165,8 @@ REFUSED = [
 
 @pytest.mark.parametrize(("make", "setting", "message"), REFUSED)
 def test_a_setting_out_of_its_range_is_refused_by_name(make, setting, message):
-    usual = {"split": "test", "lead": 3, "degrees": 3.3, "seed": 0, "limit": 0}
-    settings = (usual if make is approached else {}) | setting
+    approach = {"split": "test", "lead": 3, "degrees": 3.3, "seed": 0, "limit": 0}
+    settings = {approached: approach, spline: {"path": None}}.get(make, {}) | setting
     with pytest.raises(SteerbenchError, match=r"trajectory\." + message):
         make(orbit_of([0, 1, 2]), **settings)
 
@@ -209,12 +208,8 @@ def test_each_camera_is_approached_once_after_a_cut_from_a_motion_of_its_own(tin
     assert path.preceding == [0, 1, 2] * 6  # steady for a method that looks back on `lead` frames
     starts = [turn_deg(step.camera, path.steps[0].camera) for step in path.steps[::3]]
     assert len({round(start, 1) for start in starts}) == 6
-
     turns = [turn_deg(a.camera, b.camera) for a, b in pairwise(path.steps) if not b.cut]
     assert turns == pytest.approx([3.3] * 12, abs=0.05)
-
-
-def test_approaches_depend_on_lead_limit_and_seed(tiny_scene):
     path = approached(tiny_scene, "test", lead=0, degrees=3.3, seed=0, limit=0)
     assert [(step.truth, step.cut) for step in path.steps] == [(n, True) for n in range(6)]
     limited = approached(tiny_scene, "test", lead=1, degrees=3.3, seed=0, limit=3)
@@ -254,9 +249,9 @@ def viewer(*keyframes: dict[str, Any]) -> dict[str, Any]:
     return {"render_width": 40, "render_height": 30, "camera_path": list(keyframes)}
 
 
-def test_a_path_comes_back_as_it_was_written(scene: Scene, tmp_path: Path) -> None:
+def test_a_path_comes_back_as_it_was_written(scene, tmp_path):
     first = scene.splits["test"].cameras[0]
-    second = replace(first, c2w=first.c2w + torch.tensor([0.0, 0, 0, 0.125]))
+    second = moved(first, 0.125)
     write_path(tmp_path / "there.json", [first, second], scene)
     trajectory = follow(scene, str(tmp_path / "there.json"))
     assert trajectory.name == "there"
@@ -269,9 +264,7 @@ def test_a_path_comes_back_as_it_was_written(scene: Scene, tmp_path: Path) -> No
         assert step.camera.fy == pytest.approx(camera.fy)
 
 
-def test_a_key_frame_of_the_viewer_is_read_as_nerfstudio_means_it(
-    scene: Scene, tmp_path: Path
-) -> None:
+def test_a_key_frame_of_the_viewer_is_read_as_nerfstudio_means_it(scene, tmp_path):
     (step,) = follow(scene, stored(tmp_path, viewer(keyframe()))).steps
     camera = step.camera
     # 90 degrees from top to bottom: the focal length is half the height. y and z change signs.
@@ -280,9 +273,7 @@ def test_a_key_frame_of_the_viewer_is_read_as_nerfstudio_means_it(
     torch.testing.assert_close(camera.c2w, expected)  # (3, 0, 8) of the data set
 
 
-def test_a_transforms_file_gives_intrinsics_or_leaves_them_to_the_test_camera(
-    scene: Scene, tmp_path: Path
-) -> None:
+def test_a_transforms_file_gives_intrinsics_or_leaves_them_to_the_test_camera(scene, tmp_path):
     pose = [[1.0, 0, 0, 3], [0, 1, 0, 0], [0, 0, 1, 8], [0, 0, 0, 1]]
     given = {"fl_x": 30.0, "fl_y": 31.0, "cx": 9.0, "cy": 14.0}
     usual = replace(scene.splits["test"].cameras[0], fy=44.0, cx=15.0)
@@ -314,9 +305,7 @@ def test_a_transforms_file_gives_intrinsics_or_leaves_them_to_the_test_camera(
         ({"nothing": 1}, "frames: expected a list with at least one entry, got nothing"),
     ],
 )
-def test_a_damaged_path_is_named_with_what_was_expected(
-    scene: Scene, tmp_path: Path, record: dict, message: str
-) -> None:
+def test_a_damaged_path_is_named_with_what_was_expected(scene, tmp_path, record, message):
     with pytest.raises(SteerbenchError, match=message):
         follow(scene, stored(tmp_path, record))
     with pytest.raises(SteerbenchError, match=r"gone\.json: expected a file, got nothing there"):
@@ -327,9 +316,7 @@ def moved(camera: Camera, along: float) -> Camera:
     return replace(camera, c2w=camera.c2w + torch.tensor([0.0, 0, 0, along]))
 
 
-def test_the_keys_of_a_spline_are_a_splits_cameras_or_those_of_a_file(
-    scene: Scene, tmp_path: Path
-) -> None:
+def test_the_keys_of_a_spline_are_a_splits_cameras_or_those_of_a_file(scene, tmp_path):
     first = scene.splits["test"].cameras[0]
     cameras = [moved(first, 0.1 * index) for index in range(5)]
     images = scene.splits["test"].images * 5
@@ -346,12 +333,6 @@ def test_the_keys_of_a_spline_are_a_splits_cameras_or_those_of_a_file(
     assert of_file.reads == (tmp_path / "keys.json",)
 
 
-@pytest.mark.parametrize(("option", "value"), [("degrees", 0.0), ("keys", 1)])
-def test_a_spline_refuses_what_is_no_path(scene: Scene, option: str, value: float) -> None:
-    with pytest.raises(SteerbenchError, match=f"trajectory.{option}: expected"):
-        spline(scene, None, **{option: value})
-
-
 TARGET = torch.full((3,), 0.5)
 
 
@@ -359,7 +340,7 @@ def ring(degrees: list[float]) -> list[Camera]:
     return list(orbit_of(degrees).splits["test"].cameras)
 
 
-def test_a_spline_goes_through_its_keys_in_even_steps() -> None:
+def test_a_spline_goes_through_its_keys_in_even_steps():
     keys = ring([0, 30, 50, 90])
     pieces = leading(keys, TARGET, degrees=2.0)
     assert [piece[-1] for piece in pieces] == keys[1:]
@@ -370,7 +351,7 @@ def test_a_spline_goes_through_its_keys_in_even_steps() -> None:
         assert degrees.min() > 0.9 * degrees.max()
 
 
-def test_a_spline_has_no_corners() -> None:
+def test_a_spline_has_no_corners():
     keys = ring([0, 30, 60, 90, 120])
     path = [keys[0], *chain(*leading(keys, TARGET, degrees=1.0))]
     steps = torch.stack([camera.c2w[:, 3].double() for camera in path]).diff(dim=0)
@@ -379,7 +360,7 @@ def test_a_spline_has_no_corners() -> None:
     assert bends.max() < 2.0  # a circle bends by 1 degree a step, a chord's end by 30
 
 
-def test_a_camera_that_only_moves_is_led_in_steps_seen_from_the_target() -> None:
+def test_a_camera_that_only_moves_is_led_in_steps_seen_from_the_target():
     (first,) = ring([0])
     aside = torch.cat((torch.zeros(3, 3), torch.tensor([[0.0], [1.0], [0.0]])), dim=1)
     (piece,) = leading([first, replace(first, c2w=first.c2w + aside)], TARGET, degrees=1.0)
@@ -387,13 +368,10 @@ def test_a_camera_that_only_moves_is_led_in_steps_seen_from_the_target() -> None
     assert len(piece) == math.ceil(math.degrees(math.asinh(1 / 2)))
 
 
-@pytest.mark.parametrize("case", ["one key", "the same pose twice", "another size"])
-def test_a_spline_needs_different_keys_of_one_size(case: str) -> None:
+def test_a_spline_needs_different_keys_of_one_size():
     first, second = ring([0, 10])
-    keys = {
-        "one key": [first],
-        "the same pose twice": [first, first, second],
-        "another size": [first, scale_camera(second, 20, 16)],
-    }[case]
-    with pytest.raises(SteerbenchError, match="of one size" if "size" in case else "two cameras"):
-        leading(keys, TARGET, degrees=1.0)
+    for keys in ([first], [first, first, second]):
+        with pytest.raises(SteerbenchError, match="two cameras"):
+            leading(keys, TARGET, degrees=1.0)
+    with pytest.raises(SteerbenchError, match="of one size"):
+        leading([first, scale_camera(second, 20, 16)], TARGET, degrees=1.0)

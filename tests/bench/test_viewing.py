@@ -35,7 +35,7 @@ class Counting:
         return {"device": "cpu"}
 
 
-def test_only_the_newest_camera_of_a_browser_is_drawn() -> None:
+def test_only_the_newest_camera_of_a_browser_is_drawn_and_a_still_picture_gives_way() -> None:
     turns = Turns()
     older, newer = Ask(CAMERA), Ask(replace(CAMERA, fx=50.0))
     turns.want("a", older)
@@ -44,10 +44,6 @@ def test_only_the_newest_camera_of_a_browser_is_drawn() -> None:
     assert turns.next(0) == ("a", newer)  # who has waited longest
     assert turns.next(0) == ("b", older)
     assert turns.next(0) is None
-
-
-def test_a_still_picture_gives_way_to_a_camera_that_moves() -> None:
-    turns = Turns()
     moving, still = Ask(CAMERA), Ask(CAMERA, still=True)
     turns.want("a", moving)
     turns.offer("a", still)

@@ -108,7 +108,7 @@ def test_a_page_with_large_pictures_says_that_they_are_compressed(monkeypatch):
     assert "compressed for this page: WebP, quality 90" in publish.html_page(["# Title", frame], [])
 
 
-def test_every_line_and_every_mark_leads_to_its_run(several, parsed):
+def test_every_line_and_mark_leads_to_its_run_and_every_link_somewhere(several, parsed):
     keys = set(several[1])
     assert {f"run-{key}" for key in keys} <= set(parsed.values("id"))
     named = [line["data-runs"] for line in parsed.of("tr") if "data-runs" in line]
@@ -119,9 +119,6 @@ def test_every_line_and_every_mark_leads_to_its_run(several, parsed):
         f"#run-{key}" for key in keys
     }
     assert all("steerbench run method=offset" in line["title"] for line in parsed.of("tr") if line)
-
-
-def test_every_link_within_the_page_leads_somewhere(parsed):
     ids = parsed.values("id")
     assert len(ids) == len(set(ids))
     assert {link["href"][1:] for link in parsed.of("a")} <= set(ids)

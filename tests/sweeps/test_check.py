@@ -13,15 +13,14 @@ from bench.errors import SteerbenchError
 from bench.results import Store
 from reports.runs import readable
 from sweeps.cli import dispatch
+from tests.reports.conftest import rewrite
 
 
 @pytest.fixture
 def outputs(store: Store, stored_run: str) -> Path:
     """A folder of outputs with one run that says how it was made."""
-    path = store.folder / stored_run / "record.json"
-    record = json.loads(path.read_text())
-    record["command"] = "steerbench run scene=tiny method=offset outputs=somewhere"
-    path.write_text(json.dumps(record))
+    command = "steerbench run scene=tiny method=offset outputs=somewhere"
+    rewrite(store, stored_run, command=command)
     return store.folder.parent
 
 
@@ -89,7 +88,7 @@ def test_what_is_no_baseline_is_refused_with_the_way_to_make_one(text, outputs, 
 def test_two_runs_are_compared_by_the_beginning_of_their_keys(outputs, stored_run, capsys):
     assert dispatch(["compare", stored_run[:6], stored_run, "--outputs", str(outputs)]) == 0
     assert "psnr" in capsys.readouterr().out
-    with pytest.raises(SteerbenchError, match="the beginning of one key, got 0 runs"):
+    with pytest.raises(SteerbenchError, match="expected the beginning of one key, got 0 runs"):
         dispatch(["compare", "nothing", stored_run, "--outputs", str(outputs)])
 
 
@@ -116,8 +115,7 @@ def test_all_seeds_of_a_run_are_one_entry_and_none_may_be_missing(outputs, copy,
 
 
 def test_a_run_of_another_schema_is_left_out_and_not_compared(baseline, outputs, stored_run, copy):
-    record = json.loads((copy / "record.json").read_text())
-    (copy / "record.json").write_text(json.dumps(record | {"schema_version": 1}))
+    rewrite(Store(outputs), copy.name, schema_version=1)
     assert check(baseline, outputs) == 0
     assert [run.key for run in readable(Store(outputs))] == [stored_run]
     with pytest.raises(SteerbenchError, match=f"{copy.name}: its rows have schema 1; this version"):

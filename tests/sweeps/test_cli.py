@@ -74,6 +74,8 @@ def test_list_shows_backends_and_why_an_engine_cannot_be_used(steerbench, monkey
         (["parity", "--frames", "many"], "--frames: expected 1 or more, got many"),
         (["paper", "--table", "tabel1"], "unknown table 'tabel1'. Did you mean table1"),
         (["scenes", "verfy", "x"], "invalid choice: 'verfy'"),
+        (["scenes", "verify", os.curdir], "expected a folder chair or drums or"),
+        (["scenes", "get", "lgeo"], "lego"),
         # Options and settings are read in any order.
         (["scaling", "scene=totem", "--frames", "0", "budget=demo"], "--frames: expected 1"),
         (["report", "budget=tiny", "--table", "table3", "sed=1"], "unknown setting 'sed'"),

@@ -1,7 +1,8 @@
-"""Settings are in the configurations, each once, and a size changes only those that are there."""
+"""Settings are in the configurations, each once, and sizes and studies change what is there."""
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterator
 from dataclasses import MISSING, Field, fields, is_dataclass
 from functools import cache
@@ -11,7 +12,9 @@ import pytest
 from hydra.utils import get_object
 from omegaconf import OmegaConf
 
+from bench.study import Study, Variant
 from sweeps.overrides import CONFIGS, choices, composed, leaves
+from sweeps.variants import declared
 
 GROUPS = ("method", "scene", "trajectory", "protocol", "budget")
 CHOICES = [f"{group}={name}" for group in GROUPS for name in choices(group)]
@@ -52,10 +55,26 @@ def default(field: Field) -> Any:
     return field.default if field.default_factory is MISSING else field.default_factory()
 
 
+def test_every_scene_has_a_choice():
+    embedded = {"totem", "wires", "cloud", "void", "medley"}
+    assert choices("scene").keys() == {"blender", "colmap", "nsvf", "transforms", *embedded}
+
+
 @pytest.mark.parametrize("choice", CHOICES)
 def test_a_choice_says_what_it_is_and_composes_to_something_that_exists(choice):
     assert (CONFIGS / f"{choice.replace('=', '/')}.yaml").read_text().startswith("# ")
     assert callable(get_object(node(choice)["_target_"]))
+
+
+@pytest.mark.parametrize("name", choices("scene"))
+def test_a_scene_has_every_option_of_its_loader_and_no_other_default(name):
+    config = OmegaConf.to_container(OmegaConf.load(CONFIGS / "scene" / f"{name}.yaml"))
+    parameters = inspect.signature(get_object(config.pop("_target_"))).parameters
+    assert config.pop("_convert_") == "all"  # loaders take plain lists
+    unused = {"log"} if name == "medley" else {"log", "variant"}  # of medley alone
+    assert set(config) == set(parameters) - unused
+    for option in config.keys() - {"root", "bounds", "variant"}:
+        assert parameters[option].default in (config[option], inspect.Parameter.empty)
 
 
 OF_DATACLASSES = [x for x in CHOICES if x.startswith(("method", "budget", "protocol"))]
@@ -91,3 +110,61 @@ def test_a_size_changes_settings_that_are_there(path):
 )
 def test_a_budget_changes_a_setting_of_a_method_and_a_word_wins(words, steps):
     assert composed(["method=nerf", *words]).method.steps == steps
+
+
+# What our methods declare in their studies: the settings exist, and knobs need no training
+
+
+METHODS = [name for name, path in choices("method").items() if "_target_" in OmegaConf.load(path)]
+"""Those with a class of their own: the others declare what the method does that they vary."""
+
+
+@cache
+def study(name: str) -> Study:
+    return declared(composed([f"method={name}"]))
+
+
+@cache
+def trained(name: str, *settings: str) -> dict[str, Any]:
+    """What the training of a method depends on, by what it says itself."""
+    config = composed([f"method={name}", *settings])
+    node: Any = OmegaConf.to_container(config.method, resolve=True)
+    return {key: value for key, value in node.items() if key not in study(name).chosen}
+
+
+def variants(name: str, *kinds: str) -> list[Variant]:
+    """All settings of all knobs of these kinds."""
+    knobs = [each for kind in kinds for each in getattr(study(name), kind).values()]
+    return [variant for some in knobs for variant in some]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", METHODS)
+def test_one_training_serves_all_that_is_chosen_afterwards(name):
+    found = study(name)
+    off = [Variant(words, (f"{setting}=false",)) for words, setting in found.skips.items()]
+    exact = Variant("everything off", found.exact)
+    for variant in (*variants(name, "knobs"), *found.savings, *off, exact):
+        assert trained(name, *variant.settings) == trained(name), variant.name
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_other_knobs_need_a_training_each(name):
+    trainings = [trained(name)]
+    for variant in variants(name, "trained"):
+        trainings.append(trained(name, *variant.settings))
+        assert trainings.count(trainings[-1]) == 1, variant.name
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_what_is_declared_can_be_set_and_has_names_of_its_own(name):
+    found = study(name)
+    names = [variant.name for variant in variants(name, "knobs", "trained")]
+    assert len(set(names)) == len(names)
+    assert set(found.chosen) <= composed([f"method={name}"]).method.keys()
+    for axis in found.axes.values():
+        for value in axis.values:
+            composed([f"method={name}", f"{axis.setting}={value}"])
+        assert axis.size is None or len(axis.size) == len(axis.values)
+    for settings in found.beside.values():
+        composed(settings)

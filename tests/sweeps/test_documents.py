@@ -86,9 +86,7 @@ def typed(command: str) -> list[str]:
 WITHOUT_LPIPS = ("protocol.lpips=[]", "protocol.name=quick")
 
 
-def test_method_and_scene_of_the_document_are_listed_measured_and_studied_from_outside(
-    steerbench, mine, monkeypatch
-):
+def test_what_the_document_makes_is_listed_measured_and_studied(steerbench, mine, monkeypatch):
     assert "The mean colour of the training pictures." in steerbench(*typed("list")).out
     measured = steerbench(*typed("run"), *WITHOUT_LPIPS)
     assert measured.status == 0, measured.err
@@ -212,18 +210,13 @@ def settings_there_are() -> set[str]:
     return found
 
 
-def test_every_setting_of_a_document_exists():
-    there = settings_there_are()
-    pattern = re.compile(rf"`((?:{'|'.join(GROUPS)})\.[a-z_0-9.]+)[`=]")
+def test_every_setting_and_every_choice_of_a_document_exists():
+    there, groups = settings_there_are(), "|".join(GROUPS)
     for path in PRESENT:
-        for name in pattern.findall(path.read_text()):
+        text = path.read_text()
+        for name in re.findall(rf"`((?:{groups})\.[a-z_0-9.]+)[`=]", text):
             assert name in there, f"{named(path)}: {name}"
-
-
-def test_every_choice_of_a_document_exists():
-    pattern = re.compile(rf"`({'|'.join(GROUPS)})=(\w[\w-]*)[`\s]")
-    for path in PRESENT:
-        for group, name in pattern.findall(path.read_text()):
+        for group, name in re.findall(rf"`({groups})=(\w[\w-]*)[`\s]", text):
             if name not in {"my_engine", "mine"}:
                 assert name in choices(group), f"{named(path)}: {group}={name}"
 
@@ -260,13 +253,3 @@ def test_every_equation_of_the_paper_has_a_place():
     text = (DOCS / "steernerf.md").read_text()
     numbers = re.findall(r"^\| (\d+) \|.*\| `[\w/]+\.py`: `", text, re.MULTILINE)
     assert [int(number) for number in numbers] == list(range(1, 12))
-
-
-def test_the_citation_names_the_version_and_the_paper():
-    text = (ROOT / "CITATION.cff").read_text()
-    project = (ROOT / "pyproject.toml").read_text()
-    (version,) = re.findall(r'^version = "(.*)"$', project, re.MULTILINE)
-    citation: Any = OmegaConf.to_container(OmegaConf.create(text))
-    assert citation["version"] == version
-    assert citation["license"] == "MIT"
-    assert "2212.08476" in text

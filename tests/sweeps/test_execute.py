@@ -1,4 +1,4 @@
-"""How jobs end and what they leave behind; trainings side by side, which measurements find."""
+"""How jobs end and what they leave behind; methods in turns; trainings side by side."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bench.errors import SteerbenchError
 from sweeps import execute
 from sweeps.commands.run import label
 from sweeps.execute import Ended, read
-from sweeps.measurement import Job
+from sweeps.measurement import Job, obtain, stored
 from sweeps.overrides import composed
 from sweeps.plan import chosen, plan
 from tests.sweeps.conftest import HERE, STAND_INS
@@ -56,6 +56,54 @@ def test_a_failure_that_cannot_be_kept_is_printed_all_the_same(tmp_path, monkeyp
     printed = capsys.readouterr().err
     assert "failed: a job: the cause" in printed
     assert "cannot write to" in printed
+
+
+# Several methods in turns, and what the store has of them
+
+
+def in_turns(*levels: float, turns: str = "table") -> list[Job]:
+    configs = [composed([*STAND_INS, f"method.level={level}"]) for level in levels]
+    return [Job(config, [], turns=turns) for config in configs]
+
+
+def measured(*levels: float, turns: str = "table") -> bool:
+    """Whether the jobs of the levels had to be measured."""
+    return obtain(in_turns(*levels, turns=turns))[1]
+
+
+def test_lines_that_are_measured_in_turns_are_found_together_or_not_at_all(elsewhere):
+    """A table of times must not have one line of today beside one of last week."""
+    assert measured(0.5, 0.75)
+    assert len(stored(in_turns(0.5, 0.75))) == 2
+    assert stored(in_turns(0.5, 0.25)) == []
+    assert measured(0.5, 0.25)
+    assert not measured(0.75, 0.5)
+
+
+def test_what_an_interruption_left_of_a_group_is_measured_again_with_the_rest(elsewhere):
+    store = in_turns(0.5)[0].store
+    (first, second), _ = obtain(in_turns(0.5, 0.75))
+    mark = store.folder / first / "of yesterday"
+    mark.touch()
+    store.remove(second)
+    assert stored(in_turns(0.5, 0.75)) == []
+    assert measured(0.5, 0.75)
+    assert not mark.exists()
+    assert stored(in_turns(0.5, 0.75)) == [first, second]
+
+
+def test_a_line_alone_is_another_run_than_the_same_in_turns(elsewhere):
+    (alone,), _ = obtain(in_turns(0.5, turns=""))
+    assert alone not in obtain(in_turns(0.5, 0.75))[0]
+    assert not measured(0.5, turns="")
+
+
+def test_a_failure_is_kept_for_its_job_until_that_succeeds(elsewhere):
+    (job,), (other,) = in_turns(0.5, turns=""), in_turns(0.75, turns="")
+    job.keep_failure("no room")
+    assert (job.failure, other.failure) == ("no room", None)
+    obtain([job])
+    assert job.failure is None
 
 
 # Trainings side by side

@@ -27,13 +27,23 @@ UNKNOWN = [
           for word in ("demo", "a=b=c", "scene.path=[")),
         ("method=steernerf field=nerf", "field: each method brings its own"),
         ("scene=blender", "scene.path is not set: give scene.path=...\n"),
+        ("method.level=7", "method.level: expected 0 to 1, got 7\n"),
+        ("split=holdout", "split: expected test or validation, got 'holdout'\n"),
+        ("seed=one", "seed: expected int, got 'one'\n"),
+        ("seed=-1", "seed: expected 0 or more, got -1\n"),
+        ("threads=0", "threads: expected 1 or more, or null, got 0\n"),
+        ("device=gpu", "device: expected auto, cpu, cuda or cuda:N, got gpu\n"),
+        ("report=3", "report: expected str | None, got 3\n"),
+        ("scene.frames=many", "scene.frames: expected int, got 'many'\n"),
+        ("budget.steps=true", "budget.steps: expected int, got True\n"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_named_in_one_line(run, words, said):
+def test_what_is_wrong_is_named_in_one_line(run, tmp_path, words, said):
     outcome = run(*words.split())
     assert (outcome.status, outcome.out) == (2, "")
     assert outcome.err.startswith(f"steerbench: {said}")
     assert outcome.err.count("\n") == 1
+    assert list(tmp_path.glob("outputs/runs/*")) == []
 
 
 @pytest.mark.parametrize(

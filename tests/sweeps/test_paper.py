@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
@@ -23,6 +22,7 @@ from sweeps.commands import paper
 from sweeps.commands.paper import gather, newest
 from sweeps.measurement import Job, described
 from sweeps.plan import DataSet, Planned, chosen, plan
+from tests.reports.conftest import rewrite
 from tests.sweeps.conftest import CONFIGS, HERE
 from tests.sweeps.test_plan import blender
 
@@ -59,17 +59,16 @@ def measured(
     return asked
 
 
-def put(store: Store, source: str, config: DictConfig) -> str:
+def put(store: Store, source: str, config: DictConfig, key: str = "") -> str:
     """A copy of the run `source` as that of `config`."""
     parts = {"config": described(config)}
-    key = store.key(parts)
+    key = key or store.key(parts)
     if store.find(key) is None:
         folder = shutil.copytree(store.folder / source, store.folder / key)
         for file in ("rows.csv", "record.json"):
             text = (folder / file).read_text().replace(source, key)
             (folder / file).write_text(text)
-        record = json.loads((folder / "record.json").read_text()) | {"made_of": parts}
-        (folder / "record.json").write_text(json.dumps(record))
+        rewrite(store, key, made_of=parts)
     return key
 
 
@@ -95,9 +94,7 @@ def test_the_jobs_go_where_hydras_launcher_puts_them(steerbench, measured, launc
     assert launched == [len(measured)]
 
 
-def test_what_cannot_run_here_says_so_in_its_line_and_does_not_fail(
-    steerbench, monkeypatch, outputs
-):
+def test_what_cannot_run_here_says_so_and_does_not_fail(steerbench, monkeypatch, outputs):
     def obtain(*_: object) -> None:
         raise Unavailable("no bfloat16 on this CPU")
 
@@ -108,9 +105,7 @@ def test_what_cannot_run_here_says_so_in_its_line_and_does_not_fail(
     assert labels(page)[0] == "L = 0: failed: no bfloat16 on this CPU"
 
 
-def test_a_report_has_what_is_there_and_measures_nothing(
-    steerbench, measured, outputs, store, stored_run
-):
+def test_a_report_has_what_is_there_alone(steerbench, measured, outputs, store, stored_run):
     jobs = plan(TABLE3, [outputs, "seed=0"])
     put(store, stored_run, jobs[1].config)
     jobs[2].keep_failure("killed")
@@ -168,17 +163,11 @@ def job(folder: Path) -> Planned:
 def scenes(store: Store, stored_run: str, tmp_path: Path) -> Store:
     """A store with the job measured in a/mic and then in b/mic, scenes that differ."""
     for number, name in enumerate("ab"):
-        key = f"{number}{stored_run[1:]}"
-        folder = shutil.copytree(store.folder / stored_run, store.folder / key)
         path = tmp_path / name / "mic"
         path.mkdir(parents=True)
-        record = json.loads((folder / "record.json").read_text())
-        record["made_of"] = {"config": described(job(path).config)}
-        record["scene"]["digest"], record["scene_path"] = name, str(path)
-        (folder / "record.json").write_text(json.dumps(record))
-        rows = (folder / "rows.csv").read_text().replace(stored_run, key)
-        (folder / "rows.csv").write_text(rows)
-        os.utime(folder, (number, number))
+        key = put(store, stored_run, job(path).config, f"{number}{stored_run[1:]}")
+        rewrite(store, key, scene={"digest": name}, scene_path=str(path))
+        os.utime(store.folder / key, (number, number))
     return store
 
 
@@ -192,9 +181,7 @@ def scenes(store: Store, stored_run: str, tmp_path: Path) -> Store:
         ("gone", None, ["b"]),  # not here: the last run is shown
     ],
 )
-def test_of_folders_with_one_name_each_shows_its_own(
-    scenes, tmp_path, monkeypatch, tiny_scene, folder, digest, found
-):
+def test_folders_show_their_own(scenes, tmp_path, monkeypatch, tiny_scene, folder, digest, found):
     def loaded(*contents: object) -> Scene:
         assert digest, f"loads {contents}"
         return replace(tiny_scene, digest=digest)

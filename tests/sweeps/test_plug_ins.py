@@ -185,15 +185,12 @@ def plugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
     plug_ins.cache_clear()
 
 
-def test_a_package_that_cannot_be_imported_is_a_line(plugged, steerbench):
+def test_a_package_that_cannot_be_imported_or_is_not_there_is_a_line(plugged, steerbench):
     plugged("broken.configs", {"broken/__init__.py": "import nothing_of_this_name\n"})
     listed = steerbench("list")
     assert listed.status == 0
     assert "other (other 2.0)" in listed.out
     assert "No module named 'nothing_of_this_name'" in " ".join(listed.out.split())
-
-
-def test_an_entry_that_leads_nowhere_says_so(plugged):
     assert plugged("nowhere_at_all") == "there is no package nowhere_at_all"
 
 

@@ -187,26 +187,6 @@ def test_outputs_that_cannot_be_written_are_named(run, tmp_path):
     assert "outputs=DIR" in outcome.err
 
 
-@pytest.mark.parametrize(
-    ("argument", "message"),
-    [
-        ("method.level=7", "method.level: expected 0 to 1, got 7"),
-        ("split=holdout", "split: expected test or validation, got 'holdout'"),
-        ("seed=one", "seed: expected int, got 'one'"),
-        ("seed=-1", "seed: expected 0 or more, got -1"),
-        ("threads=0", "threads: expected 1 or more, or null, got 0"),
-        ("device=gpu", "device: expected auto, cpu, cuda or cuda:N, got gpu"),
-        ("report=3", "report: expected str | None, got 3"),
-        ("scene.frames=many", "scene.frames: expected int, got 'many'"),
-        ("budget.steps=true", "budget.steps: expected int, got True"),
-    ],
-)
-def test_a_wrong_setting_is_one_line_with_what_was_expected(run, tmp_path, argument, message):
-    outcome = run(argument)
-    assert (outcome.status, outcome.err) == (2, f"steerbench: {message}\n")
-    assert stored(tmp_path) == []
-
-
 # How a run ends that does not end by itself
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.bench.scenes.releases import publish
+from tests.bench.test_published import publish
 
 
 def test_a_damaged_file_is_named_and_fails(steerbench, tmp_path, monkeypatch):
@@ -21,12 +21,6 @@ def test_a_damaged_file_is_named_and_fails(steerbench, tmp_path, monkeypatch):
     assert steerbench("scenes", "verify", "mic").status == 0
 
 
-def test_a_folder_of_something_else_is_an_error(steerbench, tmp_path):
-    outcome = steerbench("scenes", "verify", str(tmp_path))
-    assert outcome.status == 2
-    assert "expected a folder chair or drums or" in outcome.err
-
-
 def test_get_says_how_to_run_on_what_it_got(steerbench, monkeypatch, web, tmp_path):
     publish(monkeypatch, {"mic/a.png": b"a", "lego/a.png": b"b"}, folder=web.address)
     web.files = {"/mic/a.png": b"a", "/lego/a.png": b"b"}
@@ -36,9 +30,3 @@ def test_get_says_how_to_run_on_what_it_got(steerbench, monkeypatch, web, tmp_pa
     assert "licence: free" in outcome.out
     assert (tmp_path / "mine/release/mic/a.png").read_bytes() == b"a"
     assert steerbench("scenes", "verify", "mine/release").status == 0
-
-
-def test_the_nearest_name_of_a_scene_is_proposed(steerbench):
-    outcome = steerbench("scenes", "get", "lgeo")
-    assert outcome.status == 2
-    assert "lego" in outcome.err

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,9 +11,7 @@ from bench.errors import SteerbenchError, Unavailable
 from sweeps.commands.render import recorded
 
 
-def test_a_video_shows_its_pictures_in_turn_and_what_is_no_video_is_one_line(
-    tmp_path: Path,
-) -> None:
+def test_a_video_shows_its_pictures_in_turn_and_what_is_no_video_is_one_line(tmp_path):
     av = pytest.importorskip("av")
     levels = (40, 120, 200)
     with recorded(tmp_path / "a.mp4", fps=10) as take:
@@ -32,9 +29,7 @@ def test_a_video_shows_its_pictures_in_turn_and_what_is_no_video_is_one_line(
         take(np.zeros((8, 8, 3), np.uint8))
 
 
-def test_without_pyav_it_says_how_to_get_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_pyav_it_says_how_to_get_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     refused = pytest.raises(Unavailable, match=r"pip install .*\[video\]")
     with refused, recorded(tmp_path / "a.mp4", fps=10):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import struct
 import zlib
@@ -32,6 +33,15 @@ def png(header: bytes, data: bytes) -> bytes:
         struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
         for kind, body in chunks
     )
+
+
+def encoded(
+    mode: str, kind: str = "PNG", size: tuple[int, int] = (8, 6), colour: int | tuple = 0
+) -> bytes:
+    """The file of a picture of one colour."""
+    file = io.BytesIO()
+    Image.new(mode, size, colour).save(file, kind)
+    return file.getvalue()
 
 
 def picture(seed: int, width: int = 8, height: int = 6, channels: int = 4) -> np.ndarray:

@@ -31,7 +31,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("scenes")
 
 
-def test_a_scene_is_written_once_in_the_layout_of_nerf_synthetic(tmp_path, log) -> None:
+def test_a_scene_is_written_once_in_the_layout_of_nerf_synthetic(tmp_path, log):
     options = {**SMALL, "bounds": "full", "root": tmp_path}
     first = analytic.load("void", **options, log=log)
     written = log.done
@@ -51,7 +51,7 @@ def test_a_scene_is_written_once_in_the_layout_of_nerf_synthetic(tmp_path, log) 
     assert len(list(tmp_path.iterdir())) == 6
 
 
-def test_who_finishes_second_accepts_the_scene_of_the_first(tmp_path, log, monkeypatch) -> None:
+def test_who_finishes_second_accepts_the_scene_of_the_first(tmp_path, log, monkeypatch):
     rename = Path.rename
 
     def overtaken(scene: Path, folder: Path) -> Path:
@@ -64,7 +64,7 @@ def test_who_finishes_second_accepts_the_scene_of_the_first(tmp_path, log, monke
     assert not (folder / "scene").exists()
 
 
-def test_a_scene_knows_its_picture_at_any_camera_as_its_splits_have_it(drawn, log, name) -> None:
+def test_a_scene_knows_its_picture_at_any_camera_as_its_splits_have_it(drawn, log, name):
     scene = analytic.load(name, **SMALL, root=drawn, log=log)
     assert scene.exact is not None
     test = scene.splits["test"]
@@ -78,7 +78,7 @@ def test_a_scene_knows_its_picture_at_any_camera_as_its_splits_have_it(drawn, lo
     assert find(name).boxes().abs().max() <= 1.2
 
 
-def test_the_totem_fills_but_does_not_leave_its_pictures() -> None:
+def test_the_totem_fills_but_does_not_leave_its_pictures():
     for pose in orbit_poses(24)[::6]:
         camera = Camera(pose.float(), 139.0, 139.0, 50, 50, 100, 100)
         alpha = render(find("totem"), camera, torch.ones(3), samples=4).alpha
@@ -87,7 +87,7 @@ def test_the_totem_fills_but_does_not_leave_its_pictures() -> None:
         assert alpha.mean() > 0.2
 
 
-def test_the_orbit_is_smooth_and_closes() -> None:
+def test_the_orbit_is_smooth_and_closes():
     eyes = torch.stack([pose[:, 3] for pose in orbit_poses(360)])
     steps = (eyes - eyes.roll(1, 0)).norm(dim=1)  # the last step joins the ends
     one_degree = 2 * analytic.DISTANCE * math.sin(math.radians(0.5))
@@ -96,7 +96,7 @@ def test_the_orbit_is_smooth_and_closes() -> None:
     assert steps.max() <= one_degree * math.hypot(math.cos(math.radians(17)), 16 / 57.3) * 1.001
 
 
-def test_training_poses_look_at_the_middle_from_one_distance() -> None:
+def test_training_poses_look_at_the_middle_from_one_distance():
     poses = torch.stack(train_poses(50, seed=3))
     eyes = poses[:, :, 3]
     assert eyes.norm(dim=1).tolist() == pytest.approx([analytic.DISTANCE] * 50)
@@ -110,7 +110,7 @@ def test_training_poses_look_at_the_middle_from_one_distance() -> None:
 
 
 @pytest.mark.parametrize("fault", [KeyboardInterrupt, OSError("no space left on device")])
-def test_a_broken_write_leaves_nothing(tmp_path, monkeypatch, log, fault) -> None:
+def test_a_broken_write_leaves_nothing(tmp_path, monkeypatch, log, fault):
     def fail(*args: object, **kwargs: object) -> None:
         raise fault
 
@@ -120,7 +120,7 @@ def test_a_broken_write_leaves_nothing(tmp_path, monkeypatch, log, fault) -> Non
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_root_that_cannot_be_written_is_named(tmp_path: Path, log) -> None:
+def test_a_root_that_cannot_be_written_is_named(tmp_path, log):
     (tmp_path / "file").write_text("")
     with pytest.raises(SteerbenchError, match=r"file/void-\w+: the scene cannot be written"):
         analytic.load("void", **SMALL, root=tmp_path / "file", log=log)
@@ -139,12 +139,12 @@ def test_a_root_that_cannot_be_written_is_named(tmp_path: Path, log) -> None:
         ({"name": "medley", "variant": "7"}, "variant: expected a whole number from 0 on"),
     ],
 )
-def test_bad_options(tmp_path, log, options, message) -> None:
+def test_bad_options(tmp_path, log, options, message):
     with pytest.raises(SteerbenchError, match=message):
         analytic.load(**{"name": "void", **options}, root=tmp_path, log=log)
 
 
-def test_unknown_names_are_refused(tmp_path, log) -> None:
+def test_unknown_names_are_refused(tmp_path, log):
     known = "one of totem, wires, cloud, void, medley-0, medley-1 and so on"
     for name in ("tower", "medley-", "medley--1", "medley-07", "medley-1.5"):
         with pytest.raises(Unavailable, match=f"{known}, got '{name}'"):
@@ -152,9 +152,7 @@ def test_unknown_names_are_refused(tmp_path, log) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_variants_of_medley_are_scenes_of_their_own_and_each_is_always_the_same(
-    tmp_path, log
-) -> None:
+def test_variants_of_medley_are_scenes_of_their_own_and_each_is_always_the_same(tmp_path, log):
     scenes = [
         analytic.load("medley", variant=variant, **SMALL, root=tmp_path / place, log=log)
         for variant, place in ((7, "a"), (8, "a"), (7, "b"))

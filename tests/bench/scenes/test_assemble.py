@@ -83,7 +83,7 @@ def hull_of(part: Part, poses: list) -> Box:
     st.integers(0, 1000),
 )
 @settings(max_examples=15)
-def test_no_point_of_the_surface_is_outside_the_hull(centre, radii, seed) -> None:
+def test_no_point_of_the_surface_is_outside_the_hull(centre, radii, seed):
     box = hull_of(Part(Ellipsoid(radii), RED, centre), train_poses(8, seed))
     # The surface's outermost points are its centre +- its semi-axes.
     middle, reach = torch.tensor(centre).double(), torch.tensor(radii).double()
@@ -91,7 +91,7 @@ def test_no_point_of_the_surface_is_outside_the_hull(centre, radii, seed) -> Non
     assert (box.upper >= middle + reach).all()
 
 
-def test_the_hull_of_many_views_is_tight() -> None:
+def test_the_hull_of_many_views_is_tight():
     poses = train_poses(24, 0) + [pose_on_sphere(k, -0.4) for k in range(6)]
     box = hull_of(Part(Ellipsoid((0.3, 0.3, 0.3)), RED), poses)
     # A pixel is 4 / 45 wide there; the hull has up to 2 of them and a cell of 3 / 64 more.
@@ -99,7 +99,7 @@ def test_the_hull_of_many_views_is_tight() -> None:
     assert (box.upper - box.lower).max() <= (0.6 + 2 * slack) * 1.05
 
 
-def test_blocks_drop_no_cell_that_would_be_kept(monkeypatch) -> None:
+def test_blocks_drop_no_cell_that_would_be_kept(monkeypatch):
     part = Part(Ellipsoid((0.2, 0.5, 0.1)), RED, (0.3, -0.2, 0.1))
     box = hull_of(part, train_poses(20, 3))
     monkeypatch.setattr(assemble, "GLANCES", 0)
@@ -108,7 +108,7 @@ def test_blocks_drop_no_cell_that_would_be_kept(monkeypatch) -> None:
     assert torch.equal(box.upper, cell_by_cell.upper)
 
 
-def test_cells_that_leave_the_picture_are_kept() -> None:
+def test_cells_that_leave_the_picture_are_kept():
     # One view sees only the middle of space: what it does not see, it cannot rule out.
     narrow = Camera(pose_on_sphere(0.0, 0.0).float(), 400.0, 400.0, 16, 16, SIZE, SIZE)
     nothing = torch.zeros(SIZE, SIZE, 4, dtype=torch.uint8)
@@ -124,7 +124,7 @@ def test_cells_that_leave_the_picture_are_kept() -> None:
 
 
 @pytest.mark.parametrize("alpha", [0, 255])
-def test_no_hull_without_a_mask(alpha) -> None:
+def test_no_hull_without_a_mask(alpha):
     cameras = [camera(pose) for pose in train_poses(40, 0)]
     image = torch.full((SIZE, SIZE, 4), alpha, dtype=torch.uint8)
     assert hull_box(cameras, [image] * 40, cube(1.2)) is None

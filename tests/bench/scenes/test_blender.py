@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import shutil
 import struct
@@ -15,10 +14,10 @@ from PIL import Image
 from bench.cameras import move_camera
 from bench.scenes import blender
 from bench.types import SteerbenchError
-from tests.bench.scenes.conftest import edit_json, picture, png
+from tests.bench.scenes.conftest import edit_json, encoded, picture, png
 
 
-def test_pictures_are_read_byte_for_byte(blender_folder, log) -> None:
+def test_pictures_are_read_byte_for_byte(blender_folder, log):
     scene = blender.load(blender_folder, log=log)
     assert scene.name == "chair"
     assert {name: len(split) for name, split in scene.splits.items()} == {"train": 3, "test": 2}
@@ -28,7 +27,7 @@ def test_pictures_are_read_byte_for_byte(blender_folder, log) -> None:
     assert scene.splits["train"].names == ["train/r_0.png", "train/r_1.png", "train/r_2.png"]
 
 
-def test_cameras_are_opencv_and_the_units_can_be_undone(blender_folder, log) -> None:
+def test_cameras_are_opencv_and_the_units_can_be_undone(blender_folder, log):
     scene = blender.load(blender_folder, bounds=[[-1, -1, -2], [1, 1, 2]], log=log)
     camera = scene.splits["train"].cameras[0]
     assert camera.fx == camera.fy == pytest.approx(4 / math.tan(0.35))
@@ -42,7 +41,7 @@ def test_cameras_are_opencv_and_the_units_can_be_undone(blender_folder, log) -> 
     torch.testing.assert_close(back.c2w[:, 3], torch.tensor([0.0, -4, 0]))
 
 
-def test_opaque_pictures_take_the_whole_space(blender_folder, log) -> None:
+def test_opaque_pictures_take_the_whole_space(blender_folder, log):
     for k in range(3):
         Image.fromarray(picture(k, channels=3)).save(blender_folder / "train" / f"r_{k}.png")
     scene = blender.load(blender_folder, log=log)
@@ -52,14 +51,14 @@ def test_opaque_pictures_take_the_whole_space(blender_folder, log) -> None:
     assert scene.splits["train"].images[0].shape == (6, 8, 3)
 
 
-def test_paths_may_have_their_extension(blender_folder, log) -> None:
+def test_paths_may_have_their_extension(blender_folder, log):
     extended = {"file_path": "test/r_0.png"}
     edit_json(blender_folder / "transforms_test.json", lambda r: r["frames"][0].update(extended))
     scene = blender.load(blender_folder, log=log)
     assert scene.splits["test"].names == ["test/r_0.png", "test/r_1.png"]
 
 
-def test_a_validation_split_has_all_its_pictures_or_none(blender_folder, log) -> None:
+def test_a_validation_split_has_all_its_pictures_or_none(blender_folder, log):
     text = (blender_folder / "transforms_train.json").read_text().replace("./train", "./val")
     (blender_folder / "transforms_val.json").write_text(text)
     scene = blender.load(blender_folder, bounds="full", log=log)
@@ -71,9 +70,7 @@ def test_a_validation_split_has_all_its_pictures_or_none(blender_folder, log) ->
         blender.load(blender_folder, log=log)
 
 
-def test_the_digest_depends_on_content_and_options_not_on_the_place(
-    blender_folder, tmp_path, log
-) -> None:
+def test_the_digest_depends_on_content_and_options_not_on_the_place(blender_folder, tmp_path, log):
     def digest(**options) -> str:
         return blender.load(copy, **options, log=log).digest
 
@@ -128,18 +125,12 @@ def placed(place: tuple[int, int], value: float):
         ),
     ],
 )
-def test_bad_camera_file_names_file_and_field(blender_folder, log, change, message) -> None:
+def test_bad_camera_file_names_file_and_field(blender_folder, log, change, message):
     edit_json(blender_folder / "transforms_train.json", change)
     with pytest.raises(
         SteerbenchError, match=r"transforms_train\.json: (frames\[1\]\.)?" + message
     ):
         blender.load(blender_folder, log=log)
-
-
-def encoded(*shape: int, dtype: str = "uint8") -> bytes:
-    file = io.BytesIO()
-    Image.fromarray(np.ones(shape, dtype)).save(file, "png")
-    return file.getvalue()
 
 
 # Black RGB of 16 bits a channel. Pillow cannot write it, and reads half of each number.
@@ -154,16 +145,14 @@ DEEP = png(struct.pack(">2I5B", 8, 6, 16, 2, 0, 0, 0), bytes(6 * (1 + 6 * 8)))
         ("transforms_test.json", b"[" * 100_000, r": expected JSON, got"),
         ("transforms_test.json", b"\xff\xfe\x00{", r": .* readable text file"),
         ("transforms_test.json", None, r": expected a file"),
-        ("train/r_2.png", encoded(6, 8, 3)[:-40], r": expected a whole picture"),
+        ("train/r_2.png", encoded("RGB")[:-40], r": expected a whole picture"),
         ("train/r_0.png", b"not a picture", r": expected a whole picture"),
-        ("train/r_1.png", encoded(6, 7), r": expected 8 x 6 pixels, got 7 x 6"),
-        ("train/r_1.png", encoded(6, 8, dtype="uint16"), r": expected 8 bits a channel"),
+        ("train/r_1.png", encoded("L", size=(7, 6)), r": expected 8 x 6 pixels, got 7 x 6"),
+        ("train/r_1.png", encoded("I;16"), r": expected 8 bits a channel"),
         ("train/r_1.png", DEEP, r": expected 8 bits a channel"),
     ],
 )
-def test_a_file_that_is_damaged_or_missing_is_named(
-    blender_folder, log, file, content, message
-) -> None:
+def test_a_file_that_is_damaged_or_missing_is_named(blender_folder, log, file, content, message):
     path = blender_folder / file
     path.unlink() if content is None else path.write_bytes(content)
     with pytest.raises(SteerbenchError, match=path.name + message):
@@ -171,7 +160,7 @@ def test_a_file_that_is_damaged_or_missing_is_named(
 
 
 @pytest.mark.parametrize("what", ["train/r_1.png", "transforms_train.json"])
-def test_link_out_of_the_folder_is_refused(blender_folder, tmp_path, log, what) -> None:
+def test_link_out_of_the_folder_is_refused(blender_folder, tmp_path, log, what):
     inside = blender_folder / what
     outside = tmp_path / "outside"
     inside.rename(outside)
@@ -192,6 +181,6 @@ def test_link_out_of_the_folder_is_refused(blender_folder, tmp_path, log, what) 
         ({"bounds": [[0, 0, 0], [1, 1, 0]]}, "bounds: .* a lower and an upper corner"),
     ],
 )
-def test_bad_options(blender_folder, log, options, message) -> None:
+def test_bad_options(blender_folder, log, options, message):
     with pytest.raises(SteerbenchError, match=message):
         blender.load(blender_folder, **options, log=log)

@@ -20,38 +20,29 @@ from tests.bench.scenes.conftest import picture, pose
 
 pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is an extra")
 
-PINHOLE = ("PINHOLE", (9.0, 8.0, 4.5, 2.5))
+PINHOLE = (9.0, 8.0, 4.5, 2.5)
 POINTS = np.random.default_rng(0).uniform((-1, -2, -3), (1, 2, 3), (400, 3))
-
-
-def written(root: Path, model: str, params: tuple, kind: str, turns: list) -> Path:
-    """A model with one camera of 8 x 6 pixels and an image for each pose, OpenGL, of `turns`."""
-    found = pycolmap.Reconstruction()
-    camera = pycolmap.Camera(camera_id=1, model=model, width=8, height=6, params=params)
-    found.add_camera_with_trivial_rig(camera)
-    for number, turn in enumerate(turns):
-        opencv = np.array(turn)[:3] * (1, -1, -1, 1)
-        image = pycolmap.Image(image_id=number + 1, camera_id=1, name=f"{number:03}.png")
-        found.add_image_with_trivial_frame(image, pycolmap.Rigid3d(opencv).inverse())
-    for point in POINTS:
-        found.add_point3D(point, pycolmap.Track(), np.zeros(3, np.uint8))
-    folder = root / "sparse" / "0"
-    folder.mkdir(parents=True, exist_ok=True)
-    getattr(found, f"write_{kind}")(folder)
-    return folder
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Callable[..., Path]:
-    """A capture of ten pictures, with a model of the camera and the kind that is asked for."""
+    """A capture of ten pictures of 8 x 6, with the camera and a model of the kind asked for."""
 
-    def make(model: str = "PINHOLE", params: tuple = PINHOLE[1], kind: str = "binary") -> Path:
-        root = tmp_path / kind
-        (root / "images").mkdir(parents=True)
+    def make(model: str = "PINHOLE", params: tuple = PINHOLE, kind: str = "binary") -> Path:
+        root, found = tmp_path / kind, pycolmap.Reconstruction()
+        for folder in ("images", "sparse/0"):
+            (root / folder).mkdir(parents=True)
+        camera = pycolmap.Camera(camera_id=1, model=model, width=8, height=6, params=params)
+        found.add_camera_with_trivial_rig(camera)
         for number in range(10):
-            file = root / "images" / f"{number:03}.png"
-            Image.fromarray(picture(number, channels=3)).save(file)
-        written(root, model, params, kind, [pose(number) for number in range(10)])
+            name = f"{number:03}.png"
+            Image.fromarray(picture(number, channels=3)).save(root / "images" / name)
+            opencv = np.array(pose(number))[:3] * (1, -1, -1, 1)
+            image = pycolmap.Image(image_id=number + 1, camera_id=1, name=name)
+            found.add_image_with_trivial_frame(image, pycolmap.Rigid3d(opencv).inverse())
+        for point in POINTS:
+            found.add_point3D(point, pycolmap.Track(), np.zeros(3, np.uint8))
+        getattr(found, f"write_{kind}")(root / "sparse" / "0")
         return root
 
     return make

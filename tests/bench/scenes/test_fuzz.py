@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import io
 import json
 import math
 import resource
@@ -18,13 +17,12 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from PIL import Image
 
 from bench.console import ConsoleLog
 from bench.scenes import blender, nsvf, transforms
 from bench.scenes.images import decode_bytes
 from bench.types import Scene, SteerbenchError
-from tests.bench.scenes.conftest import png
+from tests.bench.scenes.conftest import encoded, png
 
 QUIET = ConsoleLog(Path(), quiet=True)
 IN_ONE_FOLDER = settings(
@@ -100,12 +98,6 @@ def changed(content: bytes) -> st.SearchStrategy[bytes]:
     return bytes_()
 
 
-def encoded(mode: str, kind: str) -> bytes:
-    file = io.BytesIO()
-    Image.new(mode, (8, 6)).save(file, kind)
-    return file.getvalue()
-
-
 PICTURES = [
     *(encoded(mode, "PNG") for mode in ("1", "L", "LA", "P", "RGB", "RGBA", "I;16")),
     *(encoded(mode, "JPEG") for mode in ("L", "RGB", "CMYK")),
@@ -144,15 +136,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (root / "rgb").mkdir()
     for name in ("0_a", "0_b", "2_c"):
         (root / "rgb" / f"{name}.png").write_bytes(encoded("RGBA", "PNG"))
-        (root / "pose" / f"{name}.txt").write_text(TEXTS["pose"])
+        (root / "pose" / f"{name}.txt").write_text(TEXTS["pose/0_a.txt"])
     (root / "transforms_test.json").write_text(json.dumps(RECORD))
     return root
 
 
 TEXTS = {
-    "bbox": "-1 -1 -1 1 1 1 0.1",
-    "intrinsics": "10 4 3 0\n0 0 0\n0\n1\n6 8",
-    "pose": "\n".join(" ".join(map(str, row)) for row in POSE),
+    "bbox.txt": "-1 -1 -1 1 1 1 0.1",
+    "intrinsics.txt": "10 4 3 0\n0 0 0\n0\n1\n6 8",
+    "pose/0_a.txt": "\n".join(" ".join(map(str, row)) for row in POSE),
 }
 
 
@@ -205,12 +197,8 @@ def texts(draw: st.DrawFn) -> tuple[str, str]:
 @IN_ONE_FOLDER
 @given(texts())
 def test_an_nsvf_scene_of_any_text(folder: Path, changed_file: tuple[str, str]) -> None:
-    name, text = changed_file
-    path = folder / ("pose/0_a.txt" if name == "pose" else f"{name}.txt")
-    for other, good in TEXTS.items():
-        place = folder / ("pose/0_a.txt" if other == "pose" else f"{other}.txt")
-        place.write_text(good)
-    path.write_text(text, errors="replace")
+    for name, text in (*TEXTS.items(), changed_file):
+        (folder / name).write_text(text, errors="replace")
     loads_or_refuses(lambda: nsvf.load(folder, log=QUIET))
 
 

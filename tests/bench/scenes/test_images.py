@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
@@ -24,6 +23,7 @@ from bench.scenes.images import (
     shrunk_camera,
 )
 from bench.types import Camera, SteerbenchError
+from tests.bench.scenes.conftest import encoded
 
 HERE = Path("picture.png")
 
@@ -72,19 +72,14 @@ def test_what_fills_no_block_is_left_out_and_the_camera_stays_exact() -> None:
     ("mode", "channels"), [("RGB", 3), ("RGBA", 4), ("L", 3), ("LA", 4), ("P", 3), ("1", 3)]
 )
 def test_every_8_bit_mode_becomes_rgb_or_rgba(mode, channels) -> None:
-    buffer = io.BytesIO()
-    Image.new(mode, (5, 4), 1 if mode in "1LP" else tuple(range(1, len(mode) + 1))).save(
-        buffer, "png"
-    )
-    image = decode_bytes(buffer.getvalue(), HERE)
+    colour = 1 if mode in "1LP" else tuple(range(1, len(mode) + 1))
+    image = decode_bytes(encoded(mode, size=(5, 4), colour=colour), HERE)
     assert image.dtype == torch.uint8
     assert image.shape == (4, 5, channels)
 
 
 def test_a_palette_that_is_missing_is_named() -> None:
-    buffer = io.BytesIO()
-    Image.new("P", (5, 4)).save(buffer, "png")
-    content = buffer.getvalue()
+    content = encoded("P")
     chunk = content.index(b"PLTE") - 4  # its length, its name, colours, a checksum
     end = chunk + 12 + int.from_bytes(content[chunk : chunk + 4], "big")
     with pytest.raises(SteerbenchError, match="expected a palette beside numbers of colours"):
@@ -92,10 +87,8 @@ def test_a_palette_that_is_missing_is_named() -> None:
 
 
 def test_a_header_that_announces_more_than_memory_holds_is_refused(tmp_path: Path) -> None:
-    buffer = io.BytesIO()
-    Image.new("1", (1 << 14, (MOST_PIXELS >> 14) + 1)).save(buffer, "png")
     path = tmp_path / "large.png"
-    path.write_bytes(buffer.getvalue())
+    path.write_bytes(encoded("1", size=(1 << 14, (MOST_PIXELS >> 14) + 1)))
     assert path.stat().st_size < 1 << 15
     for read in (lambda: image_size(path), lambda: decode_bytes(path.read_bytes(), path)):
         with pytest.raises(SteerbenchError, match="at most 67,108,864 pixels, got 16384 x 4097"):

@@ -81,7 +81,7 @@ def test_every_form_of_intrinsics(folder, log, text, expected) -> None:
 
 
 @pytest.mark.parametrize(
-    ("file", "text", "message"),
+    ("files", "text", "message"),
     [
         ("bbox.txt", "-1 -1 -1 1 1", r"bbox.txt: expected x0 y0 z0 x1 y1 z1 .* got 5 numbers"),
         ("bbox.txt", "-1 -1 -1 1 -2 1 .4", r"bbox.txt: expected each upper bound above"),
@@ -91,27 +91,16 @@ def test_every_form_of_intrinsics(folder, log, text, expected) -> None:
         ("intrinsics.txt", MATRIX.replace("9", "-9"), r"intrinsics.txt: fx: .* above 0, got -9"),
         ("intrinsics.txt", MATRIX.replace("8", "0"), r"intrinsics.txt: fy: .* above 0, got 0"),
         ("pose/0_001.txt", "1 0 0 0\n0 1 0 0\n", r"0_001.txt: expected a 4x4 matrix"),
+        ("bbox.txt", None, r"bbox.txt: expected a file, got nothing there"),
+        ("pose/2_003.txt", None, r"pose/2_003.txt: expected a file, got nothing there"),
+        ("rgb/0_*.png", None, r"rgb: expected pictures 0_\*, got none"),
+        ("rgb/[12]_*.png", None, r"rgb: expected pictures 2_\* or 1_\*, got none"),
+        ("rgb/*.png", None, r"rgb: expected pictures named 0_\*"),
     ],
 )
-def test_bad_text_names_file_and_field(folder, log, file, text, message) -> None:
-    (folder / file).write_text(text)
-    with pytest.raises(SteerbenchError, match=message):
-        nsvf.load(folder, log=log)
-
-
-@pytest.mark.parametrize(
-    ("missing", "message"),
-    [
-        (["bbox.txt"], r"bbox.txt: expected a file, got nothing there"),
-        (["pose/2_003.txt"], r"pose/2_003.txt: expected a file, got nothing there"),
-        (["rgb/0_000.png", "rgb/0_001.png"], r"rgb: expected pictures 0_\*, got none"),
-        (["rgb/1_002.png", "rgb/2_003.png"], r"rgb: expected pictures 2_\* or 1_\*, got none"),
-        ([f"rgb/{name}.png" for name in NAMES], r"rgb: expected pictures named 0_\*"),
-    ],
-)
-def test_missing_files_are_named(folder, log, missing, message) -> None:
-    for name in missing:
-        (folder / name).unlink()
+def test_what_is_wrong_or_missing_is_named(folder, log, files, text, message) -> None:
+    for path in folder.glob(files):
+        path.unlink() if text is None else path.write_text(text)
     with pytest.raises(SteerbenchError, match=message):
         nsvf.load(folder, log=log)
 

@@ -54,9 +54,7 @@ def test_what_is_no_budget_is_refused(text):
         decibels(text)
 
 
-def test_every_row_is_printed_as_json_and_left_in_outputs_with_a_report(
-    steerbench, measured, tmp_path
-):
+def test_every_row_is_printed_as_json_and_left_with_a_report(steerbench, measured, tmp_path):
     outcome = steerbench("accuracy", "outputs=here")
     assert outcome.status == 0
     found = json.loads(outcome.out.splitlines()[-1])
