@@ -26,8 +26,7 @@ from reports.tables import NOT_AVAILABLE
 
 STAGE, OTHER = "stage_ms.", "stage_ms.other"
 LEGEND_COLUMNS = 4
-LEGEND_WIDTH = 44
-"""Characters per line in a legend of two columns."""
+LEGEND_WIDTH = 44  # characters per line in a legend of two columns
 MARKERS = "osD^vP*X<>"
 COLOURS = [matplotlib.colormaps["tab20"](index) for index in (*range(0, 20, 2), *range(1, 20, 2))]
 COLOURS = [colour for colour in COLOURS if len(set(colour[:3])) > 1]  # grey is for "other"
@@ -38,11 +37,9 @@ COSTS = {
 }
 """What quality is plotted against: prefix of the file name, unit and label of the axis."""
 
-MARK = "mark-{}"
-"""The `gid` of the mark of the line with this number."""
+MARK = "mark-{}"  # the `gid` of the mark of the line with this number
 
-NAME_SIZE = (160, 13)
-"""Width and height in pixels of the name of a setting on a plot."""
+NAME_SIZE = (160, 13)  # width and height in pixels of the name of a setting on a plot
 
 
 def stage_bars(runs: Sequence[Run], path: Path) -> None:

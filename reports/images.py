@@ -21,8 +21,7 @@ from bench.trajectories import spread
 from reports.runs import Run
 from reports.tables import Table
 
-MOST_FRAMES = 3
-"""Maximum number of frames of a run on a page."""
+MOST_FRAMES = 3  # maximum number of frames of a run on a page
 
 MOST_RENDERINGS = 4
 """Maximum number of renderings in one image beside the ground truth; more runs get more images."""
@@ -34,8 +33,7 @@ GAP_PX = 8
 LINE_PX = 24
 INK, PAPER, MARK = (30, 30, 30), (255, 255, 255), (214, 0, 110)
 
-ZOOM = 4
-"""Magnification of the detail relative to its picture."""
+ZOOM = 4  # magnification of the detail relative to its picture
 
 Box = tuple[int, int, int, int]  # left, top, right, bottom
 Band = tuple[str, Sequence[Image.Image | None]]

@@ -17,15 +17,13 @@ from bench.trajectories import MIXED
 from reports.runs import Run
 from reports.tables import Table
 
-REFERENCES = Path(__file__).parent / "paper" / "scenes.yaml"
-"""Published PSNR of well-known scenes."""
+REFERENCES = Path(__file__).parent / "paper" / "scenes.yaml"  # published PSNR of well-known scenes
 
 OTHER_SCENES_DB = 12.0
 """An outlier is this far below the median over a method's scenes. drums, the hardest scene of
 NeRF-Synthetic, is 9 dB below the median of the eight."""
 
-REFERENCE_DB = 10.0
-"""An outlier is this far below the published PSNR of the same scene."""
+REFERENCE_DB = 10.0  # an outlier is this far below the published PSNR of the same scene
 
 INT8_DB = 1.0
 """An outlier is this far below the same network in fp32. The paper's int8 loses 0.6 dB to FP16."""

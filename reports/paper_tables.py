@@ -21,8 +21,7 @@ AFTER, SHARES = "method.after", (0.125, 0.25, 0.5)
 curves show besides the end."""
 OF_CURVES = {"protocol.name": "psnr", "protocol.lpips": "[]"}
 """Curves need only PSNR; at 200x200 LPIPS would take most of a frame's time."""
-ABSENT = "–"
-"""Stands for a figure that the paper does not give or that cannot be measured here."""
+ABSENT = "–"  # stands for a figure that the paper does not give or that cannot be measured here
 
 Lines = Mapping[str, Sequence[Repeated]]
 """The measured lines of each table, by table name."""

@@ -14,8 +14,7 @@ import pandas as pd
 from bench.results import COLD, STEADY
 
 NOT_AVAILABLE = "n/a"
-DENSE = ".dense"
-"""Suffix of a work counter for the work of a method that skips nothing."""
+DENSE = ".dense"  # suffix of a work counter for the work of a method that skips nothing
 
 QUALITY = {
     "psnr": ("PSNR, dB ↑", 2),

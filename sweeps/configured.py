@@ -29,8 +29,7 @@ from sweeps.overrides import VALIDATION, target_of
 STANDS_FOR = {"Path": str, "tuple": list, "Sequence": list, "Mapping": dict, "float": float | int}
 """By the name of a type in a signature: the type that a configuration holds instead."""
 
-USUAL_THREADS = torch.get_num_threads()
-"""Number of threads that torch uses by default."""
+USUAL_THREADS = torch.get_num_threads()  # number of threads that torch uses by default
 
 
 @dataclass(frozen=True)

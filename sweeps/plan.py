@@ -22,8 +22,7 @@ from sweeps.measurement import Job
 from sweeps.overrides import CONFIGS, changed, choices, composed, setting, swept, target_of
 from sweeps.processes import on_gpu
 
-TABLES = CONFIGS / "experiment"
-"""The folder of the experiments that declare the tables."""
+TABLES = CONFIGS / "experiment"  # the folder of the experiments that declare the tables
 
 MARKS = {"blender": camera_file("train"), "nsvf": "bbox.txt"}
 """The file by which a scene's layout is recognised, by the value of `scene=` that reads it."""

@@ -20,8 +20,7 @@ from bench.sharing import locked
 if TYPE_CHECKING:  # help and completion do not load torch
     from bench.types import Log
 
-LOCKS = "STEERBENCH_LOCKS"
-"""The environment variable that names another folder for the locks."""
+LOCKS = "STEERBENCH_LOCKS"  # the environment variable that names another folder for the locks
 
 
 def set_up() -> None:

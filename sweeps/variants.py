@@ -28,11 +28,9 @@ from sweeps.processes import device_lock
 
 Row = dict[str, Any]
 
-METHOD = "method=steernerf_lean"
-"""The method that is studied by default."""
+METHOD = "method=steernerf_lean"  # the method that is studied by default
 
-AS_IT_IS = Variant("as it is")
-"""The settings as typed."""
+AS_IT_IS = Variant("as it is")  # the settings as typed
 
 
 class Ground(NamedTuple):

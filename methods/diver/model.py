@@ -19,8 +19,7 @@ from methods.students.networks import positional
 from methods.students.voxels import corners_of, occupied_voxels
 from methods.training import checkpoint
 
-CHANNELS = 32
-"""Features of a corner, and width of every layer between input and output."""
+CHANNELS = 32  # features of a corner, and width of every layer between input and output
 
 FREQUENCIES = 4
 DIRECTION_CHANNELS = 3 + 2 * 3 * FREQUENCIES

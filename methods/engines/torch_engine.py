@@ -20,8 +20,7 @@ from methods.kernels import multiplies_bf16
 
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
-WARM_UP = 3
-"""Runs before recording, in which libraries choose algorithms and allocate workspace."""
+WARM_UP = 3  # runs before recording, in which libraries choose algorithms and allocate workspace
 
 
 class TorchEngine(Engine):

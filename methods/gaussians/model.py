@@ -14,8 +14,7 @@ from methods.gaussians.kernels.projection import project_gaussians
 from methods.kernels.spherical import shade
 from methods.kernels.types import Pixels
 
-Y00 = 1 / math.sqrt(4 * math.pi)
-"""The first spherical harmonic, a constant."""
+Y00 = 1 / math.sqrt(4 * math.pi)  # the first spherical harmonic, a constant
 
 OUTLIERS = 1e-3
 """Share of the harmonics, at either end, that is clipped: a few outliers make all steps coarse."""

@@ -28,16 +28,13 @@ from methods.kernels.types import expect
 from methods.rendering.frame import render_rays
 from methods.training import checkpoint, loop
 
-SOLID = 0.5
-"""Opacity above which a ray counts as ending at a surface."""
+SOLID = 0.5  # opacity above which a ray counts as ending at a surface
 
 NEIGHBOURS = 3
 
-DEAD = 0.005
-"""A Gaussian whose opacity is at most this is dead, and is relocated."""
+DEAD = 0.005  # a Gaussian whose opacity is at most this is dead, and is relocated
 
-MOST_COPIES = 51
-"""Maximum number of Gaussians in one place after a relocation, as in the release."""
+MOST_COPIES = 51  # maximum number of Gaussians in one place after a relocation, as in the release
 
 STEEPNESS, FAINT = 100.0, 0.005
 """Noise falls off around the opacity `FAINT` as a sigmoid of this steepness (their Eq. 10)."""

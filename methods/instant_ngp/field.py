@@ -26,8 +26,7 @@ from methods.rendering.field import (
 
 Precision = Literal["bf16", "fp32"]
 
-HIDDEN_CHANNELS = 64
-"""Width of every layer between input and output."""
+HIDDEN_CHANNELS = 64  # width of every layer between input and output
 
 GEOMETRY_CHANNELS = 16
 """Outputs of the density network. The first is the log density; all feed the feature network."""

@@ -12,15 +12,13 @@ STRIP = 8
 """Width of the strips of a picture in which its pixels are numbered, row by row: a run of `RUN`
 pixels is then mostly 8 wide and 16 high, and its pixels are alike."""
 
-RUN = 128
-"""Consecutive pixels that share one estimate of an error."""
+RUN = 128  # consecutive pixels that share one estimate of an error
 
 REFRESHED = 16
 """Steps after which the chances of the runs follow their estimates: they change slowly, and summing
 up those of half a million runs takes longer than drawing from them."""
 
-UNSEEN = 0.1
-"""Estimate for a run that no ray has met yet: about that of an untrained field."""
+UNSEEN = 0.1  # estimate for a run that no ray has met yet: about that of an untrained field
 
 
 def one_from_each(count: int, generator: torch.Generator, device: torch.device) -> Tensor:

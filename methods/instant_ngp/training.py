@@ -23,8 +23,7 @@ from methods.rendering.occupancy import EVERY, MIN_VIEWS, STEP, DensityGrid, lea
 from methods.rendering.sampling import Sampling, check_step, suitable_step
 from methods.training import checkpoint, loop
 
-MIN_RAYS = 64
-"""Minimum number of rays in a step."""
+MIN_RAYS = 64  # minimum number of rays in a step
 
 GRID_YOUTH_STEPS = 256
 """Up to this step the density grid is visited four times as much: most of it is still unknown."""

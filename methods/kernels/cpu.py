@@ -43,11 +43,9 @@ FAST = {"contract", "reassoc", "nsz", "arcp"}
 """Flags of fastmath: reordering and fused multiply-adds are allowed; assuming that there is no NaN
 is not."""
 
-LANES = 16
-"""Outputs that both compute together."""
+LANES = 16  # outputs that both compute together
 
-WORDS = 16
-"""Numbers of 32 bits in a cache line."""
+WORDS = 16  # numbers of 32 bits in a cache line
 
 # e^x = 2^n e^r with n the whole number nearest to x / ln 2. ln 2 in two parts: n times the first is
 # exact. e^r = 1 + r + r^2 (E0 + r (E1 + r (E2 + r (E3 + r E4)))), |r| <= ln 2 / 2: a minimax fit,
@@ -61,8 +59,7 @@ WHOLE = f32(1.5 * 2**23)
 
 ONE_BITS = u32(0x3F800000)  # of 1.0; n added to its exponent makes 2^n
 
-EDGE = f32(87)
-"""Beyond this exponent, `exp` is held: e^87 is a little below the largest float32."""
+EDGE = f32(87)  # beyond this exponent, `exp` is held: e^87 is a little below the largest float32
 
 
 def follow_torch_threads() -> None:

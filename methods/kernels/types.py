@@ -16,8 +16,7 @@ from torch.nn import functional
 
 from bench.types import Rays, check_shape
 
-BRICK = 4
-"""Cells along the side of a brick; its 64 cells are one word of `Occupancy.words`."""
+BRICK = 4  # cells along the side of a brick; its 64 cells are one word of `Occupancy.words`
 
 
 def expect(holds: bool, name: str, expected: str, got: object) -> None:

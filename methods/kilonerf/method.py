@@ -17,8 +17,7 @@ from methods.kilonerf.field import Grid, KiloField, Pieces, place_networks
 from methods.students.fields import FieldLessons, FieldStudent, StudentTraining
 from methods.training import checkpoint
 
-MOST = 32
-"""Maximum number of networks along an axis: they are numbered in int16."""
+MOST = 32  # maximum number of networks along an axis: they are numbered in int16
 
 LEAK = 0.01
 """Slope of the density below 0 in distillation: its gradient does not vanish in empty space."""

@@ -14,11 +14,9 @@ from methods.students.networks import Dense, NetworkField, density_of, positiona
 WIDTH, LAYERS = 256, 8
 """Outputs of every layer of the trunk, and how many there are."""
 
-SKIP = 5
-"""Layers of the trunk after which the encoded position is concatenated again."""
+SKIP = 5  # layers of the trunk after which the encoded position is concatenated again
 
-VIEW_WIDTH = 128
-"""Outputs of the layer that sees the direction."""
+VIEW_WIDTH = 128  # outputs of the layer that sees the direction
 
 POSITION_FREQUENCIES = 10
 DIRECTION_FREQUENCIES = 4

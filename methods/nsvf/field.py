@@ -15,16 +15,14 @@ from methods.kernels.types import Occupancy
 from methods.students.networks import Dense, NetworkField, density_of, positional, products
 from methods.students.voxels import corners_of
 
-EMBEDDING = 32
-"""Channels at a corner."""
+EMBEDDING = 32  # channels at a corner
 
 WIDTH = 256
 DENSITY_WIDTH = 128
 EMBEDDING_FREQUENCIES = 6
 DIRECTION_FREQUENCIES = 4
 
-FREE_ENERGY = 7.0
-"""Factor by which the release multiplies lengths before it computes the opacity."""
+FREE_ENERGY = 7.0  # factor by which the release multiplies lengths before it computes the opacity
 
 ACROSS = 3.0
 """Side of the cube, approximately, in the units of the published scenes, in which the release

@@ -23,14 +23,11 @@ from methods.plenoctree.kernels.voxel_light import Light
 from methods.rendering.field import Field, pad
 from methods.students.voxels import largest_weights
 
-CELL = 4
-"""Leaves along the side of a cell of the occupancy that selects the rays of a frame."""
+CELL = 4  # leaves along the side of a cell of the occupancy that selects the rays of a frame
 
-QUERIES = 1 << 18
-"""Points at which the field is evaluated together."""
+QUERIES = 1 << 18  # points at which the field is evaluated together
 
-CLAMP = 1e-3
-"""Colours are clamped this far from 0 and 1, where their logits are infinite."""
+CLAMP = 1e-3  # colours are clamped this far from 0 and 1, where their logits are infinite
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,7 @@ FIRST_ROUNDS = (8, 16)
 """How many samples of a ray a CPU evaluates in each of the first rounds, before it knows whether
 the ray goes on; a last round has all that are left."""
 
-KEPT_THIN = 4
-"""One of so many thin samples is kept, with the length of all."""
+KEPT_THIN = 4  # one of so many thin samples is kept, with the length of all
 
 
 def render_batch(

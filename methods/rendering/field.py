@@ -10,8 +10,7 @@ from torch.nn import functional
 
 from bench.types import Probe
 
-BATCH_QUANTUM = 1 << 11
-"""Samples are handed to a field in multiples of this."""
+BATCH_QUANTUM = 1 << 11  # samples are handed to a field in multiples of this
 
 CHUNK_SAMPLES = 1 << 18
 """Samples that are evaluated together if no gradient is needed: bounds the memory."""

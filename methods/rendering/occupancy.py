@@ -27,15 +27,12 @@ RESOLUTION = 128
 STEP = math.sqrt(3) / MAX_SAMPLES
 """World length of a ray-marching step: the cube's diagonal in 1024 steps."""
 
-EVERY = 16
-"""Training steps between two updates."""
+EVERY = 16  # training steps between two updates
 
-DECAY = 0.8
-"""Factor by which a visit reduces a cell's value, if it finds no higher density."""
+DECAY = 0.8  # factor by which a visit reduces a cell's value, if it finds no higher density
 
 MIN_ALPHA = 0.01
-THRESHOLD = MIN_ALPHA / STEP
-"""Density that is opaque to `MIN_ALPHA` over one step."""
+THRESHOLD = MIN_ALPHA / STEP  # density that is opaque to `MIN_ALPHA` over one step
 
 INITIAL = 1.2 * THRESHOLD
 """Value of a cell before its first visit: a visit that finds nothing empties the cell."""
@@ -43,8 +40,7 @@ INITIAL = 1.2 * THRESHOLD
 LARGEST = math.exp(LOG_DENSITY_CLAMP)
 """Higher densities are stored as this value, so that they can decay: infinity does not."""
 
-MIN_VIEWS = 2
-"""Training cameras that must see a place before it may count as occupied."""
+MIN_VIEWS = 2  # training cameras that must see a place before it may count as occupied
 
 
 def learnable_cells(bounds: Tensor, cameras: Sequence[Camera]) -> Tensor:

@@ -13,8 +13,7 @@ from methods.instant_ngp.field import Precision
 from methods.kernels import multiplies_bf16
 from methods.students.fields import StudentField
 
-CHUNK = 1 << 14
-"""Samples that go through a network together: 16 MiB of activations."""
+CHUNK = 1 << 14  # samples that go through a network together: 16 MiB of activations
 
 
 def positional(

@@ -12,8 +12,7 @@ from methods.instant_ngp.pixels import PixelBatches
 from methods.kernels.types import Occupancy
 from methods.kernels.voxel_walk import Crossings, Voxels, walk
 
-CHUNK_RAYS = 1 << 15
-"""Rays that are traced together: bounds the memory."""
+CHUNK_RAYS = 1 << 15  # rays that are traced together: bounds the memory
 
 OFFSETS = tuple((c & 1, c >> 1 & 1, c >> 2 & 1) for c in range(8))
 """Offsets of a voxel's corners; in the index of a corner, bit 0 is +x, bit 1 +y, bit 2 +z."""

@@ -19,8 +19,7 @@ from methods.training import checkpoint
 LOOK_EVERY = 10
 """On a GPU, errors are read back only every so many steps, because reading takes time."""
 
-CHECKPOINT_S = 20.0
-"""Seconds between checkpoints: the most that a killed training loses."""
+CHECKPOINT_S = 20.0  # seconds between checkpoints: the most that a killed training loses
 
 Asked = Callable[[], dict[str, float]]
 """Tells the errors of a step, by label; the host waits if they have not arrived yet."""

@@ -22,8 +22,7 @@ from sweeps.processes import on_gpu
 from sweeps.terminal import print_rows, show
 from sweeps.variants import Row
 
-DENSE = ", nothing skipped"
-"""Suffix of a line whose method skips nothing."""
+DENSE = ", nothing skipped"  # suffix of a line whose method skips nothing
 
 
 def main(options: argparse.Namespace) -> int:

@@ -18,8 +18,7 @@ from reports.runs import Run, load, readable
 from sweeps.measurement import PLACES
 from sweeps.terminal import console, show
 
-SCHEMA = 2
-"""Of baseline files."""
+SCHEMA = 2  # of baseline files
 
 
 def main(options: argparse.Namespace) -> int:

@@ -53,8 +53,7 @@ OF_WORTH = (
 
 SETTINGS = ("scene=totem", "scene.width=100", "trajectory=orbit", "budget=tiny")
 
-AS_IT_IS = ""
-"""In place of the name of a kernel: none is computed by its reference."""
+AS_IT_IS = ""  # in place of the name of a kernel: none is computed by its reference
 
 
 def main(options: argparse.Namespace) -> int:

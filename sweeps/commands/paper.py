@@ -29,8 +29,7 @@ from sweeps.overrides import composed
 from sweeps.plan import DataSet, Planned, chosen, find, plan
 from sweeps.terminal import console, show
 
-DATA = "data="
-"""Prefix of the word that names the folder of a data set."""
+DATA = "data="  # prefix of the word that names the folder of a data set
 
 
 def main(options: argparse.Namespace) -> int:

@@ -27,8 +27,7 @@ from sweeps.processes import device_lock
 from sweeps.terminal import print_rows, show
 from sweeps.variants import METHOD, Row, amount, declared, settings
 
-FEW_STEPS = "++budget.renderer_steps=8"
-"""A 2D renderer costs the same however long it was trained."""
+FEW_STEPS = "++budget.renderer_steps=8"  # A 2D renderer costs the same however long it was trained
 
 SIZES = ((200, 200), (400, 400), (800, 800), (1920, 1080), (3840, 2160))
 

@@ -9,8 +9,7 @@ from bench.console import ConsoleLog
 from bench.errors import unknown
 from bench.published import Published, get, published, verify
 
-SHOWN = 5
-"""Missing or extra files to print by name, because there may be hundreds."""
+SHOWN = 5  # missing or extra files to print by name, because there may be hundreds
 
 
 def main(options: argparse.Namespace) -> int:

@@ -35,12 +35,10 @@ from sweeps.overrides import beside, composed
 if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle, ViserServer
 
-AS_GIVEN = "as given"
-"""The setting of a knob that was not changed."""
+AS_GIVEN = "as given"  # the setting of a knob that was not changed
 
 SIDE, DIFFERENCE, ERROR, TRUTH = "side by side", "difference x 4", "error x 4", "exact picture"
-EXACT = (ERROR, TRUTH)
-"""The views that need the exact picture."""
+EXACT = (ERROR, TRUTH)  # the views that need the exact picture
 
 
 @dataclass

@@ -12,8 +12,7 @@ from bench.types import check_shape
 from methods.kernels.dispatch import implementation
 from methods.kernels.types import Intervals, Pixels, expect
 
-STOP = 1e-4
-"""Transmittance at which a ray ends: what lies behind changes a pixel by less than this."""
+STOP = 1e-4  # transmittance at which a ray ends: what lies behind changes a pixel by less than this
 
 
 def check_stop(stop: float) -> None:

@@ -28,8 +28,7 @@ from methods.kernels.types import Intervals, Pixels, offsets_of
 
 INF = math.inf
 
-DEPTH = 2.0
-"""Largest t of the samples; values and gradients of pixels are at most 1."""
+DEPTH = 2.0  # largest t of the samples; values and gradients of pixels are at most 1
 
 KINDS: dict[str, dict[str, Any]] = {
     "no ray": {"rays": 0, "most": 0},

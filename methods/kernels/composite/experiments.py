@@ -28,8 +28,7 @@ STEPS = [2.0**-power for power in range(2, 11)]
 FINE = (2.0**-7, 2.0**-4)
 """Range of steps that resolve the ramp and leave errors far above rounding."""
 
-THIN = 1 / 32
-"""Optical thickness of a sample in the experiment on early stopping."""
+THIN = 1 / 32  # optical thickness of a sample in the experiment on early stopping
 
 
 def slope(y: Tensor) -> Tensor:

@@ -12,11 +12,9 @@ from bench.case import U32, Bound, Case, Given, Operation
 from methods.kernels.corner_gather import CORNERS, corner_gather
 from methods.kernels.dispatch import served
 
-VIEW = 1 << 17
-"""Samples of one view, for which the throughput is measured."""
+VIEW = 1 << 17  # samples of one view, for which the throughput is measured
 
-SIDE = 48
-"""Voxels along the grid of the cases."""
+SIDE = 48  # voxels along the grid of the cases
 
 
 def _summed(given: Given) -> Tensor:

@@ -20,8 +20,7 @@ from bench.types import Rays, check_shape
 from methods.kernels.dispatch import implementation
 from methods.kernels.types import Extent, Occupancy, Samples, check_rays, expect
 
-MAX_SAMPLES = 1024
-"""Most samples of a ray through the unit cube at the usual step, sqrt(3) / 1024."""
+MAX_SAMPLES = 1024  # most samples of a ray through the unit cube at the usual step, sqrt(3) / 1024
 
 PARALLEL = 2.0**-127
 """A smaller component of a direction counts as 0, because its reciprocal overflows float32."""

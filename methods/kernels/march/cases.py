@@ -24,8 +24,7 @@ AXES = torch.cat((torch.eye(3), -torch.eye(3)))
 ALL = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * 3)  # [27, 3], one is 0
 SOME = ALL[ALL.any(dim=1)]
 
-SIZE = 16
-"""Cells along the grids of the ways."""
+SIZE = 16  # cells along the grids of the ways
 
 
 def some_rays(count: int, away: float = 1.5) -> Rays:

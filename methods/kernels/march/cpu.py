@@ -19,8 +19,7 @@ from methods.kernels.cpu import arrays, check_float32, f32, i32, slope, u64
 from methods.kernels.march import Segments, longest_ray
 from methods.kernels.types import Extent, Occupancy, Samples, offsets_of
 
-CHUNK = 128
-"""Rays that are marched together; their numbers stay in the first-level cache."""
+CHUNK = 128  # rays that are marched together; their numbers stay in the first-level cache
 
 VECTOR = 32
 """Loops run over a multiple of so many columns, so that vectors leave none over. What they find in
@@ -29,8 +28,7 @@ columns without a ray is not read."""
 f64 = np.float64
 INF = f32(np.inf)
 ZEROS, ONES = (f32(0),) * 3, (f32(1),) * 3
-FAR_AWAY = f32(2**30)
-"""A step that no ray reaches; the numbers of steps are int32."""
+FAR_AWAY = f32(2**30)  # a step that no ray reaches; the numbers of steps are int32
 
 # Rows of a chunk: what is known of each ray, in float32 ...
 ORIGIN, DIRECTION, SLOPE = 0, 3, 6  # three rows each

@@ -12,8 +12,7 @@ from torch.nn import functional
 from methods.kernels.march import PARALLEL, Segments, longest_ray
 from methods.kernels.types import Extent, Occupancy, Samples, offsets_of
 
-BLOCK = 1 << 12
-"""Rays that are tested at a time: [BLOCK, 1024, 3] positions are 50 MB."""
+BLOCK = 1 << 12  # rays that are tested at a time: [BLOCK, 1024, 3] positions are 50 MB
 
 
 def count(segments: Segments, occupancy: Occupancy) -> Tensor:

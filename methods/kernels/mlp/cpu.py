@@ -18,16 +18,13 @@ from torch.nn import functional
 from methods.kernels.cpu import LANES, check_float32, f32, multiply, u64
 from methods.kernels.mlp.reference import layer_by_layer
 
-DEEP = 96
-"""Samples whose activations, with 64 channels, stay in the first-level cache."""
+DEEP = 96  # samples whose activations, with 64 channels, stay in the first-level cache
 
-CHUNKS = 64
-"""Parts into which samples are divided; fixed, so that results are repeatable."""
+CHUNKS = 64  # parts into which samples are divided; fixed, so that results are repeatable
 
 ZERO = f32(0)
 
-RELU_CHUNK = 1 << 14
-"""Numbers that a thread takes at a time."""
+RELU_CHUNK = 1 << 14  # numbers that a thread takes at a time
 
 MINUS_INFINITY = np.int16(-128)
 """The bits of -inf in bfloat16 as a whole number. All negative numbers are at or below it, negative

@@ -15,8 +15,7 @@ RATIOS = (1 / 4, 3 / 4, 15 / 4, 5 / 16, 15 / 16, 35 / 32, 105 / 4, 21 / 32, 7 / 
 FACTORS = [math.sqrt(ratio / math.pi) for ratio in RATIOS]
 """Factors of the polynomials, in the order of their first use by degree and order."""
 
-SIZES = (1, 4, 9, 16)
-"""Number of harmonics up to degree 0, 1, 2 and 3."""
+SIZES = (1, 4, 9, 16)  # number of harmonics up to degree 0, 1, 2 and 3
 
 
 def spherical_harmonics(directions: Tensor, *, backend: str = "auto") -> Tensor:

@@ -10,11 +10,9 @@ from torch import Tensor
 from methods.kernels.cpu import arrays, check_float32, f32, u64
 from methods.kernels.spherical import FACTORS
 
-BLOCK = 256
-"""Directions at a time; their 16 harmonics stay in the first-level cache."""
+BLOCK = 256  # directions at a time; their 16 harmonics stay in the first-level cache
 
-ROWS = 19
-"""Rows of a block: the harmonics, and x, y, z."""
+ROWS = 19  # rows of a block: the harmonics, and x, y, z
 
 ZERO = f32(0)
 ONE, TWO, THREE, NEXT = u64(1), u64(2), u64(3), u64(BLOCK)

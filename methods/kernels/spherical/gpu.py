@@ -15,8 +15,7 @@ from torch import Tensor
 from methods.kernels.gpu import check_types, launch, vector
 from methods.kernels.spherical import CHANNELS, FACTORS
 
-BLOCK = 1024
-"""Numbers that a program writes, 8 per lane."""
+BLOCK = 1024  # numbers that a program writes, 8 per lane
 
 C00, C1, C2, C20, C22, C33, C3XYZ, C31, C30, C32 = map(tl.constexpr, FACTORS)
 

@@ -20,14 +20,11 @@ from bench.types import Rays, check_shape
 from methods.kernels.dispatch import implementation
 from methods.kernels.types import Intervals, check_rays, expect
 
-BRICK = 8
-"""Cells along the side of a brick."""
+BRICK = 8  # cells along the side of a brick
 
-MAX_RESOLUTION = 2048
-"""Maximum number of cells along a side; the map of its bricks takes 64 MiB."""
+MAX_RESOLUTION = 2048  # maximum number of cells along a side; the map of its bricks takes 64 MiB
 
-MAX_CLEARANCE = 32
-"""Upper limit of a clearance in bricks; beyond it a ray takes another step."""
+MAX_CLEARANCE = 32  # upper limit of a clearance in bricks; beyond it a ray takes another step
 
 
 @dataclass(frozen=True, eq=False)

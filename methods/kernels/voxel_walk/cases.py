@@ -17,8 +17,7 @@ from methods.kernels.dispatch import served
 from methods.kernels.march.cases import SPECIAL, cells, slab_lengths, some_rays, special_rays
 from methods.kernels.voxel_walk import Voxels, walk
 
-SIZE = 24
-"""Resolution of the grids in most cases; not a power of two, so that planes are rounded."""
+SIZE = 24  # resolution of the grids in most cases; not a power of two, so that planes are rounded
 
 RESULTS = ("offsets", "ray", "voxel", "near", "far", "t", "delta")
 

@@ -13,8 +13,7 @@ from methods.kernels.march.reference import crossed, lengths, slopes
 from methods.kernels.types import Extent, offsets_of
 from methods.kernels.voxel_walk import BRICK, Crossings, Voxels
 
-BLOCK = 1 << 11
-"""Rays that are processed at a time."""
+BLOCK = 1 << 11  # rays that are processed at a time
 
 
 def walk(rays: Rays, voxels: Voxels) -> Crossings:

@@ -31,14 +31,11 @@ from methods.kernels.march.cases import some_rays
 from methods.kernels.voxel_walk import Crossings, Voxels, walk
 
 FEATURES = HIDDEN = 32
-SIDE = 16
-"""Voxels along the grid of the small cases."""
+SIDE = 16  # voxels along the grid of the small cases
 
-DENSEST = 1 / 4
-"""Largest density of a segment: sums of 32 products of at most 1 / 128."""
+DENSEST = 1 / 4  # largest density of a segment: sums of 32 products of at most 1 / 128
 
-FARTHEST = 3
-"""Largest depth of a segment."""
+FARTHEST = 3  # largest depth of a segment
 
 BITS = torch.arange(CORNERS)[:, None] >> torch.arange(3) & 1
 """Where the corners of a voxel are in it, [8, 3]."""

@@ -24,12 +24,10 @@ from methods.kernels.types import Pixels
 from methods.kernels.voxel_walk import Crossings, Voxels
 from methods.kernels.voxel_walk.cpu import maps_of, walk_ray
 
-SEGMENTS = 256
-"""Segments of a chunk whose weights are computed."""
+SEGMENTS = 256  # segments of a chunk whose weights are computed
 
 CHUNK = 64  # rays
-BATCH = 8 * ROWS
-"""Segments whose colours are computed together."""
+BATCH = 8 * ROWS  # segments whose colours are computed together
 
 GAUSS = f32(0.5 / math.sqrt(3))
 """Distance of the two nodes of the Gauss-Legendre rule from the middle of a segment of length 1."""

@@ -28,8 +28,7 @@ from methods.kernels.dispatch import served
 CLEAR = 1e-4
 """Minimum relative distance of every opacity, at every pixel, from a threshold of a comparison."""
 
-CROWD = 600
-"""Gaussians at a pixel of the cases, at most."""
+CROWD = 600  # Gaussians at a pixel of the cases, at most
 
 
 def _pixels(given: Given, backend: str) -> tuple[Tensor, ...]:

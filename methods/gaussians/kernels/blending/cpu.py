@@ -22,8 +22,7 @@ from methods.kernels.types import Pixels
 
 TILE = 16  # pixels, along both axes
 PIXELS = TILE * TILE
-PATIENCE = 8
-"""Gaussians between two checks whether a tile is opaque."""
+PATIENCE = 8  # Gaussians between two checks whether a tile is opaque
 
 FIELDS = 10  # of a packed Gaussian: u, v, A, B, C, opacity, r, g, b, z
 SUMS = 9  # of a Gaussian in a tile: see `_tile_backward`

@@ -10,8 +10,7 @@ from methods.gaussians.kernels.blending import LARGEST_ALPHA
 from methods.gaussians.kernels.projection import LEAST_ALPHA, Ellipses
 from methods.kernels.types import Pixels
 
-BAND = 16
-"""Rows that are blended together, which bounds the memory."""
+BAND = 16  # rows that are blended together, which bounds the memory
 
 
 def blend(

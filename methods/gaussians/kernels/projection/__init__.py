@@ -19,14 +19,12 @@ from methods.kernels.dispatch import implementation
 BLUR = 0.3
 """Added to the variance of every ellipse, in pixels^2: none is much narrower than a pixel."""
 
-NEAR = 0.01
-"""Minimum z-depth of a visible Gaussian, in scene units."""
+NEAR = 0.01  # minimum z-depth of a visible Gaussian, in scene units
 
 FRUSTUM = 1.3
 """J is evaluated at most this many half pictures from the axis; farther out it is unbounded."""
 
-LEAST_ALPHA = 1 / 255
-"""A Gaussian is cut off where its opacity is less."""
+LEAST_ALPHA = 1 / 255  # a Gaussian is cut off where its opacity is less
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from methods.kernels.cpu import arrays, check_float32, f32
 
 ZERO, ONE, TWO = f32(0), f32(1), f32(2)
 BLUR32, NEAR32, INFINITE = f32(BLUR), f32(NEAR), f32(np.inf)
-BLOCK = 256
-"""Gaussians at a time; their numbers, inputs and results, stay in the first-level cache."""
+BLOCK = 256  # Gaussians at a time; their numbers, inputs and results, stay in the first-level cache
 
 
 def project_gaussians(

@@ -21,8 +21,7 @@ from torch import Tensor
 from bench.types import check_shape
 from methods.kernels.dispatch import implementation
 
-HIDDEN = 32
-"""Outputs of every layer except density and colour."""
+HIDDEN = 32  # outputs of every layer except density and colour
 
 POSITION_FREQUENCIES, DIRECTION_FREQUENCIES = 10, 4
 

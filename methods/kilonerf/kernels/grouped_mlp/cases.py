@@ -32,8 +32,7 @@ KINDS = {
 }
 """Numbers of samples and networks."""
 
-MANY = 1000
-"""Samples of more than this are timed."""
+MANY = 1000  # samples of more than this are timed
 
 ANGLES = 188 * U32
 """An angle of at most 512 is rounded by none, reduced with an error below 4 u, and its sine within

@@ -27,17 +27,13 @@ from methods.kernels.cpu import (
 )
 from methods.kilonerf.kernels.grouped_mlp import HIDDEN, POSITION_FREQUENCIES, Networks
 
-SLOT = TALL + -TALL % 8
-"""Numbers in a row of `_encode`: `TALL` and a few idle ones, whole vectors."""
+SLOT = TALL + -TALL % 8  # numbers in a row of `_encode`: `TALL` and a few idle ones, whole vectors
 
-AHEAD = 24
-"""Samples from the one that is computed to the one that is prefetched."""
+AHEAD = 24  # samples from the one that is computed to the one that is prefetched
 
-DEEP = 96
-"""Samples whose inputs and gradients, with 64 channels, stay in the first-level cache."""
+DEEP = 96  # samples whose inputs and gradients, with 64 channels, stay in the first-level cache
 
-CHUNKS = 64
-"""Parts into which samples are divided; fixed, so that results are repeatable."""
+CHUNKS = 64  # parts into which samples are divided; fixed, so that results are repeatable
 
 RESTART = 5
 """Doublings of an angle before sine and cosine are computed afresh, as each doubles the error."""

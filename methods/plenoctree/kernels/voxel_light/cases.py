@@ -19,8 +19,7 @@ COLOUR = (16 * 50 * 6 + 16 * 16 * 6) / 4 + 8
 """Error bound in u of a colour: a quarter (slope of the sigmoid) of the error of a sum of 16
 products of harmonics (below 2, error 48 u) and numbers below 6, plus the sigmoid's own error."""
 
-FARTHEST = 3
-"""Largest depth of a voxel."""
+FARTHEST = 3  # largest depth of a voxel
 
 
 def _pixels(given: Given, backend: str) -> tuple[Tensor, ...]:

@@ -22,20 +22,16 @@ from methods.kernels.voxel_walk import Voxels
 from methods.kernels.voxel_walk.cpu import length_of, maps_of, walk_ray
 from methods.plenoctree.kernels.voxel_light import Light
 
-RAYS = 64
-"""Rays of a chunk."""
+RAYS = 64  # rays of a chunk
 
-ROUND = 16
-"""Voxels that a ray finds at a time; few, so that few behind its end are wasted."""
+ROUND = 16  # voxels that a ray finds at a time; few, so that few behind its end are wasted
 
-CHUNK = 1 << 10
-"""Voxels at a time, whose colours stay in the first-level cache."""
+CHUNK = 1 << 10  # voxels at a time, whose colours stay in the first-level cache
 
 NEAR = 64
 """Voxels in a row that one thread owns: two threads would take a cache line from each other."""
 
-AHEAD = 16
-"""Voxels between the one that is asked for and the one that is read."""
+AHEAD = 16  # voxels between the one that is asked for and the one that is read
 
 f64 = np.float64
 ONE, TWO, THREE = u64(1), u64(2), u64(3)

@@ -12,8 +12,7 @@ from torch import Tensor
 from bench.types import check_shape
 from methods.kernels.dispatch import implementation
 
-TAPS = 9
-"""Number of neighbours of a cell, row by row, including the cell itself in the middle."""
+TAPS = 9  # number of neighbours of a cell, row by row, including the cell itself in the middle
 
 
 def neighbours_of(cells: Tensor, count: int | None = None) -> Tensor:
