@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,10 +45,11 @@ def show_run(run: Run, heading: str) -> None:
     out.print(Columns([rich_table(table) for table in run_tables(run.rows)]))
 
 
-def say_missing(runs: Iterable[Run]) -> None:
+def say_missing(runs: Sequence[Run]) -> None:
     """Print why figures of `runs` are missing, each reason once."""
-    reasons = (f"{name}: n/a. {why}" for run in runs for name, why in run.record["missing"].items())
-    for reason in dict.fromkeys(reasons):
+    from reports.runs import missing_figures  # loads torch
+
+    for reason in missing_figures(runs):
         console().print(reason, markup=False, soft_wrap=True)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from bench.types import Probe
-from methods.kernels.types import Occupancy
+from methods.kernels.types import Occupancy, offsets_of
 from methods.kilonerf.kernels.grouped_mlp import (
     DIRECTION_FREQUENCIES,
     SHAPES,
@@ -87,7 +87,7 @@ def place_networks(occupancy: Occupancy, bounds: Tensor, along: int) -> tuple[Gr
     networks = torch.full((x, y, z), -1, dtype=torch.int16, device=device)
     networks.view(-1)[used.long()] = torch.arange(len(used), dtype=torch.int16, device=device)
     by_network = number.argsort(stable=True)
-    offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
+    offsets = offsets_of(counts)
     return Grid(networks, corner, side), Pieces(low[by_network], high[by_network], offsets)
 
 

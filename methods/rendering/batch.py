@@ -10,7 +10,7 @@ from torch import Tensor
 from bench.types import Rays
 from methods.kernels.composite import composite, visible
 from methods.kernels.march import march
-from methods.kernels.types import Occupancy, Pixels, Samples
+from methods.kernels.types import Occupancy, Pixels, Samples, offsets_of
 from methods.rendering.compaction import compacts
 from methods.rendering.field import CACHED_SAMPLES, CHUNK_SAMPLES, Encoder, Field, cat, pad, query
 from methods.rendering.sampling import Sampling
@@ -161,7 +161,7 @@ def thinned(rounds: list[Round], thin: float, turns: Tensor) -> Samples:
     return together.chosen(
         # Those of a ray lie in memory in their order, round after round.
         index.index_select(0, ray_of_kept.argsort(stable=True)),
-        torch.cat((counts.new_zeros(1), counts.cumsum(dim=0))),
+        offsets_of(counts),
         every[0].longest if len(rounds) == 1 else None,  # one round: it has no more
     )
 
