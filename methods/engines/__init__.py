@@ -12,18 +12,18 @@ import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import torch
-from torch import Tensor
 
 from bench.errors import Unavailable, explained, install_command
 from bench.provenance import digest, libraries
 from bench.sharing import missing
 from bench.types import Log
+from methods.engines.network import Built as Built
+from methods.engines.network import Inputs as Inputs
 from methods.engines.network import Network as Network
 
 Precision = Literal["fp32", "bf16", "fp16", "int8"]
@@ -31,26 +31,23 @@ Precision = Literal["fp32", "bf16", "fp16", "int8"]
 Calibration = Literal["frames", "none"]
 """Source of the ranges of 8-bit activations: real frames, or none: see `largest`."""
 
-Inputs = tuple[Tensor, ...]
-
 Samples = Callable[[], Sequence[Inputs]]
 """Returns the inputs of a network in several frames. Called only if a build needs them."""
 
 Folder = Callable[[], Path]
 """Returns a folder reserved for one network and engine. Called only if a build stores something."""
 
+
+class Figures(NamedTuple):
+    """What frames have and take with an engine."""
+
+    psnr: float  # dB
+    ms: float  # of the 2D renderer
+
+
 CALIBRATION = 16
 """Number of frames whose inputs determine the ranges of all 8-bit numbers, and the numbers of rows
 to expect."""
-
-
-@dataclass(frozen=True)
-class Built:
-    """A network built by an engine: `run` is called like the network, and its next call may
-    overwrite the returned tensors; `size` is the bytes of its weights in a file."""
-
-    run: Callable[..., Inputs]
-    size: int
 
 
 class Engine(ABC):
@@ -72,6 +69,9 @@ class Engine(ABC):
             )
         self.precision = precision
         self.uncalibrated = precision == "int8" and calibration == "none"
+
+    def __str__(self) -> str:
+        return f"{self.name}, {self.precision}"
 
     def load(self, library: str) -> ModuleType:
         """Import a library of the engine; raise `Unavailable` if it is not installed."""

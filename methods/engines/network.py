@@ -6,8 +6,23 @@ A module of its own, so that trainings do not depend on any engine.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
 
+import torch
 from torch import Tensor, nn
+
+Inputs = tuple[Tensor, ...]
+
+
+@dataclass(frozen=True)
+class Built:
+    """A network built by an engine: `run` is called like the network, and its next call may
+    overwrite the returned tensors."""
+
+    run: Callable[..., Inputs]
+    size: int  # bytes of its weights in a file
+    dtype: torch.dtype = torch.float32  # of input pictures that it need not convert
 
 
 class Network(nn.Module, ABC):

@@ -43,6 +43,7 @@ class OpenVino(Engine):
         self._openvino = self.load("openvino")
         self._nncf = self.load("nncf") if precision == "int8" else None
         self._half = precision != "fp32" and "BF16" in _capabilities(self._openvino)
+        self._dtype = torch.bfloat16 if self._half else torch.float32  # of input pictures
         if precision == "bf16" and not self._half:
             raise Unavailable(
                 "precision=bf16: engine=openvino has no bfloat16 on this CPU, use precision=fp32"
@@ -57,19 +58,19 @@ class OpenVino(Engine):
         """Convert `network`, for int8 quantised, and compile it for the rows to expect."""
 
         def write(path: Path, seen: Sequence[Inputs]) -> None:
-            model = self._convert(network, seen)
+            model = self._channels_last(self._convert(network, seen))
             self._openvino.save_model(model, path, compress_to_fp16=self.precision == "bf16")
 
         path = folder() / "network.xml"
         sizes = engines.keep_model(path, network, samples, write, log)
         model = self._openvino.Core().read_model(path)
-        compiled = _Compiled(self._openvino, model, half=self._half)
+        compiled = _Compiled(self._openvino, model, self._dtype)
         with log.progress("compiling", len(sizes)) as progress:
             for size in sizes:
                 compiled.prepare(size)
                 progress.advance()
         weights = [op for op in model.get_ops() if op.get_type_name() == "Constant"]
-        return Built(compiled, sum(op.data.nbytes for op in weights))
+        return Built(compiled, sum(op.data.nbytes for op in weights), self._dtype)
 
     def _convert(self, network: Network, samples: Sequence[Inputs]) -> Any:
         # Only C is fixed: frames may have another size than the samples.
@@ -80,6 +81,22 @@ class OpenVino(Engine):
                 engines.readable(network), example_input=samples[0], input=shapes
             )
         return model if self._nncf is None else self._quantised(model, samples, self._nncf)
+
+    def _channels_last(self, model: Any) -> Any:
+        """`model` with pictures in and out channels last, those that go in of `_dtype`, as its
+        convolutions have them: the CPU need not convert them."""
+        preprocess, layout = self._openvino.preprocess, self._openvino.Layout
+        outside = preprocess.PrePostProcessor(model)
+        kind = self._openvino.Type.bf16 if self._half else self._openvino.Type.f32
+        for place, port in enumerate(model.inputs):
+            if _is_picture(port):
+                outside.input(place).tensor().set_layout(layout("NHWC")).set_element_type(kind)
+                outside.input(place).model().set_layout(layout("NCHW"))
+        for place, port in enumerate(model.outputs):
+            if _is_picture(port):
+                outside.output(place).tensor().set_layout(layout("NHWC"))
+                outside.output(place).model().set_layout(layout("NCHW"))
+        return outside.build()
 
     def _quantised(self, model: Any, samples: Sequence[Inputs], nncf: Any) -> Any:
         logging.getLogger("nncf").setLevel(logging.ERROR)
@@ -113,21 +130,25 @@ def _fix_ranges(model: Any) -> None:
             op.input(place).replace_source_output(opset13.constant(bound).output(0))
 
 
+def _is_picture(port: Any) -> bool:
+    return port.partial_shape.rank.get_length() == 4
+
+
 def _capabilities(openvino: Any) -> list[str]:
     return openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
 
 
 class _Compiled:
-    """A model, compiled for every input size when that size first occurs.
+    """A compiled model. One of rows is compiled for every number of rows when it first occurs,
+    which is a third faster than for any number. One of pictures, which are channels last, is
+    compiled once: its convolutions gain little, and each compilation holds its own memory."""
 
-    Compiled for a fixed size, it is a third faster than for dynamic sizes.
-    """
-
-    def __init__(self, openvino: Any, model: Any, *, half: bool) -> None:
-        self._model, self._core = model, openvino.Core()
+    def __init__(self, openvino: Any, model: Any, dtype: torch.dtype) -> None:
+        self._openvino, self._model, self._core = openvino, model, openvino.Core()
+        self._dtype = dtype
         self._requests: dict[tuple[tuple[int, ...], ...], Any] = {}
         self._settings = {
-            "INFERENCE_PRECISION_HINT": "bf16" if half else "f32",
+            "INFERENCE_PRECISION_HINT": "bf16" if dtype == torch.bfloat16 else "f32",
             "PERFORMANCE_HINT": "LATENCY",
             "INFERENCE_NUM_THREADS": torch.get_num_threads(),
         }
@@ -141,15 +162,25 @@ class _Compiled:
         self._request(tuple(x.shape for x in inputs)).infer(inputs)
 
     def __call__(self, *inputs: Tensor) -> Inputs:
-        arrays = [x.contiguous().numpy() for x in inputs]
-        request = self._request(tuple(x.shape for x in arrays))
-        found = request.infer(arrays, share_inputs=True, share_outputs=True)
-        return tuple(torch.from_numpy(found[place]) for place in range(len(found)))
+        given = [x.movedim(1, -1).to(self._dtype) if x.dim() == 4 else x for x in inputs]
+        tensors = [self._tensor(x.contiguous()) for x in given]
+        varying = () if any(x.dim() == 4 for x in inputs) else tuple(x.shape for x in given)
+        found = self._request(varying).infer(tensors, share_inputs=True, share_outputs=True)
+        outputs = (torch.from_numpy(found[place]) for place in range(len(found)))
+        return tuple(x.movedim(-1, 1) if x.dim() == 4 else x for x in outputs)
+
+    def _tensor(self, x: Tensor) -> Any:
+        """`x` for OpenVINO, in the same memory; numpy has no bfloat16."""
+        if x.dtype != torch.bfloat16:
+            return x.numpy()
+        kind = self._openvino.Type.bf16
+        return self._openvino.Tensor(x.view(torch.int16).numpy(), list(x.shape), kind)
 
     def _request(self, shapes: tuple[tuple[int, ...], ...]) -> Any:
         if shapes not in self._requests:
             model = self._model.clone()
-            model.reshape(dict(enumerate(map(list, shapes))))
+            if shapes:
+                model.reshape(dict(enumerate(map(list, shapes))))
             compiled = self._core.compile_model(model, "CPU", self._settings)
             self._requests[shapes] = compiled.create_infer_request()
         return self._requests[shapes]

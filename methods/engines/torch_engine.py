@@ -56,7 +56,8 @@ class TorchEngine(Engine):
                 return network(*inputs)
 
         size = sum(weight.numel() for weight in network.parameters()) * dtype.itemsize
-        return Built(run if _on_cpu(network) else _recorded(run, network, samples, log), size)
+        made = run if _on_cpu(network) else _recorded(run, network, samples, log)
+        return Built(made, size, dtype)
 
 
 def _on_cpu(network: Network) -> bool:

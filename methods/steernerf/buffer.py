@@ -7,6 +7,7 @@ s / 2 - 1/2 pixels, and of several points in a pixel the last one is shown.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -19,6 +20,14 @@ from methods.rendering.frame import FeatureFrame
 from methods.steernerf.kernels.splat import splat
 
 RELIABLE_ALPHA = 0.1  # the expected depth of a pixel is reliable if its opacity is more than this
+
+
+@dataclass(frozen=True)
+class Points:
+    """Features of points, and the point that each pixel shows."""
+
+    values: Tensor  # [P, C]
+    index: Tensor  # [...] int32, a row of `values`, -1 for none
 
 
 @dataclass(frozen=True)
@@ -54,9 +63,8 @@ class Cloud:
     def splat(self, camera: Camera, backend: str) -> tuple[Tensor, Tensor]:
         """The point that each pixel of `camera` shows, as [H, W] int32 indices, -1 for none; and
         the z-depth [N] of all points."""
-        pixels, depth = project(camera, self.points)  # Eq. 7 at low resolution, Eq. 9 at full
-        size = camera.width, camera.height  # + 0.5: corners are rounded to the nearest one
-        return splat(pixels + 0.5, depth, *size, backend=backend), depth  # Eq. 8, Eq. 10
+        index, depth = _splat([self], camera, backend)
+        return index[0], depth
 
     def interval(self, camera: Camera, epsilon: float, backend: str) -> Tensor:
         """The z-depths [h, w, 2] between which each pixel of the low-resolution `camera` is
@@ -65,6 +73,24 @@ class Cloud:
         depth = functional.pad(depth, (0, 1), value=torch.inf)[index.long()]  # -1: the padding
         near = torch.where(index >= 0, depth - epsilon, 0)
         return torch.stack((near, depth + epsilon), dim=-1)
+
+
+def reproject(clouds: Sequence[Cloud], camera: Camera, channels: int, backend: str) -> Points:
+    """Which of the `channels` features of `clouds` each pixel of `camera` shows: [L', H, W]."""
+    index, _ = _splat(clouds, camera, backend)
+    none = camera.c2w.new_empty(0, channels)
+    return Points(torch.cat([none, *(cloud.values for cloud in clouds)]), index)
+
+
+def _splat(clouds: Sequence[Cloud], camera: Camera, backend: str) -> tuple[Tensor, Tensor]:
+    """The points of all `clouds` that each pixel of `camera` shows, one picture a cloud, and the
+    z-depth of them all."""
+    none = camera.c2w.new_empty(0, 3)
+    points = torch.cat([none, *(cloud.points for cloud in clouds)])
+    pixels, depth = project(camera, points)  # Eq. 7 at low resolution, Eq. 9 at full
+    counts = [len(cloud.points) for cloud in clouds]
+    size = camera.width, camera.height  # + 0.5: corners are rounded to the nearest one
+    return splat(pixels + 0.5, depth, counts, *size, backend=backend), depth  # Eq. 8, Eq. 10
 
 
 Buffer = deque[Cloud]

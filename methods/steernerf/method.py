@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,12 +10,12 @@ from typing import ClassVar
 
 import torch
 
-from bench.motion import preceding, viewing_target
 from bench.provenance import digest
 from bench.study import Axis, Study, Variant, turned
 from bench.threads import torch_threads
-from bench.types import Budget, Camera, Frame, Log, NullProbe, Probe, Scene
-from methods.engines import Engine, Inputs
+from bench.types import Budget, Camera, Frame, Log, Probe, Scene
+from methods.engines import Built, Engine, Figures
+from methods.engines.auto import Auto
 from methods.instant_ngp.field import Precision
 from methods.instant_ngp.stage1 import Setup, train_field
 from methods.instant_ngp.training import TrainingOptions
@@ -23,12 +23,16 @@ from methods.kernels.encode import HashGrid
 from methods.kernels.types import expect
 from methods.steernerf.buffer import Buffer
 from methods.steernerf.options import JointOptions, Model, Rendering
-from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.stage2 import Stage2, train_stage2
 from methods.steernerf.unet import Renderer2d
+from methods.steernerf.views import Views
 
 HOW = "method.rendering"
-SKIPS = {"empty space": f"{HOW}.skip.empty", "hidden samples": f"{HOW}.skip.hidden"}
+SKIPS = {
+    "empty space": f"{HOW}.skip.empty",
+    "hidden samples": f"{HOW}.skip.hidden",
+    "background": f"{HOW}.skip.background",
+}
 TABLES = (14, 16, 17, 19)  # sizes of the hash table, log2 T
 
 
@@ -51,7 +55,12 @@ STUDY = Study(
         "log2 T, trained": turned("log2 T", "method.grid.log2_table", (15, 19)),
         "field, trained": turned("field", "method.precision", ("fp32",)),
     },
-    exact=(f"{HOW}.range.mode=off", f"{HOW}.step=1", f"{HOW}.skip.hidden=false"),
+    exact=(
+        f"{HOW}.range.mode=off",
+        f"{HOW}.step=1",
+        f"{HOW}.skip.hidden=false",
+        f"{HOW}.skip.background=false",
+    ),
     skips=SKIPS,
     savings=(Variant("and range reduction", (f"{HOW}.range.mode=paper",)),),
     axes={
@@ -96,7 +105,7 @@ class SteerNerf:
         rendering: Rendering,
         renderer: Callable[..., Renderer2d],
         joint: JointOptions,
-        engine: Engine,
+        engine: Engine | Auto,
         steps: int | None = None,
         after: float = 1.0,
         precision: Precision = "bf16",
@@ -125,16 +134,23 @@ class SteerNerf:
             given = self.trained, self.setup, self.stage2, scene, budget, log
             self.pipeline, trained, seconds = train_stage2(*given)
         self.train_s = self.trained.train_s + seconds
-        renderer, engine = self.pipeline.renderer, self.engine
-        count = engine.samples(renderer.network)
-        samples = partial(self.record, self.pipeline, scene, count, log)
+        views = Views(self.pipeline, scene, self.stage2.joint, self.setup.seed, log)
+        renderer, device = self.pipeline.renderer, self.setup.device
 
-        def folder() -> Path:
-            key = {"trained": trained, "engine": engine.key(), "recorded": digest(type(self))}
+        def folder(engine: dict[str, object]) -> Path:
+            key = {"trained": trained, "engine": engine, "recorded": digest(type(self))}
             return log.stage_dir("network", key)
 
-        built = engine.build(renderer.network, samples, folder, log)
-        renderer.engine, self.renderer_bytes = built.run, built.size
+        def build(engine: Engine) -> Built:
+            samples = partial(views.inputs, engine.samples(renderer.network))
+            return engine.build(renderer.network, samples, lambda: folder(engine.key()), log)
+
+        def measure(engines: Sequence[Engine]) -> Sequence[Figures]:
+            return views.compare([build(engine) for engine in engines])
+
+        if isinstance(engine := self.engine, Auto):
+            engine = engine.chosen(device, measure, folder(engine.key(device)), log)
+        renderer.engine, self.chosen = build(engine), engine
 
     def reset(self) -> None:
         """Forget preceding frames."""
@@ -146,28 +162,9 @@ class SteerNerf:
 
     def sizes(self) -> dict[str, int]:
         """Bytes of table, networks, occupancy bits and 2D renderer."""
-        return self.trained.sizes() | {"renderer2d": self.renderer_bytes}
+        return self.trained.sizes() | {"renderer2d": self.pipeline.renderer.engine.size}
 
     def settings(self) -> dict[str, str]:
         """Those of the field, with the engine and precision of the 2D renderer."""
-        precision = self.engine.computed(self.setup.device)
-        return self.setup.settings() | {"engine": self.engine.name, "precision": precision}
-
-    def record(self, pipeline: Pipeline, scene: Scene, count: int, log: Log) -> list[Inputs]:
-        """The inputs of the network in `count` training views, evenly spread, on which an engine is
-        calibrated. They are rendered as in training, whatever `rendering` is, each after L + 1
-        frames of a random motion: even the oldest frame in the buffer had a preceding one."""
-        generator = torch.Generator().manual_seed(self.setup.seed)
-        cameras, target = scene.splits["train"].cameras, viewing_target(scene)
-        network, frames, joint = pipeline.renderer.network, pipeline.model.frames, self.stage2.joint
-        rendering, degrees = joint.rendering(pipeline.model), joint.motion.degrees
-        recorded: list[Inputs] = []
-        with log.progress("frames to build the network on", count) as progress:
-            for place in range(count):
-                camera, buffer = cameras[place * len(cameras) // count], Buffer(maxlen=frames)
-                for before in preceding(camera, target, frames + 1, degrees, generator):
-                    pipeline.remember(before, buffer, rendering)
-                with network.register_forward_pre_hook(lambda _, xs: recorded.append(xs)):
-                    pipeline.render(camera, buffer, rendering, NullProbe())
-                progress.advance()
-        return recorded
+        engine, computed = self.chosen.name, self.chosen.computed(self.setup.device)
+        return self.setup.settings() | {"engine": engine, "precision": computed}

@@ -52,6 +52,7 @@ class Skips:
 
     empty: bool  # samples in empty cells, and rays that meet no other cells
     hidden: bool  # samples behind a transmittance of `Rendering.stop`
+    background: bool  # pixels of the 2D renderer that are not near matter
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,8 @@ class JointOptions:
 
     def rendering(self, model: Model) -> Rendering:
         """How frames are rendered in training: everywhere, which serves all later choices."""
-        return Rendering(model.step, model.stop, EVERYWHERE, Skips(empty=True, hidden=True))
+        skip = Skips(empty=True, hidden=True, background=True)
+        return Rendering(model.step, model.stop, EVERYWHERE, skip)
 
     def distilled(self, steps: int, frames: int) -> int:
         """How many distilled views a training of `steps` steps can use. With no preceding `frames`

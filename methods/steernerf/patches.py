@@ -27,10 +27,10 @@ from methods.kernels.types import Pixels
 from methods.rendering.batch import render_batch
 from methods.rendering.compaction import indices_where
 from methods.rendering.frame import FeatureFrame, everywhere, render_frame, sees_matter
-from methods.steernerf.buffer import Buffer
+from methods.steernerf.buffer import Buffer, Points
 from methods.steernerf.options import JointOptions
 from methods.steernerf.pipeline import Pipeline, View
-from methods.steernerf.unet import Observation, Points
+from methods.steernerf.unet import Observation
 from methods.training import checkpoint
 
 
@@ -174,7 +174,12 @@ class Patch:
     example: Example
     view: View
     truth: Tensor  # [H, W, 3] the true picture
-    points: Sequence[Points]  # features of preceding frames, reprojected into `view`
+    points: Points  # features of preceding frames, reprojected into `view`
+
+    @property
+    def counts(self) -> list[int]:
+        """The number of points of each of these frames."""
+        return [len(cloud.points) for cloud in self.example.buffer][: len(self.points.index)]
 
 
 @dataclass(frozen=True)
@@ -201,7 +206,7 @@ class Patches(Examples):
         size = view.low.height, view.low.width
         side = min(self.options.patch, max(1, int(self.options.patch_share * min(size))))
         top, left = self.place(example, side, size)
-        cut = view.crop(left, top, side)
+        cut = view.crop((slice(top, top + side), slice(left, left + side)))
         truth = self._truth(example, top, left, cut.full)
         return Patch(example, cut, truth, self.pipeline.reproject(example.buffer, cut))
 
@@ -244,7 +249,7 @@ class Patches(Examples):
             for patch in patches:
                 frame, points = self._frame(patch.view.low, *next(of_each)), patch.points
                 if self.learning:
-                    points = [self._learned(old, *next(of_each)) for old in points]
+                    points = self._learned(patch, [next(of_each) for _ in patch.points.index])
                 shown.append(Observation(frame, points, self.pipeline.backend))
             observations = self.observations(patches, shown)
         truth = torch.stack([patch.truth for patch in patches])
@@ -260,8 +265,9 @@ class Patches(Examples):
         low = patch.view.low
         yield low, sees_matter(low, self.pipeline.occupancy).flatten()
         if self.learning:
-            for old, cloud in zip(patch.points, patch.example.buffer, strict=False):
-                yield cloud.camera, _shown(old.index, len(old.values))
+            masks = _shown(patch.points).split(patch.counts)
+            for cloud, mask in zip(patch.example.buffer, masks, strict=False):
+                yield cloud.camera, mask
 
     def _frame(self, low: Camera, seen: Tensor, pixels: Pixels) -> FeatureFrame:
         """The frame of the whole patch, from its rendered `pixels`, those at indices `seen`."""
@@ -270,13 +276,19 @@ class Patches(Examples):
         frame = FeatureFrame.of(low, canvas, self.pipeline.background)
         return replace(frame, depth=frame.depth.detach())
 
-    def _learned(self, old: Points, shown: Tensor, pixels: Pixels) -> Points:
-        """Preceding features, those of the points `shown` as they are rendered now."""
-        values = pixels.over(self.pipeline.background).values
-        return replace(old, values=old.values.index_copy(0, shown, values))
+    def _learned(self, patch: Patch, rendered: Sequence[tuple[Tensor, Pixels]]) -> Points:
+        """Preceding features: in each frame, those of the shown points are as `rendered` now."""
+        old, background = patch.points, self.pipeline.background
+        frames = zip(old.values.split(patch.counts), rendered, strict=True)
+        each = [
+            values.index_copy(0, shown, pixels.over(background).values)
+            for values, (shown, pixels) in frames
+        ]
+        return replace(old, values=torch.cat([old.values[:0], *each]))
 
 
-def _shown(index: Tensor, count: int) -> Tensor:
-    """Which of `count` points occur in `index`, which is -1 for none: [count] bool."""
-    shown = torch.zeros(count + 1, dtype=torch.bool, device=index.device)
-    return shown.index_fill_(0, index.flatten().long() % (count + 1), True)[:count]
+def _shown(points: Points) -> Tensor:
+    """Which of P `points` some pixel shows: [P] bool."""
+    count = len(points.values)
+    shown = torch.zeros(count + 1, dtype=torch.bool, device=points.index.device)
+    return shown.index_fill_(0, points.index.flatten().long() % (count + 1), True)[:count]

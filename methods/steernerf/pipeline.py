@@ -15,10 +15,11 @@ from bench.cameras import crop_camera, place_camera, scale_camera
 from bench.types import Camera, Frame, NullProbe, Probe
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.types import Occupancy
+from methods.rendering.compaction import compacts
 from methods.rendering.frame import FeatureFrame, everywhere, render_frame
-from methods.steernerf.buffer import Buffer, Cloud
+from methods.steernerf.buffer import Buffer, Cloud, Points, reproject
 from methods.steernerf.options import Model, Rendering
-from methods.steernerf.unet import Observation, Points, Renderer2d
+from methods.steernerf.unet import WHOLE, Observation, Part, Renderer2d
 
 
 @dataclass(frozen=True)
@@ -29,11 +30,31 @@ class View:
     low: Camera  # the same view at 1/s of the resolution; K_l of Eq. 7
     scale: int  # s
 
-    def crop(self, left: int, top: int, side: int) -> View:
-        """Crop to a square of `side` low-resolution pixels, the first at `left`, `top`."""
-        s = self.scale
-        full = crop_camera(self.full, left * s, top * s, side * s, side * s)
-        return View(full, crop_camera(self.low, left, top, side, side), s)
+    def crop(self, part: Part) -> View:
+        """The view of a part of the low-resolution pixels."""
+        (top, bottom, _), (left, right, _) = (
+            one.indices(side)
+            for one, side in zip(part, (self.low.height, self.low.width), strict=True)
+        )
+        s, sides = self.scale, (right - left, bottom - top)
+        full = crop_camera(self.full, left * s, top * s, *(side * s for side in sides))
+        return View(full, crop_camera(self.low, left, top, *sides), s)
+
+
+MARGIN = 8  # pixels at low resolution around matter, which the 2D renderer corrects, too
+STEP = 8  # sides are multiples of it: engines prepare a network for few sizes
+
+
+def near_matter(seen: Tensor) -> Part:
+    """A rectangle of low-resolution pixels [h, w] around all that are `seen`, and a margin."""
+    part = []
+    for across in (1, 0):
+        size, there = seen.shape[1 - across], seen.any(dim=across).nonzero()
+        ends = there[[0, -1], 0].tolist() if len(there) else (0, 0)
+        length = min(-(-(ends[1] + 1 - ends[0] + 2 * MARGIN) // STEP) * STEP, size)
+        begin = max(min((ends[0] + ends[1] + 1 - length) // 2, size - length), 0)
+        part.append(slice(begin, begin + length))
+    return part[0], part[1]
 
 
 class Pipeline:
@@ -108,9 +129,9 @@ class Pipeline:
             render = everywhere(self.field, where, probe, how)
             return render_frame(view.low, where, self.background, probe, render)
 
-    def reproject(self, preceding: Sequence[Cloud], view: View) -> Sequence[Points]:
+    def reproject(self, preceding: Sequence[Cloud], view: View) -> Points:
         """The features of the `preceding` frames that the present view shows (Eq. 9, 10)."""
-        return [Points(old.values, old.splat(view.full, self.backend)[0]) for old in preceding]
+        return reproject(preceding, view.full, self.model.channels, self.backend)
 
     def observe(
         self,
@@ -121,12 +142,18 @@ class Pipeline:
         probe: Probe,
     ) -> Any:
         """What the 2D renderer is shown: the present `frame` and the `preceding` features."""
-        return Observation(frame, self.reproject(preceding, view), self.backend)
+        # On a GPU the host would wait, and every new size would be recorded or built.
+        some = rendering.skip.background and compacts(frame.alpha.device)
+        part = near_matter(frame.alpha > 0) if some else WHOLE
+        drawn = view.crop(part)
+        sizes = (seen.full.width * seen.full.height for seen in (drawn, view))
+        probe.count("drawn_pixels", *sizes)
+        return Observation(frame, self.reproject(preceding, drawn), self.backend, part)
 
     def draw(self, shown: Any, view: View, rendering: Any, probe: Probe) -> Tensor:
         """The picture I [H, W, 3] of what the 2D renderer is `shown` (Eq. 11)."""
         with probe.stage("renderer2d"):
-            return self.renderer([shown], probe)[0].clamp_(0, 1)
+            return self.renderer([shown], probe, clip=True)[0]
 
     def keep(self, frame: FeatureFrame, view: View, picture: Tensor) -> Cloud:
         """What later frames need of this one: its features and depths as points (Eq. 6)."""

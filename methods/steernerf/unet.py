@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,20 +10,18 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from bench.types import NullProbe, Probe
-from methods.engines.network import Network
+from methods.engines.network import Built, Network
 from methods.kernels.types import expect
 from methods.rendering.frame import FeatureFrame
-from methods.steernerf.kernels.splat import gather
+from methods.steernerf.buffer import Points
+from methods.steernerf.kernels.drawing import corrected, shown
 
 UNWATCHED = NullProbe()
 
+Part = tuple[slice, slice]
+"""Rows and columns of a low-resolution frame."""
 
-@dataclass(frozen=True)
-class Points:
-    """Features of points, and the point that each pixel shows."""
-
-    values: Tensor  # [P, C]
-    index: Tensor  # [...] int32, a row of `values`, -1 for none
+WHOLE = slice(None), slice(None)
 
 
 @dataclass(frozen=True)
@@ -31,8 +29,9 @@ class Observation:
     """What the 2D renderer is shown."""
 
     frame: FeatureFrame  # the present features F, [h, w, K]
-    preceding: Sequence[Points]  # of preceding frames, newest first, indices [H, W]; at most L
+    preceding: Points  # of preceding frames, newest first, indices [L', H', W'], L' at most L
     backend: str  # of the kernels that a renderer calls
+    part: Part = WHOLE  # of the frame, to be drawn; the H' x W' pixels are of this part
 
 
 class Renderer2d(nn.Module):
@@ -40,13 +39,13 @@ class Renderer2d(nn.Module):
     set (Eq. 11). A subclass has a method `forward(observations, probe)`, as that of `UNet`."""
 
     network: Network
-    engine: Callable[..., tuple[Tensor, ...]] | None = None
+    engine: Built | None = None
 
     def run(self, probe: Probe, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Compute the network's output."""
         probe.count("products", self.network.products(*inputs))
         with probe.stage("network"):
-            return (self.engine or self.network)(*inputs)
+            return (self.engine.run if self.engine else self.network)(*inputs)
 
 
 class UNet(Renderer2d):
@@ -67,27 +66,40 @@ class UNet(Renderer2d):
         self.channels, self.frames, self.scale, self.aligned = channels, frames, scale, aligned
         self.network = _Network(channels * (frames + 1), width)
 
-    def forward(self, observations: Sequence[Observation], probe: Probe = UNWATCHED) -> Tensor:
-        """Draw all observations: pictures [B, H, W, 3]."""
-        inputs = torch.stack([self._inputs(o) for o in observations])
+    def forward(
+        self,
+        observations: Sequence[Observation],
+        probe: Probe = UNWATCHED,
+        *,
+        clip: bool = False,
+    ) -> Tensor:
+        """Draw all observations, whose parts have one size: pictures [B, H, W, 3], `clip`ped to
+        [0, 1]. Beyond its part, a picture is its base."""
+        inputs = _stacked([self._input(o) for o in observations]).permute(0, 3, 1, 2)
         (correction,) = self.run(probe, inputs)  # Eq. 11
-        rgb = torch.stack([o.frame.values[..., :3] for o in observations]).permute(0, 3, 1, 2)
-        base = functional.interpolate(
-            rgb, scale_factor=self.scale, mode="bilinear", align_corners=not self.aligned
-        )
-        return base.permute(0, 2, 3, 1) + correction.to(inputs).permute(0, 2, 3, 1)
+        pictures = [
+            corrected(
+                o.frame.values[..., :3],
+                added,
+                tuple(self.scale * (side.start or 0) for side in o.part),
+                self.scale,
+                self.aligned,
+                clip=clip,
+                backend=o.backend,
+            )
+            for o, added in zip(observations, correction.permute(0, 2, 3, 1), strict=True)
+        ]
+        return _stacked(pictures)
 
-    def _inputs(self, observation: Observation) -> Tensor:
-        """[K (L + 1), H, W]: the RGB of all frames, then their other features; zeros for preceding
-        frames that are missing after a cold start."""
-        values, s, backend = observation.frame.values, self.scale, observation.backend
-        present = values.new_zeros(values.shape[0] * s, values.shape[1] * s, self.channels)
-        present[::s, ::s] = values
-        points = observation.preceding
-        frames = [present, *(gather(p.values, p.index, backend=backend) for p in points)]
-        frames += [torch.zeros_like(present)] * (self.frames + 1 - len(frames))
-        rgb, rest = ([f[..., part] for f in frames] for part in (slice(0, 3), slice(3, None)))
-        return torch.cat((*rgb, *rest), dim=-1).permute(2, 0, 1)
+    def _input(self, observation: Observation) -> Tensor:
+        """[H', W', K (L + 1)]; zeros for preceding frames that are missing after a cold start."""
+        o, kind = observation, observation.frame.values.device.type
+        given = o.frame.values[o.part], o.preceding.values, o.preceding.index
+        if self.engine:
+            dtype = self.engine.dtype
+        else:
+            dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else None
+        return shown(*given, self.frames, dtype=dtype, backend=o.backend)
 
 
 class _Network(Network):
@@ -145,6 +157,11 @@ class _Residual(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.second(self.first(x).relu())
+
+
+def _stacked(pictures: Sequence[Tensor]) -> Tensor:
+    """A batch of pictures; one alone is not copied."""
+    return pictures[0][None] if len(pictures) == 1 else torch.stack(tuple(pictures))
 
 
 def _conv(inputs: int, outputs: int) -> nn.Conv2d:

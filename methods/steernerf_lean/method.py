@@ -12,7 +12,6 @@ from methods.steernerf.method import SKIPS, STUDY, SteerNerf, not_skipped
 from methods.steernerf_lean.training import LeanStage2
 
 HOW = "method.rendering"
-ALL_SKIPS = {**SKIPS, "background cells": f"{HOW}.skip.background"}
 REFINED = turned("refined", f"{HOW}.refined", (0, 0.03, 0.06, 0.25, 0.5, 1))
 REFINED_STEPS = turned("refined step", f"{HOW}.refined_step", (1, 1.5, 3))
 STEPS = turned("step", f"{HOW}.step", (1, 1.5, 3, 4))
@@ -37,7 +36,7 @@ class SteerNerfLean(SteerNerf):
         STUDY,
         knobs={
             **STUDY.knobs,
-            "skips": not_skipped(ALL_SKIPS),
+            "skips": not_skipped(SKIPS),
             "step length": STEPS,
             "refined step length": REFINED_STEPS,
             "refined share": REFINED,
@@ -52,13 +51,7 @@ class SteerNerfLean(SteerNerf):
             "s, trained": turned("s", "method.model.scale", (2, 4, 8), SCRATCH),
             "step, trained": turned("trained step", "method.model.step", (1, 3), REFINED_AS_IT_IS),
         },
-        exact=(
-            *STUDY.exact,
-            f"{HOW}.overlap=0",
-            f"{HOW}.refined=1",
-            f"{HOW}.skip.background=false",
-        ),
-        skips=ALL_SKIPS,
+        exact=(*STUDY.exact, f"{HOW}.overlap=0", f"{HOW}.refined=1"),
         skips_with=(f"{HOW}.refined=0",),  # refinement takes a share of the cells drawn
         axes={name: axis for name, axis in STUDY.axes.items() if name != "L"},
         parts={**STUDY.parts, **PARTS},

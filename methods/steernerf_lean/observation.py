@@ -15,9 +15,8 @@ from methods.rendering.compaction import kept_indices
 from methods.rendering.field import CACHED_SAMPLES, Field, query
 from methods.rendering.frame import FeatureFrame
 from methods.rendering.occupancy import STEP
-from methods.steernerf.buffer import Cloud
+from methods.steernerf.buffer import Cloud, Points
 from methods.steernerf.pipeline import View
-from methods.steernerf.unet import Points
 from methods.steernerf_lean.cells import centres
 
 OVERLAP_POINTS = 256  # at most, evenly spaced, to estimate how much of a frame another view shares

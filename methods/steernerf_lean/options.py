@@ -11,17 +11,9 @@ from methods.steernerf.options import EVERYWHERE, JointOptions, Model, Rendering
 
 
 @dataclass(frozen=True)
-class LeanSkips(Skips):
-    """Further work to skip."""
-
-    background: bool  # cells that are not near matter
-
-
-@dataclass(frozen=True)
 class LeanRendering(Rendering):
     """Further settings that are chosen after training."""
 
-    skip: LeanSkips
     overlap: float  # a preceding frame of which the present view sees less than this is dropped
     refined: float  # share of the cells that the field renders: those with the largest error
     refined_step: float  # ray-marching step in these cells, in diagonals of the cube / 1024
@@ -61,6 +53,6 @@ class LeanJointOptions(JointOptions):
 
     def rendering(self, model: Model) -> LeanRendering:
         """How frames are rendered in training: everywhere, and refined as these options say."""
-        skip = LeanSkips(empty=True, hidden=True, background=True)
+        skip = Skips(empty=True, hidden=True, background=True)
         own = {"overlap": 0.0, "refined": self.refined, "refined_step": self.refined_step}
         return LeanRendering(model.step, model.stop, EVERYWHERE, skip, **own)

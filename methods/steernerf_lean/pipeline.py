@@ -15,9 +15,8 @@ from torch import Tensor
 from bench.cameras import cast
 from bench.types import Camera, NullProbe, Probe, Rays
 from methods.rendering.frame import FeatureFrame, render_rays
-from methods.steernerf.buffer import Buffer, Cloud
+from methods.steernerf.buffer import Buffer, Cloud, Points
 from methods.steernerf.pipeline import Pipeline, View
-from methods.steernerf.unet import Points
 from methods.steernerf_lean.cells import cells_near, centres, put_pixels
 from methods.steernerf_lean.kernels.warp import enlarge, warp
 from methods.steernerf_lean.observation import Kept, LeanObservation, overlap, surface_points
@@ -53,9 +52,9 @@ class LeanPipeline(Pipeline):
                     buffer = ()
         return super().select(buffer, view, rendering, probe)
 
-    def reproject(self, preceding: Sequence[Cloud], view: View) -> Sequence[Points]:
+    def reproject(self, preceding: Sequence[Cloud], view: View) -> Points:
         """No features of preceding frames are shown."""
-        return ()
+        return super().reproject((), view)
 
     def observe(
         self,

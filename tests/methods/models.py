@@ -25,12 +25,12 @@ from methods.steernerf.options import (
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.unet import UNet
 from methods.steernerf_lean.lean_renderer import LeanRenderer
-from methods.steernerf_lean.options import LeanJointOptions, LeanRendering, LeanSkips
+from methods.steernerf_lean.options import LeanJointOptions, LeanRendering
 from methods.steernerf_lean.pipeline import LeanPipeline
 
 SMALL_GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=16)
 MODEL = Model(channels=4, frames=2, scale=4, step=8.0, stop=STOP, feature_background=0.5)
-RENDERING = Rendering(8.0, STOP, EVERYWHERE, Skips(empty=True, hidden=True))
+RENDERING = Rendering(8.0, STOP, EVERYWHERE, Skips(empty=True, hidden=True, background=True))
 MOTION = MotionOptions(degrees=(0.0, 2.5), length=4, least=0, pool=12, uses=16, longer=0.75)
 JOINT = JointOptions(
     field="joint",
@@ -66,8 +66,7 @@ small_joint = partial(replace, JOINT)
 lean_model = partial(replace, MODEL, frames=1)
 """K = 4, L = 1, s = 4, long steps."""
 
-LEAN_SKIPS = LeanSkips(empty=True, hidden=True, background=True)
-LEAN_RENDERING = {"skip": LEAN_SKIPS, "overlap": 0.0, "refined": 0.0, "refined_step": 1.0}
+LEAN_RENDERING = {"skip": RENDERING.skip, "overlap": 0.0, "refined": 0.0, "refined_step": 1.0}
 lean_rendering = partial(replace, LeanRendering(**vars(RENDERING) | LEAN_RENDERING))
 """As `lean_model()` is trained, but without refinement."""
 

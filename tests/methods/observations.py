@@ -10,7 +10,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from methods.rendering.frame import FeatureFrame
-from methods.steernerf.unet import Observation, Points, Renderer2d
+from methods.steernerf.buffer import Points
+from methods.steernerf.unet import Observation, Renderer2d
 from methods.steernerf_lean.cells import cells_near
 from methods.steernerf_lean.lean_renderer import LeanRenderer
 from methods.steernerf_lean.observation import LeanObservation
@@ -75,8 +76,8 @@ def observe_paper(
 ) -> Observation:
     """Random features in steps of 1/256, and preceding points on a third of the pixels."""
     frame, fine, generator = _frame(height, width, channels, scale, None, seed)
-    preceding = [_scattered(fine, 0.33, channels, generator) for _ in range(frames)]
-    return Observation(frame, preceding, "auto")
+    each = fine.expand(frames, *fine.shape)
+    return Observation(frame, _scattered(each, 0.33, channels, generator), "auto")
 
 
 def _frame(

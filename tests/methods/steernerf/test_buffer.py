@@ -18,8 +18,7 @@ from methods.kernels.types import Occupancy
 from methods.rendering.frame import FeatureFrame, everywhere, render_frame
 from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import Sampling
-from methods.steernerf.buffer import RELIABLE_ALPHA, Cloud
-from methods.steernerf.kernels.splat import gather
+from methods.steernerf.buffer import RELIABLE_ALPHA, Cloud, reproject
 from methods.steernerf.options import RangeReduction
 from tests.methods.conftest import Work, look_at_the_middle
 from tests.methods.solids import Solid, ball, wall
@@ -88,11 +87,11 @@ def test_features_land_where_the_released_code_puts_them(
     depth, values = given["depth"][age], torch.from_numpy(features).permute(1, 2, 0)
     seen = depth > 0
     frame = FeatureFrame(cameras[age], values, depth.where(seen, math.inf), seen.float())
-    cloud = Cloud.of(frame)
-    index, _ = cloud.splat(scale_camera(cameras[0], 48, 40), backend)
+    points = reproject([Cloud.of(frame)], scale_camera(cameras[0], 48, 40), 6, backend)
     # Features are moved, not computed: no rounding at all.
     wanted = torch.from_numpy(RELEASE[f"warp.{which}"][age]).permute(1, 2, 0)
-    assert torch.equal(gather(cloud.values, index, backend=backend), wanted)
+    nothing = torch.zeros(1, points.values.shape[1])
+    assert torch.equal(torch.cat((points.values, nothing))[points.index[0].long()], wanted)
 
 
 def test_summed_depths_are_too_near_unless_the_opacity_is_divided_out() -> None:

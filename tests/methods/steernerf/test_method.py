@@ -20,6 +20,7 @@ from methods.steernerf.method import SteerNerf
 from methods.steernerf.options import RangeReduction, Skips
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.unet import UNet
+from methods.steernerf.views import Views
 from tests.methods.models import (
     new_pipeline,
     small_joint,
@@ -147,7 +148,7 @@ def key_of(method: SteerNerf, **changed: Any) -> dict[str, object]:
 
 
 def test_a_training_depends_on_its_model_and_on_nothing_that_is_chosen_afterwards() -> None:
-    usual, skip = new_method(), Skips(empty=False, hidden=True)
+    usual, skip = new_method(), Skips(empty=False, hidden=True, background=True)
     other = new_method(step=1.5, stop=1e-1, range=RANGED, skip=skip)
     assert key_of(other) == key_of(usual)
     everywhere = small_rendering(step=4.0)
@@ -193,10 +194,9 @@ def test_settings_that_do_not_fit_are_refused() -> None:
 
 def recorded(scene: Scene, log: Log, frames: int, seed: int = 0) -> list[torch.Tensor]:
     """The inputs of the network in three views."""
-    method = new_method(frames)
-    method.setup = replace(method.setup, seed=seed)
     pipeline = new_pipeline(small_model(frames=frames))
-    return [inputs for (inputs,) in method.record(pipeline, scene, 3, log)]
+    views = Views(pipeline, scene, small_joint(), seed, log)
+    return [inputs for (inputs,) in views.inputs(3)]
 
 
 def test_a_frame_is_recorded_behind_as_many_as_the_buffer_holds_and_one_more(

@@ -11,7 +11,7 @@ import torch
 from bench.cameras import cast, project
 from bench.types import NullProbe
 from methods.steernerf.buffer import Buffer, Cloud
-from methods.steernerf.options import RangeReduction, Skips
+from methods.steernerf.options import RangeReduction
 from tests.methods.conftest import Work, look_at_the_middle
 from tests.methods.models import new_pipeline, small_model, small_rendering
 
@@ -33,7 +33,7 @@ def test_a_ray_of_the_low_resolution_goes_through_the_middle_of_its_cell(
 
 def test_a_part_of_a_view_looks_as_the_view_does() -> None:
     view = new_pipeline().view(CAMERA)
-    part = view.crop(2, 3, 4)
+    part = view.crop((slice(3, 7), slice(2, 6)))
     for whole, some, scale in ((view.low, part.low, 1), (view.full, part.full, 4)):
         directions = cast(whole).directions.view(whole.height, whole.width, 3)
         there = directions[3 * scale : 7 * scale, 2 * scale : 6 * scale]
@@ -125,5 +125,6 @@ def test_what_is_not_skipped_is_more_work_and_longer_steps_and_earlier_stops_are
     usual, some = samples(), samples(stop=0.5)
     assert samples(step=16.0) < 0.7 * usual
     assert 0 < some < usual
-    for skip in (Skips(empty=False, hidden=True), Skips(empty=True, hidden=False)):
+    for unskipped in ("empty", "hidden"):
+        skip = replace(USUAL.skip, **{unskipped: False})
         assert samples(stop=0.5, skip=skip) > some

@@ -63,16 +63,13 @@ def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
     training = new_training(ball_scene, options, field.float())
     renderer, pipeline = training.renderer, training.patches.pipeline
     patches = [training.patches.cut(training.patches.example()) for _ in range(8)]
-    shown = [p for p in patches if all((old.index >= 0).any() for old in p.points)][:2]
-    assert [len(patch.points) for patch in shown] == [2, 2]
+    shown = [p for p in patches if all((i >= 0).any() for i in p.points.index)][:2]
+    assert [len(patch.points.index) for patch in shown] == [2, 2]
     field.double(), renderer.double()
     pipeline.background = torch.ones(4, dtype=torch.float64)
     field.gradients = None
     monkeypatch.setattr(torch, "zeros", partial(torch.zeros, dtype=torch.float64))  # of a canvas
-    patches = [
-        replace(p, points=[replace(old, values=old.values.double()) for old in p.points])
-        for p in shown
-    ]
+    patches = [replace(p, points=replace(p.points, values=p.points.values.double())) for p in shown]
     truth = torch.stack([patch.truth for patch in patches])
 
     def loss() -> Tensor:

@@ -98,11 +98,13 @@ def test_its_products_are_those_that_torch_counts(height: int, width: int, chann
 def test_frames_that_are_missing_after_a_cold_start_show_nothing() -> None:
     renderer = shaken(unet(6, 2, 4)).double()
     warm = doubled(observe_paper())
-    empty = replace(warm.preceding[1], index=torch.full_like(warm.preceding[1].index, -1))
-    pictures = renderer([replace(warm, preceding=warm.preceding[:1])])
-    unseen = renderer([replace(warm, preceding=[warm.preceding[0], empty])])
+    index = warm.preceding.index
+    one, none = (replace(warm.preceding, index=index[:count]) for count in (1, 0))
+    empty = replace(one, index=torch.stack((index[0], torch.full_like(index[1], -1))))
+    pictures = renderer([replace(warm, preceding=one)])
+    unseen = renderer([replace(warm, preceding=empty)])
     assert torch.equal(pictures, unseen)
-    cold = renderer([replace(warm, preceding=[])])
+    cold = renderer([replace(warm, preceding=none)])
     assert cold.isfinite().all()
     assert (cold - pictures).abs().max() > 1e-3
 

@@ -11,9 +11,10 @@ import torch
 
 from bench.types import Budget, Log, NullProbe, Scene
 from methods.engines.torch_engine import TorchEngine
+from methods.steernerf.options import Skips
+from methods.steernerf.views import Views
 from methods.steernerf_lean.lean_renderer import LeanRenderer
 from methods.steernerf_lean.method import SteerNerfLean
-from methods.steernerf_lean.options import LeanSkips
 from tests.methods.models import lean_joint, lean_model, lean_pipeline, lean_rendering, small_motion
 from tests.methods.trainings import GRID, QUICK
 
@@ -50,7 +51,7 @@ def test_a_rendering_may_be_exchanged_between_frames(
 
 
 def test_a_training_depends_on_its_options_and_on_nothing_that_is_chosen_afterwards() -> None:
-    usual, skip = new_method().stage2, LeanSkips(empty=True, hidden=True, background=False)
+    usual, skip = new_method().stage2, Skips(empty=True, hidden=True, background=False)
     other = new_method(overlap=0.5, refined=0.25, refined_step=2.0, skip=skip).stage2
     assert other.key(BUDGET) == usual.key(BUDGET)
     as_trained = lean_rendering(step=4.0, refined=0.2, refined_step=2.0)
@@ -64,5 +65,5 @@ def test_of_a_frame_for_the_engine_only_its_own_inputs_are_recorded(
 ) -> None:
     """Not those of the frames before it, whose pictures are drawn as well."""
     pipeline = lean_pipeline()
-    frames = new_method().record(pipeline, ball_scene, 3, quiet_log)
+    frames = Views(pipeline, ball_scene, new_method().stage2.joint, 0, quiet_log).inputs(3)
     assert [rows.shape[1] for rows, _ in frames] == 3 * [pipeline.renderer.layout.width]

@@ -1,10 +1,12 @@
-"""Splats points into pixels and gathers their features: the reprojection of earlier frames.
+"""Splats points into pixels: the reprojection of earlier frames.
 
-`splat` finds which point each pixel shows; `gather` fetches the features of these points. Pixel
-(i, j) covers [i, i+1) x [j, j+1), so a point at (u, v) lands only in (floor u, floor v).
+Pixel (i, j) covers [i, i+1) x [j, j+1), so a point at (u, v) lands only in (floor u, floor v).
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -14,39 +16,29 @@ from methods.kernels.dispatch import implementation
 
 
 def splat(
-    pixels: Tensor, depth: Tensor, width: int, height: int, *, backend: str = "auto"
+    pixels: Tensor,
+    depth: Tensor,
+    counts: Sequence[int],
+    width: int,
+    height: int,
+    *,
+    backend: str = "auto",
 ) -> Tensor:
-    """Find which of N points each pixel of a width x height picture shows: [height, width] int32.
+    """Find which of the points of several frames each pixel of a width x height picture shows:
+    [frames, height, width] int32.
 
-    The points have continuous coordinates (u, v) `pixels` [N, 2] and a z-depth `depth` [N]. An
-    entry is the index of the last point that lands there, whatever its depth, -1 for none: in
-    SteerNeRF's release points overwrite each other. Only points inside the picture with a finite
-    positive depth count. Not differentiable; for features use `gather`.
+    The N points, `counts` of each frame, one frame after the other, have continuous coordinates
+    (u, v) `pixels` [N, 2] and a z-depth `depth` [N]. An entry is the index, 0 to N - 1, of the last
+    point of the frame that lands there, whatever its depth, -1 for none: in SteerNeRF's release
+    points overwrite each other. Only points inside the picture with a finite positive depth count.
+    Not differentiable.
     """
-    check_shape("pixels", pixels, None, 2)
-    check_shape("depth", depth, len(pixels))
+    check_shape("pixels", pixels, sum(counts), 2)
+    check_shape("depth", depth, sum(counts))
     chosen = implementation(__name__, backend, pixels.device)
-    return chosen.splat(pixels.detach(), depth.detach(), width, height)
-
-
-def gather(values: Tensor, index: Tensor, *, backend: str = "auto") -> Tensor:
-    """Rows of `values` [N, C] at `index` [...] int32, as from `splat`, zeros where it is -1:
-    [..., C]. Differentiable in `values`; the gradient of a row is the sum over all pixels that
-    show it."""
-    check_shape("values", values, None, None)
-    chosen = implementation(__name__, backend, values.device)
-    rows = _Gather.apply(values.contiguous(), index.contiguous().view(-1), chosen)
-    return rows.view(*index.shape, values.shape[1])
-
-
-class _Gather(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, values, index, chosen):
-        ctx.save_for_backward(index)
-        ctx.points, ctx.chosen = len(values), chosen
-        return chosen.gather(values.detach(), index)
-
-    @staticmethod
-    def backward(ctx, grad):
-        (index,) = ctx.saved_tensors
-        return ctx.chosen.scatter(grad.contiguous(), index, ctx.points), None, None
+    index = torch.full((len(counts), height, width), -1, dtype=torch.int32, device=pixels.device)
+    starts = accumulate(counts, initial=0)
+    each = zip(pixels.detach().split(counts), depth.detach().split(counts), strict=True)
+    for picture, first, points in zip(index, starts, each, strict=False):
+        chosen.splat(*points, first, picture)
+    return index

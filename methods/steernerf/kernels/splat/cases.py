@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from bench.cameras import pixel_grid
-from bench.case import U32, Bound, Case, Given, Operation
+from bench.case import Bound, Case, Given, Operation
 from methods.kernels.dispatch import served
-from methods.steernerf.kernels.splat import gather, splat
+from methods.steernerf.kernels.splat import splat
 
 LOW, HIGH = 200, 800  # sides in pixels of the splatted frame and of the target picture
 FRAME = f"{LOW} x {LOW} into {HIGH} x {HIGH}"
@@ -21,38 +21,22 @@ WRONG = (math.nan, math.inf, -math.inf, 1e20, -1e20, 0.0, -0.0, 1e-20, -1e-20)
 
 
 def _shown(given: Given, backend: str) -> tuple[Tensor, ...]:
-    return (splat(given["pixels"], given["depth"], *given["size"], backend=backend),)
-
-
-def _gathered(given: Given, backend: str) -> tuple[Tensor, ...]:
-    return (gather(given["values"], given["index"], backend=backend),)
-
-
-def _sums(given: Given) -> Tensor:
-    """2 n (n - 1) u for each row, which n pixels show."""
-    index = given["index"].flatten()
-    times = torch.bincount(index[index >= 0], minlength=len(given["values"]))
-    return (2 * times * (times - 1).clamp(min=0) * U32)[:, None]
+    points, depth = given["pixels"], given["depth"]
+    counts = [len(depth) // 3, len(depth) - len(depth) // 3]  # two frames
+    return (splat(points, depth, counts, *given["size"], backend=backend),)
 
 
 EXACT = Bound("decided by comparisons, nothing is computed: 0", 0.0)
-SUMS = Bound("n pixels: n - 1 sums of at most n, off by n u in each backend: 2 n (n - 1) u", _sums)
-BY = served(__package__)
-SPLAT = Operation("splat", BY, _shown, {"index": EXACT})
-GATHER = Operation("splat gather", BY, _gathered, {"rows": EXACT}, {"values": SUMS})
+SPLAT = Operation("splat", served(__package__), _shown, {"index": EXACT})
 
 
 def cases() -> list[Case]:
-    """Splatting and gathering by all backends; a frame seen from beside is timed."""
+    """Splatting by all backends; a frame seen from beside is timed."""
     found = SPLAT.cases("at borders, outside or not finite", _extreme)
     for count, width, height in ((0, 5, 4), (50, 1, 1), (3000, 13, 7), (5000, 4097, 3)):
         name = f"{count} points in {width} x {height}"
         found += SPLAT.cases(name, partial(_points, count, width, height))
-    found += SPLAT.cases(FRAME, _seen_aside, items=LOW**2)
-    for points, pixels, channels in ((0, 20, 6), (10, 0, 6), (10, 20, 0), (1000, 1001, 6)):
-        name = f"{points} points of {channels} in {pixels} pixels"
-        found += GATHER.cases(name, partial(_rows, points, pixels, channels))
-    return found + GATHER.cases(FRAME, _frame_rows, items=HIGH**2)
+    return found + SPLAT.cases(FRAME, _seen_aside, items=LOW**2)
 
 
 def _points(count: int, width: int, height: int) -> Given:
@@ -79,14 +63,3 @@ def _seen_aside() -> Given:
     pixels = HIGH / LOW * pixel_grid(LOW, LOW) + torch.tensor([5.0, -3.0])
     pixels += 0.5 * torch.randn(LOW**2, 2, generator=generator)
     return {"pixels": pixels, "depth": torch.ones(LOW**2), "size": (HIGH, HIGH)}
-
-
-def _rows(points: int, pixels: int, channels: int) -> Given:
-    generator = torch.Generator().manual_seed(points + pixels)
-    index = torch.randint(-1, points, (pixels,), generator=generator, dtype=torch.int32)
-    return {"index": index, "values": torch.rand(points, channels, generator=generator)}
-
-
-def _frame_rows() -> Given:
-    (index,) = _shown(_seen_aside(), "reference")
-    return {"index": index, "values": _rows(LOW**2, 0, 6)["values"]}

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bench.threads import torch_threads
-from methods.steernerf.kernels.splat import gather, splat
+from methods.steernerf.kernels.splat import splat
 
 BACKENDS = ["reference", "cpu"]
 
@@ -23,6 +23,11 @@ def scatter_points(
     pixels = (torch.rand(count, 2, generator=generator) * 1.5 - 0.25) * size
     depth = (4 * torch.rand(count, generator=generator)).round() - 1
     return ((4 * pixels).round() / 4).to(dtype), depth.to(dtype)
+
+
+def one(pixels: Tensor, depth: Tensor, width: int, height: int, backend: str) -> Tensor:
+    """The picture of a single frame."""
+    return splat(pixels, depth, [len(depth)], width, height, backend=backend)[0]
 
 
 def plain_splat(pixels: Tensor, depth: Tensor, width: int, height: int) -> list[list[int]]:
@@ -41,7 +46,7 @@ def plain_splat(pixels: Tensor, depth: Tensor, width: int, height: int) -> list[
 )
 def test_a_picture_is_the_definition(count: int, width: int, height: int, backend: str) -> None:
     pixels, depth = scatter_points(count, width, height)
-    index = splat(pixels, depth, width, height, backend=backend)
+    index = one(pixels, depth, width, height, backend)
     assert index.dtype == torch.int32
     assert index.tolist() == plain_splat(pixels, depth, width, height)
     assert (index >= 0).any() == (count > 0)
@@ -50,7 +55,7 @@ def test_a_picture_is_the_definition(count: int, width: int, height: int, backen
 def test_the_reference_keeps_the_digits_of_float64() -> None:
     pixels, depth = scatter_points(500, 9, 9, torch.float64)
     pixels -= 1e-12  # nothing in float32: over the border of a pixel
-    index = splat(pixels, depth, 9, 9, backend="reference")
+    index = one(pixels, depth, 9, 9, "reference")
     assert index.tolist() == plain_splat(pixels, depth, 9, 9)
 
 
@@ -64,39 +69,32 @@ def test_the_border_of_a_pixel_belongs_to_the_next_and_wrong_points_to_none(back
     """A point at a time, at all places and depths; the border of the picture belongs to none."""
     places, depths = torch.tensor((*EDGES, *WRONG)), torch.tensor(DEPTHS)
     for point in torch.cartesian_prod(places, places, torch.ones(1)).split(1):
-        got = splat(point[:, :2], point[:, 2], 7, 5, backend=backend)
+        got = one(point[:, :2], point[:, 2], 7, 5, backend)
         assert got.tolist() == plain_splat(point[:, :2], point[:, 2], 7, 5), point
     for depth in depths.split(1):
         table = torch.tensor([[0.5, 0.5]]), depth
-        assert splat(*table, 1, 1, backend=backend).tolist() == plain_splat(*table, 1, 1), depth
+        assert one(*table, 1, 1, backend).tolist() == plain_splat(*table, 1, 1), depth
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_pixel_gathers_the_row_of_its_point_or_zeros(backend: str) -> None:
-    values = torch.rand(40, 3, generator=torch.Generator().manual_seed(0))
-    values[0] = values[-1] = torch.nan  # where nothing is shown, no row may be read
-    index = torch.randint(-1, 40, (2, 5, 7), generator=torch.Generator().manual_seed(1)).int()
-    got = gather(values, index, backend=backend)
-    assert got.shape == (2, 5, 7, 3)
-    for place, point in enumerate(index.flatten().tolist()):
-        want = torch.zeros(3) if point < 0 else values[point]
-        assert torch.equal(got.view(-1, 3)[place].nan_to_num(2.0), want.nan_to_num(2.0))
+def test_frames_have_a_picture_each_and_their_points_one_numbering(backend: str) -> None:
+    pixels, depth = scatter_points(300, 9, 7)
+    counts = [100, 0, 200]
+    got = splat(pixels, depth, counts, 9, 7, backend=backend)
+    assert got.shape == (3, 7, 9)
+    first = splat(pixels[:100], depth[:100], [100], 9, 7, backend=backend)
+    last = splat(pixels[100:], depth[100:], [200], 9, 7, backend=backend)
+    assert torch.equal(got[0], first[0])
+    assert (got[1] == -1).all()
+    assert torch.equal(got[2], torch.where(last[0] < 0, -1, last[0] + 100))
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_what_is_strided_is_read_as_it_stands(backend: str) -> None:
     pixels, depth = scatter_points(400, 9, 9)
     table = torch.cat((depth[:, None], pixels), dim=1)  # a row of three, used in two parts
-    index = splat(pixels, depth, 9, 9, backend=backend)
-    assert torch.equal(splat(table[:, 1:], table[:, 0], 9, 9, backend=backend), index)
-    got = gather(table.T.contiguous().T, index.T, backend=backend)
-    assert torch.equal(got, gather(table, index, backend=backend).transpose(0, 1))
-
-
-def test_gradients_in_float64() -> None:
-    values = torch.rand(4, 3, dtype=torch.float64, requires_grad=True)
-    index = torch.tensor([[0, -1, 2], [2, 2, 3]], dtype=torch.int32)
-    assert torch.autograd.gradcheck(lambda v: gather(v, index, backend="reference"), values)
+    index = one(pixels, depth, 9, 9, backend)
+    assert torch.equal(one(table[:, 1:], table[:, 0], 9, 9, backend), index)
 
 
 def test_the_number_of_threads_does_not_change_the_picture() -> None:
@@ -104,20 +102,15 @@ def test_the_number_of_threads_does_not_change_the_picture() -> None:
     pictures = []
     for threads in (1, 2, 4):
         with torch_threads(threads):
-            pictures.append(splat(pixels, depth, 50, 3, backend="cpu"))
+            pictures.append(one(pixels, depth, 50, 3, "cpu"))
     assert all(torch.equal(picture, pictures[0]) for picture in pictures)
 
 
 def test_wrong_arguments_are_named() -> None:
     pixels, depth = torch.zeros(3, 2), torch.ones(3)
-    with pytest.raises(ValueError, match=r"pixels: expected shape \[any, 2\], got \[3\]"):
-        splat(depth, depth, 5, 4)
+    with pytest.raises(ValueError, match=r"pixels: expected shape \[3, 2\], got \[3\]"):
+        splat(depth, depth, [3], 5, 4)
     with pytest.raises(ValueError, match=r"depth: expected shape \[3\], got \[2\]"):
-        splat(pixels, depth[:2], 5, 4)
+        splat(pixels, depth[:2], [3], 5, 4)
     with pytest.raises(ValueError, match="computes with float32"):
-        splat(pixels.double(), depth, 5, 4, backend="cpu")
-    index = torch.zeros(4, dtype=torch.int32)
-    with pytest.raises(ValueError, match="values: expected shape"):
-        gather(depth, index)
-    with pytest.raises(ValueError, match="computes with float32"):
-        gather(pixels.double(), index, backend="cpu")
+        splat(pixels.double(), depth, [3], 5, 4, backend="cpu")

@@ -1,0 +1,86 @@
+"""Training views with the frames before them, on which engines are built and compared."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from bench.metrics import psnr
+from bench.motion import preceding, viewing_target
+from bench.probes import FrameRecord, StageClock
+from bench.types import Camera, Frame, Log, NullProbe, Probe, Scene, composite
+from methods.engines import Built, Figures, Inputs
+from methods.steernerf.buffer import Buffer
+from methods.steernerf.options import JointOptions
+from methods.steernerf.pipeline import Pipeline
+
+COMPARED = 4
+"""Number of views that engines are compared in."""
+
+
+@dataclass(frozen=True)
+class Views:
+    """The training views of `scene`, rendered by `pipeline` as in training, whatever is chosen
+    afterwards; `seed` is that of the motions before them."""
+
+    pipeline: Pipeline
+    scene: Scene
+    joint: JointOptions
+    seed: int
+    log: Log
+
+    def inputs(self, count: int) -> list[Inputs]:
+        """The inputs of the network in `count` views."""
+        network, recorded = self.pipeline.renderer.network, list[Inputs]()
+        self.pipeline.renderer.engine = None  # which would be called instead
+        for _, camera, buffer in self._spread(count, "frames to build the network on"):
+            with network.register_forward_pre_hook(lambda _, inputs: recorded.append(inputs)):
+                self._render(camera, buffer, NullProbe())
+        return recorded
+
+    def compare(self, networks: Sequence[Built]) -> list[Figures]:
+        """The PSNR of pictures and the time of the 2D renderer with each of the `networks`."""
+        pictures, background = self.scene.splits["train"].images, self.pipeline.background
+        clocks = [StageClock(background.device.type) for _ in networks]
+        quality = [list[float]() for _ in networks]
+        for number, camera, buffer in self._spread(COMPARED, "frames to compare engines in"):
+            truth = composite(pictures[number], self.scene.background)
+            for network, clock, found in zip(networks, clocks, quality, strict=True):
+                self.pipeline.renderer.engine = network
+                self._render(camera, buffer, NullProbe())  # the first of its size takes longer
+                with clock.frame():
+                    frame = self._render(camera, buffer, clock)
+                found.append(psnr(frame.rgb.cpu(), truth))
+        return [
+            Figures(statistics.mean(found), statistics.median(map(_renderer_ms, clock.frames)))
+            for found, clock in zip(quality, clocks, strict=True)
+        ]
+
+    def _spread(self, count: int, label: str) -> Iterator[tuple[int, Camera, Buffer]]:
+        """Numbers and cameras of `count` views, evenly spread, and the frames before each: L + 1 of
+        a random motion, so that even the oldest in the buffer had a preceding one."""
+        generator = torch.Generator().manual_seed(self.seed)
+        cameras, target = self.scene.splits["train"].cameras, viewing_target(self.scene)
+        frames, degrees = self.pipeline.model.frames, self.joint.motion.degrees
+        rendering = self.joint.rendering(self.pipeline.model)
+        with self.log.progress(label, count) as progress:
+            for place in range(count):
+                number, buffer = place * len(cameras) // count, Buffer(maxlen=frames)
+                camera = cameras[number]
+                for before in preceding(camera, target, frames + 1, degrees, generator):
+                    self.pipeline.remember(before, buffer, rendering)
+                yield number, camera, buffer
+                progress.advance()
+
+    def _render(self, camera: Camera, buffer: Buffer, probe: Probe) -> Frame:
+        """The frame that follows those in `buffer`, which stays as it is."""
+        rendering = self.joint.rendering(self.pipeline.model)
+        return self.pipeline.render(camera, buffer.copy(), rendering, probe)
+
+
+def _renderer_ms(frame: FrameRecord) -> float:
+    """The time of the 2D renderer, with its network."""
+    return sum(ns for name, ns in frame.stages_ns.items() if name.startswith("renderer2d")) / 1e6
