@@ -150,7 +150,8 @@ class SteerNerf:
 
         if isinstance(engine := self.engine, Auto):
             engine = engine.chosen(device, measure, folder(engine.key(device)), log)
-        renderer.engine, self.chosen = build(engine), engine
+        self.chosen, self.built = engine, build(engine)
+        renderer.engine = self.built
 
     def reset(self) -> None:
         """Forget preceding frames."""
@@ -162,7 +163,7 @@ class SteerNerf:
 
     def sizes(self) -> dict[str, int]:
         """Bytes of table, networks, occupancy bits and 2D renderer."""
-        return self.trained.sizes() | {"renderer2d": self.pipeline.renderer.engine.size}
+        return self.trained.sizes() | {"renderer2d": self.built.size}
 
     def settings(self) -> dict[str, str]:
         """Those of the field, with the engine and precision of the 2D renderer."""

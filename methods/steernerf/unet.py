@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -77,28 +78,21 @@ class UNet(Renderer2d):
         [0, 1]. Beyond its part, a picture is its base."""
         inputs = _stacked([self._input(o) for o in observations]).permute(0, 3, 1, 2)
         (correction,) = self.run(probe, inputs)  # Eq. 11
-        pictures = [
-            corrected(
-                o.frame.values[..., :3],
-                added,
-                tuple(self.scale * (side.start or 0) for side in o.part),
-                self.scale,
-                self.aligned,
-                clip=clip,
-                backend=o.backend,
-            )
-            for o, added in zip(observations, correction.permute(0, 2, 3, 1), strict=True)
-        ]
+        how: Any = {"scale": self.scale, "aligned": self.aligned, "clip": clip}
+        pictures = []
+        for o, added in zip(observations, correction.permute(0, 2, 3, 1), strict=True):
+            rgb, (top, left) = o.frame.values[..., :3], (side.start or 0 for side in o.part)
+            corner = self.scale * top, self.scale * left
+            pictures.append(corrected(rgb, added, corner, **how, backend=o.backend))
         return _stacked(pictures)
 
     def _input(self, observation: Observation) -> Tensor:
         """[H', W', K (L + 1)]; zeros for preceding frames that are missing after a cold start."""
-        o, kind = observation, observation.frame.values.device.type
+        o, dtype = observation, self.engine.dtype if self.engine else None
+        kind = o.frame.values.device.type
+        if not self.engine and torch.is_autocast_enabled(kind):
+            dtype = torch.get_autocast_dtype(kind)
         given = o.frame.values[o.part], o.preceding.values, o.preceding.index
-        if self.engine:
-            dtype = self.engine.dtype
-        else:
-            dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else None
         return shown(*given, self.frames, dtype=dtype, backend=o.backend)
 
 
