@@ -103,7 +103,7 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
 
     jobs = []
     for block, line, repeated in _lines(table, beyond):
-        if line.job.get("precision", experiment.engine.precision) not in precisions:
+        if "precision" in line.job and line.job["precision"] not in precisions:
             continue
         settings = [f"{name}={value}" for name, value in line.job.items()]
         groups = [word for word in settings if choices(word.partition("=")[0], fixed)]
