@@ -12,6 +12,7 @@ from bench.cameras import cast, project
 from bench.types import NullProbe
 from methods.steernerf.buffer import Buffer, Cloud
 from methods.steernerf.options import RangeReduction
+from methods.steernerf.pipeline import near_matter
 from tests.methods.conftest import Work, look_at_the_middle
 from tests.methods.models import new_pipeline, small_model, small_rendering
 
@@ -128,3 +129,57 @@ def test_what_is_not_skipped_is_more_work_and_longer_steps_and_earlier_stops_are
     for unskipped in ("empty", "hidden"):
         skip = replace(USUAL.skip, **{unskipped: False})
         assert samples(stop=0.5, skip=skip) > some
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "part"),
+    [
+        ((30, 33), (40, 42), (slice(19, 43), slice(29, 53))),  # 3 + 16 rows, 2 + 16 columns: 24
+        ((0, 1), (97, 100), (slice(0, 24), slice(76, 100))),  # it stays inside the picture
+        ((5, 85), (20, 84), (slice(0, 90), slice(12, 92))),  # no larger than the picture
+    ],
+)
+def test_the_part_that_is_drawn_surrounds_matter(rows, columns, part) -> None:
+    seen = torch.zeros(90, 100, dtype=torch.bool)
+    seen[slice(*rows), slice(*columns)] = True
+    assert near_matter(seen) == part
+
+
+def test_a_view_of_nothing_has_a_part_too() -> None:
+    part = near_matter(torch.zeros(90, 100, dtype=torch.bool))
+    assert [side.stop - side.start for side in part] == [24, 24]
+
+
+def test_far_from_matter_a_picture_is_background_and_near_it_that_of_the_whole() -> None:
+    """At the border of its part the network sees less than in the whole picture; what it draws of
+    a pixel depends on no other farther away than 52: 2 + 3 convolutions at full size, 2 + 4 at
+    half and 8 at a quarter of it, and what is pooled."""
+    lens = {"fx": 500.0, "fy": 500.0, "cx": 400.0, "cy": 400.0}
+    camera, pipeline = replace(CAMERA, width=800, height=800, **lens), new_pipeline()
+    whole = replace(USUAL, skip=replace(USUAL.skip, background=False))
+    some, every = (
+        pipeline.render(camera, Buffer(maxlen=2), rendering, NullProbe())
+        for rendering in (USUAL, whole)
+    )
+    rows, columns = near_matter(every.alpha[::4, ::4] > 0)
+    assert torch.equal(every.alpha, some.alpha)
+    drawn = torch.zeros(800, 800, dtype=torch.bool)
+    drawn[4 * rows.start : 4 * rows.stop, 4 * columns.start : 4 * columns.stop] = True
+    assert 0.05 < drawn.float().mean() < 0.5
+    assert (some.rgb[~drawn] == pipeline.background[:3]).all()
+    inner = (slice(4 * side.start + 52, 4 * side.stop - 52) for side in (rows, columns))
+    place = tuple(inner)
+    assert every.rgb[place].shape[0] > 50
+    # Float32, sums of a few hundred products, in another order where the size is another.
+    torch.testing.assert_close(some.rgb[place], every.rgb[place], rtol=0, atol=1e-5)
+    assert not torch.equal(some.rgb, every.rgb)
+
+
+def test_drawing_less_is_less_work() -> None:
+    camera = replace(CAMERA, width=800, height=800, cx=400.0, cy=400.0)
+    products = []
+    for background in (False, True):
+        work, skip = Work(), replace(USUAL.skip, background=background)
+        new_pipeline().render(camera, Buffer(maxlen=2), replace(USUAL, skip=skip), work)
+        products.append(work.done["products"])
+    assert products[1] < 0.1 * products[0]
