@@ -28,13 +28,17 @@ class Auto:
     """The fastest engine and precision here whose pictures lose at most `loss` dB of PSNR against
     those of torch in fp32. It is found once for a trained network, and remembered."""
 
-    precisions = ()  # none is asked for by name
+    name, precisions = "auto", ()  # no precision is asked for by name
 
     def __init__(self, loss: float) -> None:
         self.loss = loss
 
     def check(self, device: torch.device) -> None:
         """As of an engine; torch in fp32 can always be chosen."""
+
+    def computed(self, device: torch.device) -> str:
+        """As of an engine: not known before one is chosen."""
+        return self.name
 
     def _candidates(self, device: torch.device) -> Iterator[Engine]:
         """All engines and precisions that can be used on `device`; torch in fp32 first."""

@@ -121,7 +121,8 @@ class SteerNerf:
         engine.check(self.setup.device)
         with torch.random.fork_rng(devices=[]):  # refuses before hours of training
             self.stage2.make(self.setup)
-        self.rendering, self.engine, self.name = rendering, engine, name
+        self.rendering, self.name = rendering, name
+        self.engine = self.chosen = engine  # `chosen` computes the network after `fit`
         self.steps, self.train_s = steps, 0.0
         self.memory, self.buffer = model.frames, Buffer(maxlen=model.frames)
 
