@@ -1,0 +1,67 @@
+"""Views that engines are built and compared on."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from bench.metrics import psnr
+from bench.types import Log, NullProbe, Scene, composite
+from methods.engines import Built
+from methods.steernerf.pipeline import Pipeline
+from methods.steernerf.views import COMPARED, Views
+from tests.methods.models import new_pipeline, small_joint, small_model
+
+
+def views_of(scene: Scene, log: Log) -> Views:
+    return Views(new_pipeline(small_model(frames=1)), scene, small_joint(), 0, log)
+
+
+@torch.no_grad()
+def test_engines_are_compared_in_the_same_frames_with_the_true_pictures(
+    ball_scene: Scene, quiet_log: Log
+) -> None:
+    """A network that adds 1 to everything draws white pictures."""
+    views, given = views_of(ball_scene, quiet_log), []
+    network = views.pipeline.renderer.network
+
+    def white(inputs):
+        given.append(inputs)
+        return (torch.ones_like(network(inputs)[0]),)
+
+    exact, wrong = views.compare([Built(network, 0), Built(white, 0)])
+    numbers = [place * 24 // COMPARED for place in range(COMPARED)]
+    pictures = [ball_scene.splits["train"].images[number] for number in numbers]
+    truth = [composite(picture, ball_scene.background) for picture in pictures]
+    blank = [psnr(torch.ones_like(picture), picture) for picture in truth]
+    assert wrong.psnr == pytest.approx(sum(blank) / COMPARED, abs=1e-4)
+    assert exact.psnr > wrong.psnr
+    assert min(exact.ms, wrong.ms) > 0
+    frames = [tuple(x.flatten().tolist()) for x in given]
+    assert len(set(frames)) == COMPARED  # each twice: the first is not timed
+    assert len(frames) == 2 * COMPARED
+
+
+def test_what_a_network_is_built_on_is_what_it_is_shown_whatever_ran_before(
+    ball_scene: Scene, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views = views_of(ball_scene, quiet_log)
+    first = views.inputs(2)
+    views.pipeline.renderer.engine = Built(lambda *inputs: pytest.fail("asked"), 0)
+    again = views.inputs(2)
+    assert all(torch.equal(a, b) for (a,), (b,) in zip(first, again, strict=True))
+
+
+def test_frames_are_rendered_as_in_training(
+    ball_scene: Scene, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views, seen = views_of(ball_scene, quiet_log), []
+    render = Pipeline.render
+
+    def watched(self, camera, buffer, rendering, probe):
+        seen.append(rendering)
+        return render(self, camera, buffer, rendering, NullProbe())
+
+    monkeypatch.setattr(Pipeline, "render", watched)
+    views.inputs(2)
+    assert seen == 2 * [views.joint.rendering(views.pipeline.model)]
