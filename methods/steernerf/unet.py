@@ -66,6 +66,7 @@ class UNet(Renderer2d):
         expect(1 <= width <= 4096, "renderer.width", "1 to 4096", width)
         self.channels, self.frames, self.scale, self.aligned = channels, frames, scale, aligned
         self.network = _Network(channels * (frames + 1), width)
+        self._memory = torch.empty(0)  # of the last input
 
     def forward(
         self,
@@ -76,7 +77,8 @@ class UNet(Renderer2d):
     ) -> Tensor:
         """Draw all observations, whose parts have one size: pictures [B, H, W, 3], `clip`ped to
         [0, 1]. Beyond its part, a picture is its base."""
-        inputs = _stacked([self._input(o) for o in observations]).permute(0, 3, 1, 2)
+        once = len(observations) == 1 and not torch.is_grad_enabled()
+        inputs = _stacked([self._input(o, once) for o in observations]).permute(0, 3, 1, 2)
         (correction,) = self.run(probe, inputs)  # Eq. 11
         how: Any = {"scale": self.scale, "aligned": self.aligned, "clip": clip}
         pictures = []
@@ -86,14 +88,19 @@ class UNet(Renderer2d):
             pictures.append(corrected(rgb, added, corner, **how, backend=o.backend))
         return _stacked(pictures)
 
-    def _input(self, observation: Observation) -> Tensor:
-        """[H', W', K (L + 1)]; zeros for preceding frames that are missing after a cold start."""
+    def _input(self, observation: Observation, once: bool) -> Tensor:
+        """[H', W', K (L + 1)]; zeros for preceding frames that are missing after a cold start. If
+        it is needed `once`, until the next call, it lies in the memory of the last one."""
         o, dtype = observation, self.engine.dtype if self.engine else None
         kind = o.frame.values.device.type
         if not self.engine and torch.is_autocast_enabled(kind):
             dtype = torch.get_autocast_dtype(kind)
         given = o.frame.values[o.part], o.preceding.values, o.preceding.index
-        return shown(*given, self.frames, dtype=dtype, backend=o.backend)
+        memory = self._memory if once else None
+        canvas = shown(*given, self.frames, dtype=dtype, memory=memory, backend=o.backend)
+        if once and canvas.data_ptr() != self._memory.data_ptr():
+            self._memory = canvas.view(-1)
+        return canvas
 
 
 class _Network(Network):

@@ -35,9 +35,13 @@ class Views:
     def inputs(self, count: int) -> list[Inputs]:
         """The inputs of the network in `count` views."""
         network, recorded = self.pipeline.renderer.network, list[Inputs]()
+
+        def keep(_: object, inputs: Inputs) -> None:
+            recorded.append(tuple(x.clone() for x in inputs))  # the next frame overwrites them
+
         self.pipeline.renderer.engine = None  # which would be called instead
         for _, camera, buffer in self._spread(count, "frames to build the network on"):
-            with network.register_forward_pre_hook(lambda _, inputs: recorded.append(inputs)):
+            with network.register_forward_pre_hook(keep):
                 self._render(camera, buffer, NullProbe())
         return recorded
 

@@ -23,6 +23,7 @@ def shown(
     frames: int,
     *,
     dtype: torch.dtype | None = None,
+    memory: Tensor | None = None,
     backend: str = "auto",
 ) -> Tensor:
     """Lay out the features of the present and L preceding `frames`: [H, W, K (L + 1)] of `dtype`
@@ -31,13 +32,14 @@ def shown(
     `present` [h, w, K] stands at every s-th pixel; each pixel has the row of `values` [P, K] that
     `index` [L', H, W] int32 names, -1 for none, for L' <= L preceding frames. All else is 0.
     Differentiable in `present` and `values`; the gradient of a row is the sum over all pixels that
-    show it.
+    show it. Without a gradient, a CPU writes the result into the beginning of `memory` [M], if that
+    is given: fresh pages of the system take as long as the work itself.
     """
     check_shape("present", present, None, None, None)
     check_shape("values", values, None, present.shape[2])
     check_shape("index", index, None, None, None)
     chosen, given = _by(backend, present), (present, values, index.contiguous())
-    return _Shown.apply(*given, frames, dtype or present.dtype, chosen)
+    return _Shown.apply(*given, frames, dtype or present.dtype, memory, chosen)
 
 
 def corrected(
@@ -70,18 +72,20 @@ def _by(backend: str, x: Tensor) -> ModuleType:
 
 class _Shown(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, present, values, index, frames, dtype, chosen):
+    def forward(ctx, present, values, index, frames, dtype, memory, chosen):
         ctx.save_for_backward(index)
         ctx.chosen, ctx.dtype = chosen, present.dtype
         ctx.given = frames, present.shape[:2], len(values)
         moved = (x.detach().to(dtype).contiguous() for x in (present, values))
-        return chosen.shown(*moved, index, frames)
+        if memory is None or any(ctx.needs_input_grad):
+            memory = present.new_empty(0, dtype=dtype)
+        return chosen.shown(*moved, index, frames, memory)
 
     @staticmethod
     def backward(ctx, grad):
         (index,) = ctx.saved_tensors
         grads = ctx.chosen.collected(grad.to(ctx.dtype).contiguous(), index, *ctx.given)
-        return *grads, None, None, None, None
+        return *grads, None, None, None, None, None
 
 
 class _Corrected(torch.autograd.Function):

@@ -15,9 +15,12 @@ Axis = tuple[Tensor, Tensor, Tensor]
 the second, 0 to 1."""
 
 
-def shown(present: Tensor, values: Tensor, index: Tensor, frames: int) -> Tensor:
-    """As the reference, of numbers of 16 or 32 bits, which are moved and not computed."""
-    out = present.new_empty(*index.shape[1:], present.shape[2] * (frames + 1))
+def shown(present: Tensor, values: Tensor, index: Tensor, frames: int, memory: Tensor) -> Tensor:
+    """As the reference, of numbers of 16 or 32 bits, which are moved and not computed; in `memory`
+    if that has room."""
+    shape = torch.Size((*index.shape[1:], present.shape[2] * (frames + 1)))
+    fits = memory.dtype == present.dtype and len(memory) >= shape.numel()
+    out = memory[: shape.numel()].view(shape) if fits else present.new_empty(shape)
     moved = (x.view(torch.int16) if x.dtype.itemsize == 2 else x for x in (present, values, out))
     present, values, filled = moved
     _shown(*arrays(present, values, index), frames + 1, filled.numpy())

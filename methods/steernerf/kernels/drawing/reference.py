@@ -7,8 +7,8 @@ from torch import Tensor
 from torch.nn import functional
 
 
-def shown(present: Tensor, values: Tensor, index: Tensor, frames: int) -> Tensor:
-    """The features of all frames, [H, W, K (L + 1)]."""
+def shown(present: Tensor, values: Tensor, index: Tensor, frames: int, memory: Tensor) -> Tensor:
+    """The features of all frames, [H, W, K (L + 1)]; `memory` is not used."""
     s, (preceding, height, width) = index.shape[1] // present.shape[0], index.shape
     every = present.new_zeros(frames + 1, height, width, present.shape[2])
     every[0, ::s, ::s] = present

@@ -53,6 +53,19 @@ def test_features_of_16_bits_are_rounded_before_they_are_moved(backend: str) -> 
     assert torch.equal(got, shown(*given, 2, backend=backend).bfloat16())
 
 
+def test_memory_is_used_where_it_has_room_and_nothing_needs_a_gradient() -> None:
+    """What lay there before does not show."""
+    given = features()
+    want = shown(*given, 2, backend="cpu")
+    for size, used in ((want.numel() + 5, True), (want.numel() - 1, False)):
+        memory = torch.full((size,), torch.nan)
+        got = shown(*given, 2, memory=memory, backend="cpu")
+        assert torch.equal(got, want)
+        assert (got.data_ptr() == memory.data_ptr()) == used
+    learnt = shown(given[0].requires_grad_(), *given[1:], 2, memory=memory, backend="cpu")
+    assert learnt.data_ptr() != memory.data_ptr()
+
+
 def test_gradients_of_what_is_shown_in_float64() -> None:
     present, values, index = features(dtype=torch.float64)
     given = present.requires_grad_(), values.requires_grad_()
