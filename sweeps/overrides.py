@@ -195,11 +195,11 @@ def target_of(node: Mapping[str, Any] | DictConfig) -> Any:
 
 
 def engine_kinds(words: Sequence[str]) -> dict[str, Any]:
-    """The class of each engine by name, but for `auto`, which is one of them; torch, the standard,
-    comes first."""
-    files = {name: file for name, file in choices("engine", words).items() if name != "auto"}
-    ordered = sorted(files.items(), key=lambda file: (file[0] != "torch", file))
-    return {name: target_of(OmegaConf.load(path)) for name, path in ordered}  # type: ignore[arg-type]
+    """The class of each engine by name, but for one without precisions, which chooses among the
+    others; torch, the standard, comes first."""
+    files = sorted(choices("engine", words).items(), key=lambda file: (file[0] != "torch", file))
+    kinds = {name: target_of(OmegaConf.load(path)) for name, path in files}  # type: ignore[arg-type]
+    return {name: kind for name, kind in kinds.items() if kind.precisions}
 
 
 def folder_words(words: Sequence[str]) -> list[str]:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from copy import deepcopy
 from pathlib import Path
 from types import ModuleType
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal
 
 import torch
 
@@ -36,13 +36,6 @@ Samples = Callable[[], Sequence[Inputs]]
 
 Folder = Callable[[], Path]
 """Returns a folder reserved for one network and engine. Called only if a build stores something."""
-
-
-class Figures(NamedTuple):
-    """What frames have and take with an engine."""
-
-    psnr: float  # dB
-    ms: float  # of the 2D renderer
 
 
 CALIBRATION = 16
@@ -130,7 +123,7 @@ def keep(path: Path, write: Callable[[Path], None], log: Log) -> None:
     """
     with missing(path, log) as to_build:
         if not to_build:
-            log.info(f"built network found: {path}")
+            log.info(f"found: {path}")
             return
         with explained(path.parent), tempfile.TemporaryDirectory(dir=path.parent) as place:
             write(Path(place, path.name))

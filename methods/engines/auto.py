@@ -6,19 +6,27 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 
 from bench.errors import Unavailable
 from bench.provenance import computed_by
-from bench.sharing import missing
 from bench.types import Log
-from methods.engines import Engine, Figures
+from methods.engines import Engine, keep
 from methods.engines.openvino_engine import OpenVino
 from methods.engines.tensorrt_engine import TensorRt
 from methods.engines.torch_engine import TorchEngine
 
 KINDS = (TorchEngine, OpenVino, TensorRt)
+
+
+class Figures(NamedTuple):
+    """What frames have and take with an engine."""
+
+    psnr: float  # dB
+    ms: float  # of the 2D renderer
+
 
 Measure = Callable[[Sequence[Engine]], Sequence[Figures]]
 """Renders the same frames with several engines, in turns."""
@@ -58,9 +66,11 @@ class Auto:
     def chosen(self, device: torch.device, measure: Measure, folder: Path, log: Log) -> Engine:
         """The engine to use on `device`: as noted in `folder`, or as `measure` shows."""
         engines, path = list(self._candidates(device)), folder / "engines.json"
-        with missing(path, log) as to_measure:
-            if to_measure:
-                path.write_text(json.dumps(measure(engines)))
+
+        def write(new: Path) -> None:
+            new.write_text(json.dumps(measure(engines)))
+
+        keep(path, write, log)
         found = [Figures(*figures) for figures in json.loads(path.read_text())]
         for engine, figures in zip(engines, found, strict=True):
             log.info(f"engine {engine}: {figures.ms:.1f} ms, {figures.psnr:.2f} dB")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -14,8 +14,8 @@ from bench.provenance import digest
 from bench.study import Axis, Study, Variant, turned
 from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
-from methods.engines import Built, Engine, Figures
-from methods.engines.auto import Auto
+from methods.engines import Built, Engine
+from methods.engines.auto import Auto, Figures
 from methods.instant_ngp.field import Precision
 from methods.instant_ngp.stage1 import Setup, train_field
 from methods.instant_ngp.training import TrainingOptions
@@ -142,6 +142,7 @@ class SteerNerf:
             key = {"trained": trained, "engine": engine, "recorded": digest(type(self))}
             return log.stage_dir("network", key)
 
+        @cache  # what was measured is not built again
         def build(engine: Engine) -> Built:
             samples = partial(views.inputs, engine.samples(renderer.network))
             return engine.build(renderer.network, samples, lambda: folder(engine.key()), log)
@@ -151,8 +152,8 @@ class SteerNerf:
 
         if isinstance(engine := self.engine, Auto):
             engine = engine.chosen(device, measure, folder(engine.key(device)), log)
-        self.chosen, self.built = engine, build(engine)
-        renderer.engine = self.built
+        self.chosen = engine
+        renderer.engine = self.built = build(engine)
 
     def reset(self) -> None:
         """Forget preceding frames."""

@@ -21,6 +21,9 @@ from methods.steernerf.buffer import Buffer, Cloud, Points, reproject
 from methods.steernerf.options import Model, Rendering
 from methods.steernerf.unet import WHOLE, Observation, Part, Renderer2d
 
+MARGIN = 8  # pixels at low resolution around matter, which the 2D renderer corrects, too
+QUANTUM = 8  # the sides of what it corrects are multiples: libraries prepare code for every size
+
 
 @dataclass(frozen=True)
 class View:
@@ -41,17 +44,13 @@ class View:
         return View(full, crop_camera(self.low, left, top, *sides), s)
 
 
-MARGIN = 8  # pixels at low resolution around matter, which the 2D renderer corrects, too
-STEP = 8  # sides are multiples of it: engines prepare a network for few sizes
-
-
 def near_matter(seen: Tensor) -> Part:
     """A rectangle of low-resolution pixels [h, w] around all that are `seen`, and a margin."""
     part = []
     for across in (1, 0):
         size, there = seen.shape[1 - across], seen.any(dim=across).nonzero()
         ends = there[[0, -1], 0].tolist() if len(there) else (0, 0)
-        length = min(-(-(ends[1] + 1 - ends[0] + 2 * MARGIN) // STEP) * STEP, size)
+        length = min(-(-(ends[1] + 1 - ends[0] + 2 * MARGIN) // QUANTUM) * QUANTUM, size)
         begin = max(min((ends[0] + ends[1] + 1 - length) // 2, size - length), 0)
         part.append(slice(begin, begin + length))
     return part[0], part[1]

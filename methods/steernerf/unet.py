@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -80,20 +79,21 @@ class UNet(Renderer2d):
         once = len(observations) == 1 and not torch.is_grad_enabled()
         inputs = _stacked([self._input(o, once) for o in observations]).permute(0, 3, 1, 2)
         (correction,) = self.run(probe, inputs)  # Eq. 11
-        how: Any = {"scale": self.scale, "aligned": self.aligned, "clip": clip}
-        pictures = []
+        how, pictures = (self.scale, self.aligned), []
         for o, added in zip(observations, correction.permute(0, 2, 3, 1), strict=True):
             rgb, (top, left) = o.frame.values[..., :3], (side.start or 0 for side in o.part)
             corner = self.scale * top, self.scale * left
-            pictures.append(corrected(rgb, added, corner, **how, backend=o.backend))
+            pictures.append(corrected(rgb, added, corner, *how, clip=clip, backend=o.backend))
         return _stacked(pictures)
 
     def _input(self, observation: Observation, once: bool) -> Tensor:
         """[H', W', K (L + 1)]; zeros for preceding frames that are missing after a cold start. If
         it is needed `once`, until the next call, it lies in the memory of the last one."""
-        o, dtype = observation, self.engine.dtype if self.engine else None
+        o, dtype = observation, None
         kind = o.frame.values.device.type
-        if not self.engine and torch.is_autocast_enabled(kind):
+        if self.engine:
+            dtype = self.engine.dtype
+        elif torch.is_autocast_enabled(kind):
             dtype = torch.get_autocast_dtype(kind)
         given = o.frame.values[o.part], o.preceding.values, o.preceding.index
         memory = self._memory if once else None

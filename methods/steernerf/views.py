@@ -12,9 +12,10 @@ from bench.metrics import psnr
 from bench.motion import preceding, viewing_target
 from bench.probes import FrameRecord, StageClock
 from bench.types import Camera, Frame, Log, NullProbe, Probe, Scene, composite
-from methods.engines import Built, Figures, Inputs
+from methods.engines import Built, Inputs
+from methods.engines.auto import Figures
 from methods.steernerf.buffer import Buffer
-from methods.steernerf.options import JointOptions
+from methods.steernerf.options import JointOptions, Rendering
 from methods.steernerf.pipeline import Pipeline
 
 COMPARED = 4
@@ -48,7 +49,7 @@ class Views:
     def compare(self, networks: Sequence[Built]) -> list[Figures]:
         """The PSNR of pictures and the time of the 2D renderer with each of the `networks`."""
         pictures, background = self.scene.splits["train"].images, self.pipeline.background
-        clocks = [StageClock(background.device.type) for _ in networks]
+        clocks = [StageClock(str(background.device)) for _ in networks]
         quality = [list[float]() for _ in networks]
         for number, camera, buffer in self._spread(COMPARED, "frames to compare engines in"):
             truth = composite(pictures[number], self.scene.background)
@@ -69,20 +70,22 @@ class Views:
         generator = torch.Generator().manual_seed(self.seed)
         cameras, target = self.scene.splits["train"].cameras, viewing_target(self.scene)
         frames, degrees = self.pipeline.model.frames, self.joint.motion.degrees
-        rendering = self.joint.rendering(self.pipeline.model)
         with self.log.progress(label, count) as progress:
             for place in range(count):
                 number, buffer = place * len(cameras) // count, Buffer(maxlen=frames)
                 camera = cameras[number]
                 for before in preceding(camera, target, frames + 1, degrees, generator):
-                    self.pipeline.remember(before, buffer, rendering)
+                    self.pipeline.remember(before, buffer, self._rendering)
                 yield number, camera, buffer
                 progress.advance()
 
     def _render(self, camera: Camera, buffer: Buffer, probe: Probe) -> Frame:
         """The frame that follows those in `buffer`, which stays as it is."""
-        rendering = self.joint.rendering(self.pipeline.model)
-        return self.pipeline.render(camera, buffer.copy(), rendering, probe)
+        return self.pipeline.render(camera, buffer.copy(), self._rendering, probe)
+
+    @property
+    def _rendering(self) -> Rendering:
+        return self.joint.rendering(self.pipeline.model)
 
 
 def _renderer_ms(frame: FrameRecord) -> float:

@@ -10,8 +10,8 @@ import torch
 
 from bench.errors import Unavailable
 from bench.types import Log
-from methods.engines import Engine, Figures, auto
-from methods.engines.auto import Auto
+from methods.engines import Engine, auto
+from methods.engines.auto import Auto, Figures
 
 CPU = torch.device("cpu")
 

@@ -43,7 +43,7 @@ def test_engines_are_compared_in_the_same_frames_with_the_true_pictures(
 
 
 def test_what_a_network_is_built_on_is_what_it_is_shown_whatever_ran_before(
-    ball_scene: Scene, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+    ball_scene: Scene, quiet_log: Log
 ) -> None:
     views = views_of(ball_scene, quiet_log)
     first = views.inputs(2)

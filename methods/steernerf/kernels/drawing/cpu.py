@@ -3,6 +3,8 @@ of a picture, each of which stays in the cache until it is complete."""
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import torch
 from numba import njit, prange
@@ -66,6 +68,7 @@ def reduced(grad: Tensor, size: tuple[int, int], scale: int, aligned: bool) -> T
     return sums
 
 
+@lru_cache(maxsize=16)
 def _axis(side: int, scale: int, aligned: bool) -> Axis:
     """The places of the `scale` times as many pixels of a side of `side` pixels."""
     place = torch.arange(side * scale, dtype=torch.float64)
