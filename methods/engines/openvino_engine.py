@@ -82,9 +82,24 @@ class OpenVino(Engine):
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # from the tracer, and about argument checks
             model = self._openvino.convert_model(
-                engines.readable(network), example_input=samples[0], input=shapes
+                engines.readable(network),
+                example_input=samples[0],
+                input=shapes,
+                extension=[self._pixel_shuffle()],
             )
         return model if self._nncf is None else self._quantised(model, samples, self._nncf)
+
+    def _pixel_shuffle(self) -> Any:
+        """Converts torch's `pixel_shuffle` to one operator, which keeps channels last, instead of a
+        transposition between two changes of shape, which does not."""
+        from openvino import opset13
+        from openvino.frontend.pytorch import ConversionExtension
+
+        def convert(node: Any) -> Any:
+            factor = node.get_values_from_const_input(1)
+            return opset13.depth_to_space(node.get_input(0), "depth_first", factor).outputs()
+
+        return ConversionExtension("aten::pixel_shuffle", convert)
 
     def _channels_last(self, model: Any) -> Any:
         """`model` with pictures in and out channels last, those that go in of `_dtype`, as its

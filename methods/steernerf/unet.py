@@ -23,6 +23,8 @@ Part = tuple[slice, slice]
 
 WHOLE = slice(None), slice(None)
 
+QUANTUM = 4  # the network halves its pictures twice
+
 
 @dataclass(frozen=True)
 class Observation:
@@ -78,7 +80,11 @@ class UNet(Renderer2d):
         [0, 1]. Beyond its part, a picture is its base."""
         once = len(observations) == 1 and not torch.is_grad_enabled()
         inputs = _stacked([self._input(o, once) for o in observations]).permute(0, 3, 1, 2)
+        height, width = inputs.shape[-2:]
+        if height % QUANTUM or width % QUANTUM:
+            inputs = functional.pad(inputs, (0, -width % QUANTUM, 0, -height % QUANTUM))
         (correction,) = self.run(probe, inputs)  # Eq. 11
+        correction = correction[..., :height, :width]
         how, pictures = (self.scale, self.aligned), []
         for o, added in zip(observations, correction.permute(0, 2, 3, 1), strict=True):
             rgb, (top, left) = o.frame.values[..., :3], (side.start or 0 for side in o.part)
@@ -121,26 +127,23 @@ class _Network(Network):
             _kaiming(layer, 1.0)
 
     def forward(self, inputs: Tensor) -> tuple[Tensor]:
-        """[B, C, H, W] to [B, 3, H, W]."""
-        height, width = inputs.shape[-2:]
-        # The size is halved twice: pad to a multiple of 4, and crop the result.
-        padded = functional.pad(inputs, (0, -width % 4, 0, -height % 4))
-        full = self.enter(self.first(padded)).relu()
+        """[B, C, H, W] to [B, 3, H, W]; H and W are multiples of `QUANTUM`."""
+        full = self.enter(self.first(inputs)).relu()
         half = self.at_half(functional.max_pool2d(full, 2)).relu()
         quarter = self.narrow(functional.max_pool2d(half, 2)).relu()
         for block in self.at_quarter:
             quarter = block(quarter).relu()
         wide = functional.pixel_shuffle(self.widen_quarter(quarter), 2)
-        merged = self.merge_half(torch.cat((wide, half), dim=1)).relu()
+        merged = _merged(self.merge_half, wide, half).relu()
         merged = self.half_again(merged).relu()
         wide = functional.pixel_shuffle(self.widen_half(merged), 2)
-        merged = self.merge_full(torch.cat((wide, full), dim=1)).relu()
-        return (self.last(self.leave(merged).relu())[..., :height, :width],)
+        merged = _merged(self.merge_full, wide, full).relu()
+        return (self.last(self.leave(merged).relu()),)
 
     def products(self, *inputs: Tensor) -> int:
         """Multiplications by weights: every kernel counts once per pixel at its resolution."""
         batch, _, height, width = inputs[0].shape
-        pixels = batch * (-(-height // 4) * 4) * (-(-width // 4) * 4)
+        pixels = batch * height * width
         half = dict.fromkeys(("at_half", "merge_half", "half_again", "widen_half"), 4)
         fewer = {**half, "narrow": 16, "at_quarter": 16, "widen_quarter": 16}
         weights = ((name.split(".")[0], x) for name, x in self.named_parameters() if x.dim() > 1)
@@ -158,6 +161,15 @@ class _Residual(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.second(self.first(x).relu())
+
+
+def _merged(layer: nn.Conv2d, one: Tensor, other: Tensor) -> Tensor:
+    """`layer` of the channels of `one` and `other`, which are not copied side by side."""
+    of_other = layer.out_channels  # `other` has the channels of the result
+    of_one = layer.in_channels - of_other
+    weights = layer.weight.split((of_one, of_other), dim=1)
+    merged = functional.conv2d(one, weights[0], padding=1)
+    return merged + functional.conv2d(other, weights[1], layer.bias, padding=1)
 
 
 def _stacked(pictures: Sequence[Tensor]) -> Tensor:

@@ -92,7 +92,7 @@ def test_pictures_may_differ_in_size_from_the_samples_and_from_one_another(
     network, ((picture,), *_) = unet()
     for _ in range(2):  # built, and found again
         built = build(OpenVino(precision), network, [(picture,), (picture[..., :32, :40],)])
-        for height, width in ((36, 44), (30, 41), (36, 24)):
+        for height, width in ((36, 44), (28, 40), (36, 24)):
             cropped = picture[..., :height, :width]
             with torch.no_grad():
                 assert_close(built.run(cropped), network(cropped), TOLERANCE[precision])
