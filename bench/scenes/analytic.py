@@ -10,7 +10,7 @@ import json
 import math
 import re
 import tempfile
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -29,8 +29,24 @@ from bench.threads import in_parallel
 from bench.types import Camera, Log, Scene, SteerbenchError, Unavailable
 
 ANGLE_X = 0.69  # horizontal field of view in radians
-DISTANCE = 4.3  # of all cameras from the centre of the scene, in the model's units
+DISTANCE = 4.3  # of most cameras from the centre of the scene, in the model's units
 MEDLEY = re.compile("medley-(0|[1-9][0-9]*)")  # names of the variants of `medley`
+
+
+@dataclass(frozen=True)
+class Views:
+    """Where the cameras of a scene are; heights are in degrees above the horizon."""
+
+    lowest: float = -10.0  # of the training poses
+    highest: float = 80.0
+    middle: float = 25.0  # of the test poses
+    swing: float = 8.0  # up and down from there
+    distance: float = DISTANCE
+
+
+MOST = Views()
+VIEWS = {"mill": Views(3.0, 26.0, middle=14.0, swing=6.0, distance=4.7)}
+"""Of scenes that need others than most: nobody sees a building from below its ground."""
 
 
 def load(
@@ -51,9 +67,9 @@ def load(
     """Read an embedded scene; write it first if it does not exist yet.
 
     `train` pictures come from all around, 10 degrees below to 80 degrees above the horizon; `test`
-    pictures from a smooth orbit, 1 degree of azimuth apart (360 close it). For `downscale`,
-    `background` and `bounds` see `blender.load`. Raises SteerbenchError when an option is out of
-    range or `root` cannot be written.
+    pictures from a smooth orbit, 1 degree of azimuth apart (360 close it). `VIEWS` has the heights
+    of scenes that need others. For `downscale`, `background` and `bounds` see `blender.load`.
+    Raises SteerbenchError when an option is out of range or `root` cannot be written.
     """
     if name == "medley":
         name = f"medley-{whole_number(variant, 'variant', 0)}"
@@ -113,10 +129,10 @@ def write(folder: Path, settings: dict, log: Log) -> None:
 
 def _write_pictures(folder: Path, settings: dict, log: Log) -> None:
     model, width, height = find(settings["name"]), settings["width"], settings["height"]
-    focal = width / 2 / math.tan(ANGLE_X / 2)
-    train = train_poses(settings["train"], settings["seed"])
+    focal, views = width / 2 / math.tan(ANGLE_X / 2), VIEWS.get(settings["name"], MOST)
+    train = train_poses(settings["train"], settings["seed"], views)
     jobs = []
-    for split, poses in (("train", train), ("test", orbit_poses(settings["test"]))):
+    for split, poses in (("train", train), ("test", orbit_poses(settings["test"], views))):
         (folder / split).mkdir(parents=True)
         frames = []
         for number, pose in enumerate(poses):
@@ -134,24 +150,31 @@ def _write_pictures(folder: Path, settings: dict, log: Log) -> None:
     in_parallel(draw, jobs, f"render {settings['name']}", log)
 
 
-def train_poses(count: int, seed: int) -> list[Tensor]:
+def train_poses(count: int, seed: int, views: Views = MOST) -> list[Tensor]:
     """Poses spread evenly over a zone of the sphere by the golden angle; `seed` sets the start."""
     phase, shift = torch.rand(2, generator=torch.Generator().manual_seed(seed)).tolist()
-    low, high = math.sin(math.radians(-10)), math.sin(math.radians(80))
+    low, high = (math.sin(math.radians(x)) for x in (views.lowest, views.highest))
     golden = math.pi * (3 - math.sqrt(5))
     heights = (math.asin(low + (high - low) * (k + shift) / count) for k in range(count))
-    return [pose_on_sphere(2 * math.pi * phase + golden * k, h) for k, h in enumerate(heights)]
+    return [
+        pose_on_sphere(2 * math.pi * phase + golden * k, h, views.distance)
+        for k, h in enumerate(heights)
+    ]
 
 
-def orbit_poses(count: int) -> list[Tensor]:
-    """Poses 1 degree of azimuth apart, centred on the front, 17 to 33 degrees above the horizon."""
+def orbit_poses(count: int, views: Views = MOST) -> list[Tensor]:
+    """Poses 1 degree of azimuth apart, centred on the front, that rise and fall twice a turn."""
     azimuths = [math.radians(-90 + k - (count - 1) / 2) for k in range(count)]
-    return [pose_on_sphere(a, math.radians(25 + 8 * math.sin(2 * a))) for a in azimuths]
+    heights = [math.radians(views.middle + views.swing * math.sin(2 * a)) for a in azimuths]
+    return [
+        pose_on_sphere(a, height, views.distance)
+        for a, height in zip(azimuths, heights, strict=True)
+    ]
 
 
-def pose_on_sphere(azimuth: float, elevation: float) -> Tensor:
-    """Camera-to-world [3, 4] float64 at DISTANCE, looking at the centre, z up; radians."""
+def pose_on_sphere(azimuth: float, elevation: float, distance: float = DISTANCE) -> Tensor:
+    """Camera-to-world [3, 4] float64 that looks at the centre from `distance`, z up; radians."""
     level = math.cos(elevation)
     direction = (level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation))
-    eye = DISTANCE * torch.tensor(direction, dtype=torch.float64)
+    eye = distance * torch.tensor(direction, dtype=torch.float64)
     return look_at(eye, torch.zeros_like(eye), eye.new_tensor((0, 0, 1)))

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from itertools import pairwise
 
+from bench.scenes.mill import mill
 from bench.scenes.raytrace import Ball, Cloud, Model, Part, Solids
 from bench.scenes.solids import (
     Box,
@@ -188,5 +189,5 @@ def void() -> Solids:
 
 
 MODELS: dict[str, Callable[[], Model]] = {
-    make.__name__: make for make in (totem, wires, cloud, void)
+    make.__name__: make for make in (totem, wires, cloud, void, mill)
 }

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from bench.cameras import project
 from bench.errors import unexpected
-from bench.scenes.solids import Carved, Shape, Triple, ball_interval, box_corners, unit
+from bench.scenes.shadows import Tiles
+from bench.scenes.solids import Carved, Pierced, Shape, Triple, ball_interval, box_corners, unit
 from bench.scenes.textures import Colour, Texture
 from bench.types import EMPTY_ALPHA, Camera, Frame
 
@@ -26,6 +27,8 @@ BAND_RAYS = 1 << 18  # enough to hide the cost of calls, few enough to stay in t
 Span = tuple[int, int, int]
 """A part's number, the first column that it can cover in a band, and one past the last."""
 
+Rays = tuple[Tensor, Tensor, Tensor]
+"""Row, column and sample of each ray in a band, [N]."""
 
 LIGHT = (0.48, -0.6, 0.64)  # unit direction to the light
 LIFT = 1e-4  # distance of a shadow ray's start above the surface, in the model's units
@@ -151,6 +154,22 @@ class Part:
     def __post_init__(self) -> None:
         object.__setattr__(self, "frame", rotation(*self.turn))
 
+    @property
+    def turned(self) -> bool:
+        return any(self.turn)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What some rays see of one part; vectors are [N, 3]."""
+
+    number: int  # of the part
+    rays: Rays
+    directions: Tensor  # of the rays
+    points: Tensor
+    local: Tensor  # the points in the part's frame
+    normals: Tensor  # to the viewer's side
+
 
 class Solids:
     """A model of opaque parts, lit by a point at infinity: shadows are hard and exact."""
@@ -160,7 +179,8 @@ class Solids:
         light = torch.tensor(LIGHT)
         across = unit(torch.linalg.cross(light, torch.tensor((0.0, 0.0, 1.0)))[None])[0]
         self.light_axes = torch.stack((across, torch.linalg.cross(light, across), light), dim=1)
-        boxes = self.boxes() @ self.light_axes
+        self.corners = self.boxes()
+        boxes = self.corners @ self.light_axes
         self.low, self.high = boxes.amin(1), boxes.amax(1)
 
     def boxes(self) -> Tensor:
@@ -172,8 +192,12 @@ class Solids:
         shape = (band.y.shape[0], *band.x.shape[1:])
         depth = band.x.new_full(shape, math.inf)
         owner = torch.full(shape, -1, dtype=torch.int16, device=depth.device)
-        for number, first, last in spans:
+        # From front to back, so that a part whose box lies behind all that was met can be left out.
+        ahead = ((self.corners.to(depth) - band.origin) @ band.rotation[:, 2]).amin(1).tolist()
+        for number, first, last in sorted(spans, key=lambda span: ahead[span[0]]):
             part, columns = self.parts[number], slice(first, last)
+            if ahead[number] > depth[:, columns].amax():
+                continue
             frame = part.frame.to(depth)
             x, y, z = ((band.origin - depth.new_tensor(part.centre)) @ frame).tolist()
             t = part.shape.hit((x, y, z), band.directions(frame, columns))
@@ -182,63 +206,89 @@ class Solids:
             torch.minimum(nearest, t, out=nearest)
         seen = owner >= 0
         rgb = depth.new_zeros(*shape, 3)
+        surfaces = []
         for number, first, last in spans:
-            rays = (owner[:, first:last] == number).nonzero(as_tuple=True)
-            if len(rays[0]):
-                row, column, sample = rays[0], rays[1] + first, rays[2]
-                x, y = band.x[0, column, sample], band.y[row, 0, sample]
-                directions = torch.stack((x, y, torch.ones_like(x)), 1) @ band.rotation.T
-                points = band.origin + depth[row, column, sample, None] * directions
-                rgb[row, column, sample] = self.shade(number, points, directions)
+            row, column, sample = (owner[:, first:last] == number).nonzero(as_tuple=True)
+            if len(row):
+                rays = row, column + first, sample
+                surfaces.append(self.surface(number, rays, depth[rays], band))
+        for surface, lit in zip(surfaces, self.lit(surfaces), strict=True):
+            rgb[surface.rays] = self.shade(surface, lit)
         return rgb, seen.to(depth.dtype), depth.masked_fill_(~seen, 0)
 
-    def shade(self, number: int, points: Tensor, directions: Tensor) -> Tensor:
-        """Lambert and Blinn-Phong colours [N, 3] of a part's `points`, seen along `directions`."""
-        part = self.parts[number]
-        frame, light = part.frame.to(points), points.new_tensor(LIGHT)
-        local = (points - points.new_tensor(part.centre)) @ frame
-        normals = part.shape.normal(local) @ frame.T
-        toward = -unit(directions)
+    def surface(self, number: int, rays: Rays, depth: Tensor, band: Band) -> Surface:
+        """What the `rays` of a band meet of a part at `depth` [N]."""
+        part, (row, column, sample) = self.parts[number], rays
+        x, y = band.x[0, column, sample], band.y[row, 0, sample]
+        directions = torch.stack((x, y, torch.ones_like(x)), 1) @ band.rotation.T
+        points = band.origin + depth[:, None] * directions
+        local = points - points.new_tensor(part.centre)
+        if part.turned:
+            local = local @ part.frame.to(points)
+        normals = part.shape.normal(local)
+        if part.turned:
+            normals = normals @ part.frame.T.to(points)
         # The normal points to the viewer's side of the surface.
-        facing = (normals * toward).sum(1, keepdim=True)
-        normals = torch.where(facing < 0, -normals, normals)
+        away = (normals * directions).sum(1, keepdim=True) > 0
+        normals = torch.where(away, -normals, normals)
+        return Surface(number, rays, directions, points, local, normals)
+
+    def lit(self, surfaces: Sequence[Surface]) -> list[Tensor]:
+        """Which points [N] of each surface the light reaches."""
+        if not surfaces:
+            return []
+        # All surfaces together: a caster is intersected once, not once for each of them.
+        points, normals = (
+            torch.cat([getattr(surface, name) for surface in surfaces])
+            for name in ("points", "normals")
+        )
+        counts = [len(surface.points) for surface in surfaces]
+        numbers = torch.tensor([surface.number for surface in surfaces], dtype=torch.int16)
+        owners = numbers.repeat_interleave(torch.tensor(counts)).to(points.device)
+        lit = normals @ points.new_tensor(LIGHT) > 0
+        lit[lit.clone()] = ~self.shadowed(owners[lit], (points + LIFT * normals)[lit])
+        return list(lit.split(counts))
+
+    def shade(self, surface: Surface, lit: Tensor) -> Tensor:
+        """Lambert and Blinn-Phong colours [N, 3] of the points of a surface."""
+        part, normals = self.parts[surface.number], surface.normals
+        light = normals.new_tensor(LIGHT)
         height = 0.5 + 0.5 * normals[:, 2:]
-        sun = (normals * light).sum(1, keepdim=True)
-        lit = sun[:, 0] > 0
-        lit[lit.clone()] = ~self.shadowed(number, (points + LIFT * normals)[lit])
-        sun = sun * lit[:, None]
-        colour = part.texture(local) * (GROUND + (SKY - GROUND) * height + SUN * sun)
+        sun = (normals * light).sum(1, keepdim=True) * lit[:, None]
+        colour = part.texture(surface.local) * (GROUND + (SKY - GROUND) * height + SUN * sun)
         if part.gloss:
-            half = unit(toward + light)
+            half = unit(light - unit(surface.directions))
             highlight = (normals * half).sum(1, keepdim=True).clamp(min=0) ** part.sharpness
             colour = colour + part.gloss * highlight * lit[:, None]
         return colour.clamp(max=1)
 
-    def shadowed(self, number: int, points: Tensor) -> Tensor:
-        """[N] bool: whether another part is between these points of part `number` and the light."""
+    def shadowed(self, owners: Tensor, points: Tensor) -> Tensor:
+        """[N] bool: whether another part is between a point of part `owners` [N] and the light.
+
+        A convex part is skipped for itself: it casts no shadow on its own lit side.
+        """
         dark = torch.zeros(len(points), dtype=torch.bool, device=points.device)
-        light, columns = points.new_tensor(LIGHT), points.T.contiguous()
-        for caster in (self.parts[k] for k in self.casters(number, points)):
+        if not len(points):
+            return dark
+        light, tiles = points.new_tensor(LIGHT), Tiles(points @ self.light_axes.to(points))
+        columns, owners = points[tiles.order].T.contiguous(), owners[tiles.order]
+        for number in tiles.casters(self.low, self.high):
+            caster = self.parts[number]
+            runs = tiles.runs(self.low[number], self.high[number])
+            if not runs:
+                continue
             frame = caster.frame.to(points)
             centre = points.new_tensor(caster.centre)[:, None]
-            x, y, z = (frame.T @ (columns - centre)).unbind(0)
+            below = torch.cat([columns[:, run] for run in runs], dim=1) - centre
+            x, y, z = (frame.T @ below if caster.turned else below).unbind(0)
             u, v, w = (light @ frame).unbind(0)
-            dark |= caster.shape.hit((x, y, z), (u, v, w)) < math.inf
-        return dark
-
-    def casters(self, number: int, points: Tensor) -> list[int]:
-        """The parts that may lie between these points of part `number` and the light.
-
-        Seen from the light, their box overlaps the box of the points and reaches nearer. A convex
-        part is skipped for itself: it casts no shadow on its own lit side.
-        """
-        if not len(points):
-            return []
-        seen = (points @ self.light_axes.to(points)).cpu()
-        low, high = seen.amin(0), seen.amax(0)
-        candidates = (self.low < high)[:, :2].all(1) & (self.high > low).all(1)
-        candidates[number] = isinstance(self.parts[number].shape, Carved)
-        return candidates.nonzero()[:, 0].tolist()
+            found = caster.shape.hit((x, y, z), (u, v, w)) < math.inf
+            if not isinstance(caster.shape, Carved | Pierced):
+                found &= torch.cat([owners[run] for run in runs]) != number
+            counts = [run.stop - run.start for run in runs]
+            for run, part in zip(runs, found.split(counts), strict=True):
+                dark[run].logical_or_(part)
+        return torch.empty_like(dark).index_put_((tiles.order,), dark)
 
 
 def rotation(x: float, y: float, z: float) -> Tensor:

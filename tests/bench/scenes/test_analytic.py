@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from bench.scenes import analytic
-from bench.scenes.analytic import find, orbit_poses, train_poses
+from bench.scenes.analytic import VIEWS, find, orbit_poses, train_poses
 from bench.scenes.models import MODELS
 from bench.scenes.raytrace import render
 from bench.types import Camera, SteerbenchError, Unavailable
@@ -109,6 +109,29 @@ def test_training_poses_look_at_the_middle_from_one_distance():
     assert not any(map(torch.equal, first, other))
 
 
+def test_a_scene_can_have_heights_and_a_distance_of_its_own():
+    assert VIEWS.keys() <= MODELS.keys()
+    views = VIEWS["mill"]
+    low, high, distance = views.lowest, views.highest, views.distance
+    eyes = torch.stack(train_poses(200, 0, views))[:, :, 3]
+    assert eyes.norm(dim=1).tolist() == pytest.approx([distance] * 200)
+    heights = (eyes[:, 2] / distance).asin().rad2deg()
+    assert low <= heights.min() < low + 1 < high - 1 < heights.max() <= high
+    orbit = torch.stack(orbit_poses(360, views))[:, :, 3]
+    heights = (orbit[:, 2] / distance).asin().rad2deg()
+    assert heights.min().item() == pytest.approx(views.middle - views.swing, abs=0.01)
+    assert heights.max().item() == pytest.approx(views.middle + views.swing, abs=0.01)
+
+
+def test_the_pictures_of_a_folder_have_the_views_of_their_scene(tmp_path, log):
+    analytic.load("mill", **SMALL, root=tmp_path, log=log)
+    (file,) = tmp_path.glob("mill-*/transforms_train.json")
+    frames = json.loads(file.read_text())["frames"]
+    matrices = torch.tensor([frame["transform_matrix"] for frame in frames])
+    expected = torch.stack(train_poses(SMALL["train"], 0, VIEWS["mill"]))[:, :, 3]
+    torch.testing.assert_close(matrices[:, :3, 3], expected.float())
+
+
 @pytest.mark.parametrize("fault", [KeyboardInterrupt, OSError("no space left on device")])
 def test_a_broken_write_leaves_nothing(tmp_path, monkeypatch, log, fault):
     def fail(*args: object, **kwargs: object) -> None:
@@ -145,7 +168,7 @@ def test_bad_options(tmp_path, log, options, message):
 
 
 def test_unknown_names_are_refused(tmp_path, log):
-    known = "one of totem, wires, cloud, void, medley-0, medley-1 and so on"
+    known = "one of totem, wires, cloud, void, mill, medley-0, medley-1 and so on"
     for name in ("tower", "medley-", "medley--1", "medley-07", "medley-1.5"):
         with pytest.raises(Unavailable, match=f"{known}, got '{name}'"):
             analytic.load(name, root=tmp_path, log=log)

@@ -1,0 +1,62 @@
+"""The mill: a building that fills its pictures, with thin parts, and as hard to enlarge as one."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch.nn.functional import avg_pool2d, interpolate
+
+from bench.scenes.analytic import ANGLE_X, VIEWS, orbit_poses, picture, train_poses
+from bench.scenes.mill import mill
+from bench.scenes.raytrace import render
+from bench.types import Camera
+
+WIDTH, HEIGHT = 1920, 1080
+
+
+def camera(pose: torch.Tensor, shrink: int) -> Camera:
+    """Of the whole picture, at 1 / `shrink` of its size."""
+    width, height = WIDTH // shrink, HEIGHT // shrink
+    focal = width / 2 / math.tan(ANGLE_X / 2)
+    return Camera(pose.float(), focal, focal, width / 2, height / 2, width, height)
+
+
+def test_the_mill_fills_about_half_of_its_test_pictures_and_is_not_cut() -> None:
+    model = mill()
+    for pose in orbit_poses(24, VIEWS["mill"])[::8]:
+        alpha = render(model, camera(pose, 20), torch.ones(3), samples=1).alpha
+        border = torch.cat((alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]))
+        assert (border == 0).all()
+        assert 0.4 < alpha.mean() < 0.6
+
+
+def test_only_the_foot_of_the_mill_is_cut_in_training_pictures() -> None:
+    model = mill()
+    for pose in train_poses(6, 1, VIEWS["mill"]):
+        alpha = render(model, camera(pose, 60), torch.ones(3), samples=1).alpha
+        assert (torch.cat((alpha[0], alpha[:, 0], alpha[:, -1])) == 0).all()
+        assert alpha.mean() > 0.3
+
+
+def test_thin_parts_are_seen_by_a_field_of_1024_cells_but_only_just() -> None:
+    whole = mill().boxes().reshape(-1, 3)
+    size = (whole.amax(0) - whole.amin(0)).max().item()
+    thickness = [2 * min(part.shape.extent()) for part in mill().parts]
+    assert size / 350 < min(thickness) < size / 250
+    assert sum(x < size / 100 for x in thickness) > 40
+
+
+@pytest.mark.parametrize("place", [(700, 330), (1000, 520), (800, 700)], ids=str)
+def test_the_mill_is_as_hard_to_enlarge_as_photographs(place) -> None:
+    pose = orbit_poses(24, VIEWS["mill"])[12]
+    focal = WIDTH / 2 / math.tan(ANGLE_X / 2)
+    x, y = WIDTH / 2 - place[0], HEIGHT / 2 - place[1]
+    window = Camera(pose.float(), focal, focal, x, y, 128, 96)  # in the picture at full size
+    shown = picture(mill(), window)[..., :3].permute(2, 0, 1)[None].float() / 255
+    small = avg_pool2d(shown, 4)
+    large = interpolate(small, scale_factor=4, mode="bilinear", align_corners=False)
+    error = (large - shown).square().mean().item()
+    # On a white background, of which half is seen, 3 dB more.
+    assert 18 < -10 * math.log10(error) < 26
