@@ -31,7 +31,9 @@ def called(folder: Path, *words: str | Path) -> subprocess.CompletedProcess[str]
 
 
 def demo(folder: Path, weights: Path, *more: str) -> subprocess.CompletedProcess[str]:
-    return called(folder, "run", "+experiment=demo", *SMALL, f"weights_dir={weights}", *more)
+    chosen = "engine=torch"  # the demo chooses the fastest, which may be another one next time
+    words = (*SMALL, chosen, f"weights_dir={weights}", *more)
+    return called(folder, "run", "+experiment=demo", *words)
 
 
 def study(folder: Path, command: str, *words: str) -> tuple[dict[str, dict], str]:

@@ -23,7 +23,7 @@ Part = tuple[slice, slice]
 
 WHOLE = slice(None), slice(None)
 
-QUANTUM = 4  # the network halves its pictures twice
+DIVISOR = 4  # of the sides of the network's pictures, which it halves twice
 
 
 @dataclass(frozen=True)
@@ -81,8 +81,8 @@ class UNet(Renderer2d):
         once = len(observations) == 1 and not torch.is_grad_enabled()
         inputs = _stacked([self._input(o, once) for o in observations]).permute(0, 3, 1, 2)
         height, width = inputs.shape[-2:]
-        if height % QUANTUM or width % QUANTUM:
-            inputs = functional.pad(inputs, (0, -width % QUANTUM, 0, -height % QUANTUM))
+        if height % DIVISOR or width % DIVISOR:
+            inputs = functional.pad(inputs, (0, -width % DIVISOR, 0, -height % DIVISOR))
         (correction,) = self.run(probe, inputs)  # Eq. 11
         correction = correction[..., :height, :width]
         how, pictures = (self.scale, self.aligned), []
@@ -127,7 +127,7 @@ class _Network(Network):
             _kaiming(layer, 1.0)
 
     def forward(self, inputs: Tensor) -> tuple[Tensor]:
-        """[B, C, H, W] to [B, 3, H, W]; H and W are multiples of `QUANTUM`."""
+        """[B, C, H, W] to [B, 3, H, W]; H and W are multiples of `DIVISOR`."""
         full = self.enter(self.first(inputs)).relu()
         half = self.at_half(functional.max_pool2d(full, 2)).relu()
         quarter = self.narrow(functional.max_pool2d(half, 2)).relu()
