@@ -10,9 +10,9 @@ import time
 import traceback
 import warnings
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import dropwhile
 from pathlib import Path
 from typing import NamedTuple
@@ -23,6 +23,7 @@ from torch import Tensor
 
 from bench.allocator import give_back
 from bench.errors import Unavailable
+from bench.types import DEVICE
 
 OTHER = "other"  # the stage that gets the time of a frame outside any stage
 TORCH = str(Path(torch.__file__).parent)
@@ -36,6 +37,8 @@ class FrameRecord:
     stages_ns: dict[str, int]  # of each stage and `other`; "outer/inner" is no part of "outer"
     done: dict[str, int]  # units of work by counter
     dense: dict[str, int]  # the work of a method that skips nothing, of counters that report it
+    wall_ns: int | None = None  # by the clock here, if the stages were timed by another process
+    peak_bytes: int | None = None  # of the memory of that process, if it told
 
     @property
     def total_ns(self) -> int:
@@ -62,7 +65,7 @@ class StageClock:
         self, device: str, clock: Callable[[], int] = time.perf_counter_ns, *, stages: bool = True
     ) -> None:
         self.frames: list[FrameRecord] = []
-        self._device = torch.device(device)
+        self._device = _seen_here(device)
         self._clock, self._stages = clock, stages
         self._open: list[str] | None = None  # names of the open stages; None outside a frame
         self._last = 0
@@ -80,7 +83,12 @@ class StageClock:
             yield
             self._charge()
             done = {name: int(units) for name, units in self._done.items()}
-            self.frames.append(FrameRecord(dict(self._ns), done, dict(self._dense)))
+            record = FrameRecord(dict(self._ns), done, dict(self._dense))
+            if self._told is not None:
+                stages_ns, peak = self._told
+                told = {"stages_ns": stages_ns, "wall_ns": record.total_ns, "peak_bytes": peak}
+                record = replace(record, **told)
+            self.frames.append(record)
         finally:
             self._open = None
 
@@ -107,10 +115,16 @@ class StageClock:
         if dense is not None:
             self._dense[name] += dense
 
+    def report(self, ns: int, stages_ns: Mapping[str, int], peak_bytes: int | None = None) -> None:
+        """Take the times of another process's clock; see `bench.types.Probe`."""
+        stages = dict(stages_ns) if self._stages else {}
+        self._told = {**stages, OTHER: ns - sum(stages.values())}, peak_bytes
+
     def _begin(self) -> None:
         self._ns: defaultdict[str, int] = defaultdict(int, {OTHER: 0})
         self._done: defaultdict[str, int | Tensor] = defaultdict(int)
         self._dense: defaultdict[str, int] = defaultdict(int)
+        self._told: tuple[dict[str, int], int | None] | None = None  # by another process
 
     def _now(self) -> int:
         if self._device.type == "cuda":
@@ -121,6 +135,12 @@ class StageClock:
         now = self._now()
         self._ns["/".join(self._open or ()) or OTHER] += now - self._last
         self._last = now
+
+
+def _seen_here(device: str) -> torch.device:
+    """`device`, or the CPU for one of another process that torch does not see here."""
+    there = DEVICE.fullmatch(device) and (torch.cuda.is_available() or "cuda" not in device)
+    return torch.device(device if there else "cpu")
 
 
 def times_ms(
@@ -144,7 +164,7 @@ class MemoryMeter:
 
     def __init__(self, device: str) -> None:
         self.peak_bytes = 0  # the highest so far
-        self._device = torch.device(device)
+        self._device = _seen_here(device)
         self.of_process = self._device.type != "cuda"  # with all that other code keeps
         give_back()  # what was freed earlier, say in a training
         if not self.of_process:
