@@ -92,8 +92,8 @@ class Channel:
     def _read(self, size, where="in the middle of a message"):
         buffer = np.empty(size, np.uint8)
         left = memoryview(buffer)
+        self._arm()
         while left:
-            self._arm()
             got = self._connection.recv_into(left)
             if not got:
                 raise EOFError("closed the connection " + where)
@@ -151,7 +151,7 @@ class Job:
 
 
 class _Clock:
-    """Charges every nanosecond of a frame to its innermost open stage, as steerbench's clock does."""
+    """Charges every nanosecond of a frame to its innermost open stage, as steerbench does."""
 
     def __init__(self):
         self.stages, self.counters, self.open = {}, {}, []
@@ -260,15 +260,14 @@ def _about(renderer):
 
 def _files():
     """The files of all loaded modules that belong neither to Python nor to an installed package."""
-    library = tuple(sysconfig.get_paths()[name] + os.sep for name in ("stdlib", "platstdlib"))
+    library = Path(sysconfig.get_paths()["stdlib"])
     files = (getattr(module, "__file__", None) for module in list(sys.modules.values()))
-    paths = {os.path.abspath(file) for file in files if file}
+    paths = {Path(file).absolute() for file in files if file}
+    installed = {"site-packages", "dist-packages"}
     return sorted(
-        path
+        str(path)
         for path in paths
-        if not path.startswith(library)
-        and not {"site-packages", "dist-packages"} & set(Path(path).parts)
-        and os.path.isfile(path)
+        if path.is_file() and library not in path.parents and not installed & set(path.parts)
     )
 
 

@@ -138,9 +138,8 @@ class StageClock:
 
 
 def _seen_here(device: str) -> torch.device:
-    """`device`, or the CPU for one of another process that torch does not see here."""
-    there = DEVICE.fullmatch(device) and (torch.cuda.is_available() or "cuda" not in device)
-    return torch.device(device if there else "cpu")
+    """The device of that name; the CPU for what is not one of torch, but of another process."""
+    return torch.device(device if DEVICE.fullmatch(device) else "cpu")
 
 
 def times_ms(

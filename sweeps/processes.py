@@ -88,7 +88,7 @@ def lock_file(device: str) -> Path:
     """
     import torch
 
-    gpu = on_gpu(device) and torch.cuda.is_available()  # that of another process may not be seen
+    gpu = on_gpu(device)
     if device == "auto":
         device = "cuda" if gpu else "cpu"
     which = torch.cuda.get_device_properties(device).uuid if gpu else device

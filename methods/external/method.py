@@ -11,7 +11,7 @@ import sys
 import tempfile
 import time
 import weakref
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from bench.errors import SteerbenchError, explained, unexpected
 from bench.provenance import computed_by, sha256
@@ -118,9 +117,11 @@ class External:
 
     def settings(self) -> dict[str, str]:
         """What rows show, and a hash of its environment for the key of a run."""
-        about = {name: self._about[name] for name in ("device", "precision")}
-        environment = content_key(self._environment)[:16]
-        return {**about, "backend": "external", "engine": "none", "environment": environment}
+        device, precision = self._about["device"], self._about["precision"]
+        if device != "cpu" and not (device.startswith("cuda") and torch.cuda.is_available()):
+            device = f"worker's {device}"  # nothing here can wait for it
+        shown = {"device": device, "backend": "external", "engine": "none", "precision": precision}
+        return {**shown, "environment": content_key(self._environment)[:16]}
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """Let it train and store the result, load what it stored before, or get ready."""
@@ -165,7 +166,9 @@ class External:
 
     def _train(self, folder: Path, job: Mapping[str, object], log: Log) -> float:
         """Let it train on the scene as files, and put what it stores into `folder`; the seconds."""
-        cameras = [data_camera(self._scene, camera) for camera in self._scene.splits["train"].cameras]
+        cameras = [
+            data_camera(self._scene, camera) for camera in self._scene.splits["train"].cameras
+        ]
         pictures = [
             {"file": picture_file("train", number), **_described(camera)}
             for number, camera in enumerate(cameras)
@@ -226,8 +229,13 @@ class External:
         if not math.isfinite(rgb.sum()):  # which reads the picture once, and writes no other
             broken = int((~rgb.isfinite()).any(dim=2).sum())
             self._expect(not broken, "finite numbers", f"{broken} pixels that are NaN or infinite")
-        depth = _plane(arrays, "depth", size, math.inf) / self._scene.unit_length
-        return Frame(rgb, depth, _plane(arrays, "alpha", size, 1.0))
+        depth = torch.tensor(math.inf).expand(size)
+        if "depth" in arrays:
+            depth = torch.from_numpy(arrays["depth"]).float() / self._scene.unit_length
+        alpha = torch.ones(()).expand(size)
+        if "alpha" in arrays:
+            alpha = torch.from_numpy(arrays["alpha"]).float()
+        return Frame(rgb, depth, alpha)
 
     def _expect(self, holds: bool, expected: str, got: object) -> None:
         self._worker.expect(holds, "render", expected, got)
@@ -245,13 +253,6 @@ def _described(camera: Camera) -> dict[str, object]:
     return {**{name: getattr(camera, name) for name in names}, "c2w": camera.c2w.tolist()}
 
 
-def _plane(
-    arrays: Mapping[str, np.ndarray], name: str, size: tuple[int, int], usual: float
-) -> Tensor:
-    """An array [H, W], or one filled with the `usual` value where the worker sent none."""
-    return torch.from_numpy(arrays[name]).float() if name in arrays else torch.full(size, usual)
-
-
 def _counts(told: object) -> bool:
     """Whether a worker has told whole numbers from 0 on, by name."""
     return isinstance(told, dict) and all(type(x) is int and x >= 0 for x in told.values())
@@ -262,11 +263,16 @@ def _files_at(path: Path) -> list[Path]:
     if not path.exists():
         raise unexpected("method.files", "files and folders", f"{path}, which is not there")
     left_out = (".", "__pycache__")
-    return [path] if path.is_file() else [
-        file
-        for file in path.rglob("*")
-        if file.is_file() and not any(x.startswith(left_out) for x in file.relative_to(path).parts)
-    ]
+    return (
+        [path]
+        if path.is_file()
+        else [
+            file
+            for file in path.rglob("*")
+            if file.is_file()
+            and not any(x.startswith(left_out) for x in file.relative_to(path).parts)
+        ]
+    )
 
 
 def _close(worker: Worker) -> None:

@@ -73,7 +73,9 @@ class Worker:
 
         Before an answer, and before each message to `progress`, it may be silent for `limit_s`.
         """
-        return self._heard(message, limit_s, progress, lambda: self._channel.send(message, **fields))
+        return self._heard(
+            message, limit_s, progress, lambda: self._channel.send(message, **fields)
+        )
 
     def _heard(
         self,
@@ -107,7 +109,7 @@ class Worker:
     def expect(self, holds: bool, message: str, expected: str, got: object) -> None:
         """Raise the SteerbenchError about an answer to `message` unless something `holds`."""
         if not holds:
-            raise self.fault(f"answered {message!r} with {str(got):.100}, expected {expected}")
+            raise self.fault(f"answered {message!r} with {got!s:.100}, expected {expected}")
 
     def fault(self, why: str) -> SteerbenchError:
         """Kill the process, and return the error that says `why`."""
