@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import dropwhile
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -37,7 +37,7 @@ class FrameRecord:
     stages_ns: dict[str, int]  # of each stage and `other`; "outer/inner" is no part of "outer"
     done: dict[str, int]  # units of work by counter
     dense: dict[str, int]  # the work of a method that skips nothing, of counters that report it
-    wall_ns: int | None = None  # by the clock here, if the stages were timed by another process
+    wall_ns: int | None = None  # by the clock here, until another process told the stages' times
     peak_bytes: int | None = None  # of the memory of that process, if it told
 
     @property
@@ -84,11 +84,7 @@ class StageClock:
             self._charge()
             done = {name: int(units) for name, units in self._done.items()}
             record = FrameRecord(dict(self._ns), done, dict(self._dense))
-            if self._told is not None:
-                stages_ns, peak = self._told
-                told = {"stages_ns": stages_ns, "wall_ns": record.total_ns, "peak_bytes": peak}
-                record = replace(record, **told)
-            self.frames.append(record)
+            self.frames.append(replace(record, **self._told))
         finally:
             self._open = None
 
@@ -117,14 +113,17 @@ class StageClock:
 
     def report(self, ns: int, stages_ns: Mapping[str, int], peak_bytes: int | None = None) -> None:
         """Take the times of another process's clock; see `bench.types.Probe`."""
+        self._charge()
         stages = dict(stages_ns) if self._stages else {}
-        self._told = {**stages, OTHER: ns - sum(stages.values())}, peak_bytes
+        stages[OTHER] = ns - sum(stages.values())
+        wall_ns = sum(self._ns.values())
+        self._told = {"stages_ns": stages, "wall_ns": wall_ns, "peak_bytes": peak_bytes}
 
     def _begin(self) -> None:
         self._ns: defaultdict[str, int] = defaultdict(int, {OTHER: 0})
         self._done: defaultdict[str, int | Tensor] = defaultdict(int)
         self._dense: defaultdict[str, int] = defaultdict(int)
-        self._told: tuple[dict[str, int], int | None] | None = None  # by another process
+        self._told: dict[str, Any] = {}  # what another process has told of this frame
 
     def _now(self) -> int:
         if self._device.type == "cuda":

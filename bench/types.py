@@ -183,7 +183,7 @@ class Probe(Protocol):
 
     def report(self, ns: int, stages_ns: Mapping[str, int], peak_bytes: int | None = None) -> None:
         """Take the time of this frame, in all and of its stages, from the clock of another process,
-        and the peak of that process's memory, if known."""
+        whose picture has just arrived, and the peak of that process's memory, if known."""
 
 
 class Method(Protocol):

@@ -213,11 +213,10 @@ class External:
         self._expect(_counts(stages) and sum(stages.values()) <= ns, f"stages within {ns}", stages)
         self._expect(_counts(counters), "counters of 0 or more", counters)
         self._expect(peak is None or _counts({"": peak}), "peak_bytes of 0 or more", peak)
-        frame = self._frame(arrays, (camera.height, camera.width))
+        probe.report(ns, stages, peak)
         for name, done in counters.items():
             probe.count(name, done)
-        probe.report(ns, stages, peak)
-        return frame
+        return self._frame(arrays, (camera.height, camera.width))
 
     def _frame(self, arrays: Mapping[str, np.ndarray], size: tuple[int, int]) -> Frame:
         for name, shape in (("rgb", (*size, 3)), ("depth", size), ("alpha", size)):
