@@ -76,11 +76,13 @@ def crop_camera(camera: Camera, left: int, top: int, width: int, height: int) ->
     return replace(camera, cx=camera.cx - left, cy=camera.cy - top, width=width, height=height)
 
 
-def move_camera(camera: Camera, scale: float, offset: Tensor) -> Camera:
+def move_camera(
+    camera: Camera, scale: float, offset: Tensor, dtype: torch.dtype = torch.float32
+) -> Camera:
     """The same view after x becomes scale * x + offset [3]; in float64, for cameras far away."""
     pose = camera.c2w.double()
     centre = scale * pose[:, 3:] + offset.to(pose)[:, None]
-    return replace(camera, c2w=torch.cat((pose[:, :3], centre), dim=1).float())
+    return replace(camera, c2w=torch.cat((pose[:, :3], centre), dim=1).to(dtype))
 
 
 def place_camera(camera: Camera, device: torch.device | str) -> Camera:

@@ -10,12 +10,12 @@ import time
 import traceback
 import warnings
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import dropwhile
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from torch import Tensor
 
 from bench.allocator import give_back
 from bench.errors import Unavailable
+from bench.types import DEVICE
 
 OTHER = "other"  # the stage that gets the time of a frame outside any stage
 TORCH = str(Path(torch.__file__).parent)
@@ -36,6 +37,8 @@ class FrameRecord:
     stages_ns: dict[str, int]  # of each stage and `other`; "outer/inner" is no part of "outer"
     done: dict[str, int]  # units of work by counter
     dense: dict[str, int]  # the work of a method that skips nothing, of counters that report it
+    wall_ns: int | None = None  # by the clock here, until another process told the stages' times
+    peak_bytes: int | None = None  # of the memory of that process, if it told
 
     @property
     def total_ns(self) -> int:
@@ -62,7 +65,7 @@ class StageClock:
         self, device: str, clock: Callable[[], int] = time.perf_counter_ns, *, stages: bool = True
     ) -> None:
         self.frames: list[FrameRecord] = []
-        self._device = torch.device(device)
+        self._device = _seen_here(device)
         self._clock, self._stages = clock, stages
         self._open: list[str] | None = None  # names of the open stages; None outside a frame
         self._last = 0
@@ -80,7 +83,8 @@ class StageClock:
             yield
             self._charge()
             done = {name: int(units) for name, units in self._done.items()}
-            self.frames.append(FrameRecord(dict(self._ns), done, dict(self._dense)))
+            record = FrameRecord(dict(self._ns), done, dict(self._dense))
+            self.frames.append(replace(record, **self._told))
         finally:
             self._open = None
 
@@ -107,10 +111,19 @@ class StageClock:
         if dense is not None:
             self._dense[name] += dense
 
+    def report(self, ns: int, stages_ns: Mapping[str, int], peak_bytes: int | None = None) -> None:
+        """Take the times of another process's clock; see `bench.types.Probe`."""
+        self._charge()
+        stages = dict(stages_ns) if self._stages else {}
+        stages[OTHER] = ns - sum(stages.values())
+        wall_ns = sum(self._ns.values())
+        self._told = {"stages_ns": stages, "wall_ns": wall_ns, "peak_bytes": peak_bytes}
+
     def _begin(self) -> None:
         self._ns: defaultdict[str, int] = defaultdict(int, {OTHER: 0})
         self._done: defaultdict[str, int | Tensor] = defaultdict(int)
         self._dense: defaultdict[str, int] = defaultdict(int)
+        self._told: dict[str, Any] = {}  # what another process has told of this frame
 
     def _now(self) -> int:
         if self._device.type == "cuda":
@@ -121,6 +134,11 @@ class StageClock:
         now = self._now()
         self._ns["/".join(self._open or ()) or OTHER] += now - self._last
         self._last = now
+
+
+def _seen_here(device: str) -> torch.device:
+    """The device of that name; the CPU for what is not one of torch, but of another process."""
+    return torch.device(device if DEVICE.fullmatch(device) else "cpu")
 
 
 def times_ms(
@@ -144,7 +162,7 @@ class MemoryMeter:
 
     def __init__(self, device: str) -> None:
         self.peak_bytes = 0  # the highest so far
-        self._device = torch.device(device)
+        self._device = _seen_here(device)
         self.of_process = self._device.type != "cuda"  # with all that other code keeps
         give_back()  # what was freed earlier, say in a training
         if not self.of_process:

@@ -28,8 +28,8 @@ from bench.types import Budget, Log, Method, Scene
 
 QUANTILES = (50, 95, 99)
 UNITS = {
-    **{"psnr": "dB", "frame_ms": "ms", "stage_ms": "ms", "fps": "1/s", "work": "1/frame"},
-    **{"size_bytes": "B", "peak_bytes": "B", "train_s": "s"},
+    **{"psnr": "dB", "frame_ms": "ms", "wall_ms": "ms", "stage_ms": "ms", "fps": "1/s"},
+    **{"work": "1/frame", "size_bytes": "B", "peak_bytes": "B", "train_s": "s"},
 }
 """Units of metrics, by name up to the first dot; other metrics have no unit."""
 
@@ -88,19 +88,38 @@ class _Take:
         counts = warm or not self.meter.peak_bytes if self.meter.of_process else not warm
         return self.meter if counts else nullcontext()
 
+    def peak(self) -> tuple[float, str]:
+        """Peak memory in bytes, NaN if it is not known, and what was read."""
+        frames = self.clock.frames
+        if all(frame.wall_ns is None for frame in frames):
+            source = self.meter.source + ", before its frames were scored" * self.meter.of_process
+            return self.meter.peak_bytes, source
+        told = [frame.peak_bytes for frame in frames if frame.peak_bytes is not None]
+        if not told:
+            return math.nan, "not told by the process that rendered"
+        return max(told), "as the process that rendered has told"
+
+    @property
+    def times(self) -> str:
+        """Whose times those of the frames are."""
+        if all(frame.wall_ns is None for frame in self.clock.frames):
+            return "read here, after the device has finished its work"
+        return "read by the process that rendered; wall_ms: read here, with the way there and back"
+
 
 def _measurement(
     take: _Take, task: Task, missing: Mapping[str, str], neighbours: Neighbours
 ) -> Measurement:
     scene, trajectory, protocol, budget = task.scene, task.trajectory, task.protocol, task.budget
-    method, meter, scoring = take.method, take.meter, take.scoring
+    method, scoring, sizes = take.method, take.scoring, take.method.sizes()
+    peak_bytes, source = take.peak()
     frames = _frame_table(take.rows, protocol)
     of_phases = ((phase, frames[frames["phase"] == phase]) for phase in (STEADY, COLD))
     summary = [
         *(row | {"phase": phase} for phase, of in of_phases if len(of) for row in phase_rows(of)),
-        *(_single(f"size_bytes.{part}", size) for part, size in method.sizes().items()),
-        _single("size_bytes.total", sum(method.sizes().values())),
-        _single("peak_bytes", meter.peak_bytes),
+        *(_single(f"size_bytes.{part}", size) for part, size in sizes.items()),
+        *([_single("size_bytes.total", sum(sizes.values()))] if sizes else []),
+        _single("peak_bytes", peak_bytes),
         _single("train_s", method.train_s),
     ]
     rows = pd.DataFrame(summary).assign(
@@ -121,7 +140,8 @@ def _measurement(
         "scene": {"name": scene.name, "digest": scene.digest, "unit_length": scene.unit_length},
         "missing": missing,
         "neighbours": neighbours._asdict(),
-        "peak_bytes": meter.source + ", before its frames were scored" * meter.of_process,
+        "peak_bytes": source,
+        "times": take.times,
         "error_map": f"absolute error, mean over the channels, black 0 to yellow {ERROR_RANGE}",
     }
     return Measurement(rows, frames, scoring.images, record)
@@ -168,6 +188,7 @@ def _draw(take: _Take, task: Task, index: int, before: int) -> None:
         "frame": index,
         "phase": phase,
         "frame_ms": record.total_ns / 1e6,
+        **({} if record.wall_ns is None else {"wall_ms": record.wall_ns / 1e6}),
         **{f"stage_ms.{name}": ns / 1e6 for name, ns in record.stages_ns.items()},
         **{f"work.{name}": done for name, done in record.done.items()},
         **{f"work.{name}.dense": dense for name, dense in record.dense.items()},
@@ -189,7 +210,8 @@ def _frame_table(table: list[dict[str, Any]], protocol: EvaluationProtocol) -> p
     touched = [name for name in map(str, frames) if name.startswith(("stage_ms.", "work."))]
     touched.sort(key=lambda name: (name.startswith("work."), name == "stage_ms.other"))
     scores = (*protocol.metric_names, "flicker")
-    columns = ["frame", "name", "phase", *scores, "frame_ms", *touched]
+    times = [name for name in ("frame_ms", "wall_ms") if name in frames]
+    columns = ["frame", "name", "phase", *scores, *times, *touched]
     return frames.reindex(columns=columns).fillna(dict.fromkeys(touched, 0))
 
 
@@ -212,6 +234,7 @@ def phase_rows(frames: pd.DataFrame) -> list[dict[str, Any]]:
         # No upper end if the interval of the time reaches 0.
         {"metric": "fps", "n": ms["n"], "value": 1000 / ms["value"], "lo": 1000 / ms["hi"]}
         | {"hi": 1000 / ms["lo"] if ms["lo"] > 0 else math.nan},
+        *(mean_row(name, frames[name]) for name in columns if name == "wall_ms"),
         *(mean_row(name, frames[name]) for name in parts),
     ]
 
@@ -227,5 +250,6 @@ def mean_row(metric: str, values: pd.Series) -> dict[str, Any]:
 
 def _single(metric: str, value: float) -> dict[str, Any]:
     """The row of a single figure; it belongs to the whole run unless its phase is replaced."""
-    row = {"metric": metric, "value": float(value), "n": 1, "lo": math.nan, "hi": math.nan}
+    known = int(not math.isnan(value))
+    row = {"metric": metric, "value": float(value), "n": known, "lo": math.nan, "hi": math.nan}
     return row | {"phase": WHOLE}

@@ -63,5 +63,7 @@ class Study:
 
 
 def study_of(method: Any) -> Study:
-    """The `study` attribute of a method's class, function or object; an empty one if missing."""
-    return getattr(method, "study", Study())
+    """The `study` attribute of a method's class, function or object; an empty one if missing, or if
+    only the object knows it."""
+    found = getattr(method, "study", None)
+    return found if isinstance(found, Study) else Study()

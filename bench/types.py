@@ -181,6 +181,10 @@ class Probe(Protocol):
         A count on a GPU, given as a tensor of one number, is read at the end of the frame.
         """
 
+    def report(self, ns: int, stages_ns: Mapping[str, int], peak_bytes: int | None = None) -> None:
+        """Take the time of this frame, in all and of its stages, from the clock of another process,
+        whose picture has just arrived, and the peak of that process's memory, if known."""
+
 
 class Method(Protocol):
     """A radiance-field renderer.
@@ -216,4 +220,7 @@ class NullProbe:
         return nullcontext()
 
     def count(self, name: str, done: int | Tensor, dense: int | None = None) -> None:
+        pass
+
+    def report(self, ns: int, stages_ns: Mapping[str, int], peak_bytes: int | None = None) -> None:
         pass

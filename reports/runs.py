@@ -108,6 +108,7 @@ class Run:
             "seed": str(row["seed"]),
             "commit": row["commit"],
             "computed on": _listed(computed),
+            **({"times": record["times"]} if "times" in record else {}),  # older runs have none
             "peak memory": record["peak_bytes"],
             "machine": f"{machine['cpu']}, {machine['threads']} threads, {memory}",
             "beside it": str(Neighbours(**seen)) if seen else "not recorded",

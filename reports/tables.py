@@ -124,6 +124,8 @@ def _time(rows: pd.DataFrame, suffix: str) -> Table:
         for each in ("p50", "p95", "p99"):
             lines.append((f"frame, {each}", decimal(value[f"frame_ms.{each}"], 2), ""))
         lines.append(("FPS", decimal(value["fps"], 2), ""))
+        if wall := value.get("wall_ms"):
+            lines.append(("frame, with the pipe", decimal(wall, 2), ""))
     return Table(f"Time of a frame{suffix}", ("stage", "mean ms", "share"), tuple(lines))
 
 
@@ -144,6 +146,7 @@ def _memory(rows: pd.DataFrame) -> Table:
     sizes = _values(rows, "size_bytes.")
     if sizes:
         sizes["model"] = sizes.pop("total")
-        sizes["peak, rendering"] = _values(rows)["peak_bytes"]
+    if math.isfinite(peak := _values(rows).get("peak_bytes", math.nan)):
+        sizes["peak, rendering"] = peak
     lines = tuple((name, megabytes(size)) for name, size in sizes.items())
     return Table("Memory", ("component", "MB"), lines)

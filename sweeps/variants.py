@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from bench.accuracy import render_in_turns, steady_frames
 from bench.console import ConsoleLog
@@ -133,8 +133,14 @@ def _usable(configs: Mapping[str, DictConfig], log: Log) -> dict[str, Method]:
 
 
 def declared(config: DictConfig) -> Study:
-    """The study that the method of `config` declares."""
-    return study_of(target_of(config.method))
+    """The study that the method of `config` declares: its class or, if only that knows, an object.
+
+    A method that still lacks a setting declares nothing.
+    """
+    target = target_of(config.method)
+    if isinstance(getattr(target, "study", None), property):
+        return Study() if OmegaConf.missing_keys(config.method) else build(config, "method").study
+    return study_of(target)
 
 
 def words_of(words: Sequence[str], variants: Iterable[Variant]) -> dict[str, list[str]]:

@@ -31,6 +31,7 @@ STANDS_ON = {
     **{name: {"kernels"} for name in ("engines", "rendering", "training")},
     "instant_ngp": {"kernels", "rendering", "training"},
     "gaussians": FIELD,
+    "external": {*FIELD, "gaussians"},
     "students": FIELD,
     **{name: {*FIELD, "students"} for name in ("nerf", "nsvf", "kilonerf", "plenoctree", "diver")},
     "steernerf": {*FIELD, "engines"},

@@ -70,6 +70,23 @@ def test_stages_and_other_add_up_to_the_frame_whatever_the_nesting(tree, steps):
     assert all(ns >= 0 for ns in frame.stages_ns.values())
 
 
+@pytest.mark.parametrize(
+    ("stages", "kept"), [(True, {"march": 30, "other": 20}), (False, {"other": 50})]
+)
+def test_a_time_of_another_clock_replaces_the_stages_and_leaves_that_until_then(stages, kept):
+    readings = iter([100, 103, 110, 190, 191])
+    clock = StageClock("worker's cuda", clock=lambda: next(readings), stages=stages)
+    with clock.frame():  # 100
+        clock.report(50, {"march": 30}, peak_bytes=7)  # 103
+        clock.count("rays", 2)
+    with clock.frame():  # 190 to 191
+        pass
+    assert clock.frames == [
+        FrameRecord(kept, {"rays": 2}, {}, wall_ns=3, peak_bytes=7),
+        FrameRecord({"other": 1}, {}, {}),
+    ]
+
+
 def test_counters_add_up_within_a_frame_and_start_at_0_in_the_next():
     clock = clock_reading(itertools.count())
     with clock.frame():

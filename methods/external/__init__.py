@@ -1,0 +1,1 @@
+"""A renderer in another process, as a method: docs/external.md has the protocol."""

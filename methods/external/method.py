@@ -1,0 +1,281 @@
+"""A renderer in another process, as a `bench.types.Method`."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import weakref
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from bench.errors import SteerbenchError, explained, unexpected
+from bench.provenance import computed_by, sha256
+from bench.results import content_key
+from bench.scenes.export import data_camera, picture_file, write_blender
+from bench.sharing import missing, whole
+from bench.study import Study, turned
+from bench.types import Budget, Camera, Frame, Log, Probe, Scene
+from methods.external.worker import Header, Worker
+
+WORKERS = Path(__file__).with_name("workers")  # those that come with steerbench
+
+UNTOLD: dict[str, Any] = {
+    **{"device": "cpu", "precision": "unknown", "memory": 0},
+    **{"can": [], "knobs": {}, "files": [], "packages": {}},
+}
+"""What holds of a worker that does not tell; the types are those that it has to tell."""
+
+
+@dataclass(kw_only=True, eq=False)
+class External:
+    """A renderer in another process, with the settings of `sweeps/configs/method/external.yaml`.
+
+    The process starts when something is asked of it, and ends with this object.
+    """
+
+    command: str
+    python: str | None
+    options: Mapping[str, Any]
+    files: list[str]
+    lock: str | None
+    start_s: float
+    fit_s: float
+    frame_s: float
+    seed: int
+
+    def __post_init__(self) -> None:
+        self.train_s = 0.0
+
+    @cached_property
+    def _worker(self) -> Worker:
+        words = shlex.split(self.command)
+        if (shipped := WORKERS / f"{words[0]}.py").exists():
+            words[0] = str(shipped)
+        if words[0].endswith(".py"):
+            words.insert(0, self.python or sys.executable)
+        worker = Worker(words, self.start_s)
+        weakref.finalize(self, _close, worker)
+        return worker
+
+    @cached_property
+    def _about(self) -> Header:
+        """What the worker tells about itself, made with the options."""
+        worker = self._worker
+        told, _ = worker.ask("settings", self.start_s, options=self.options)
+        about = {"name": worker.name, **UNTOLD, **told}
+        for name, usual in UNTOLD.items():
+            kind = type(usual)
+            worker.expect(type(about[name]) is kind, "settings", f"{name}: {kind.__name__}", told)
+        worker.name = about["name"]
+        return about
+
+    @property
+    def name(self) -> str:
+        """What the worker calls itself."""
+        return self._about["name"]
+
+    @property
+    def memory(self) -> int:
+        """Preceding frames that it uses."""
+        return self._about["memory"]
+
+    @property
+    def study(self) -> Study:
+        """The knobs that the worker declares."""
+        knobs = self._about["knobs"].items()
+        return Study({name: turned(name, f"++method.options.{name}", of) for name, of in knobs})
+
+    @property
+    def reads(self) -> list[Path]:
+        """The files that its pictures depend on: code that it has loaded, words, and `files`."""
+        words = (Path(word) for word in shlex.split(self.command))
+        given = [file for path in self.files for file in _files_at(Path(path))]
+        loaded = map(Path, self._about["files"])
+        return sorted({*loaded, *given, *(word for word in words if word.is_file())})
+
+    @cached_property
+    def _environment(self) -> dict[str, object]:
+        """The versions of what its environment holds."""
+        if self.lock is None:
+            return self._about["packages"]
+        done = subprocess.run(shlex.split(self.lock), capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise SteerbenchError(f"method.lock: {self.lock}: {done.stderr.strip()[-200:]}")
+        return {"lock": done.stdout}
+
+    def settings(self) -> dict[str, str]:
+        """What rows show, and a hash of its environment for the key of a run."""
+        device, precision = self._about["device"], self._about["precision"]
+        if device != "cpu" and not (device.startswith("cuda") and torch.cuda.is_available()):
+            device = f"worker's {device}"  # nothing here can wait for it
+        shown = {"device": device, "backend": "external", "engine": "none", "precision": precision}
+        return {**shown, "environment": content_key(self._environment)[:16]}
+
+    def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
+        """Let it train and store the result, load what it stored before, or get ready."""
+        self._scene, can = scene, self._about["can"]
+        corners = scene.origin.double() + scene.unit_length * scene.bounds.double()
+        job = {
+            "background": scene.background.tolist(),
+            "bounds": corners.tolist(),
+            "steps": budget.steps,
+            "samples": budget.samples,
+            "renderer_steps": budget.renderer_steps,
+            "seed": self.seed,
+        }
+        if "fit" not in can:
+            if "load" in can:
+                self._worker.ask("load", self.start_s, state=None, **job)
+            return
+        folder = log.stage_dir("external", self._key(job))
+        finished = folder / "trained.json"
+        with missing(finished, log) as untrained:
+            if untrained or "load" not in can:
+                self.train_s = self._train(folder, job, log)
+                with whole(finished) as new:
+                    new.write_text(json.dumps({"train_s": self.train_s}) + "\n")
+            else:
+                log.info(f"{self.name}: found in {folder}")
+                self._worker.ask("load", self.start_s, state=str(folder / "state"), **job)
+                self.train_s = json.loads(finished.read_text())["train_s"]
+
+    def _key(self, job: Mapping[str, object]) -> dict[str, object]:
+        knobs = self._about["knobs"]
+        return {
+            **job,
+            "scene": self._scene.digest,
+            "name": self.name,
+            "options": {name: value for name, value in self.options.items() if name not in knobs},
+            "files": [sha256(file) for file in self.reads],
+            "environment": self._environment,
+            "device": self._about["device"],
+            **computed_by(write_blender),
+        }
+
+    def _train(self, folder: Path, job: Mapping[str, object], log: Log) -> float:
+        """Let it train on the scene as files, and put what it stores into `folder`; the seconds."""
+        cameras = [
+            data_camera(self._scene, camera) for camera in self._scene.splits["train"].cameras
+        ]
+        pictures = [
+            {"file": picture_file("train", number), **_described(camera)}
+            for number, camera in enumerate(cameras)
+        ]
+        with explained(folder), tempfile.TemporaryDirectory(dir=folder) as temporary:
+            place, state = Path(temporary) / "scene", Path(temporary) / "state"
+            # Programs want all three files: none of them shows a picture that is held out.
+            write_blender(self._scene, place, dict.fromkeys(("train", "val", "test"), "train"), log)
+            state.mkdir()
+            with log.progress(f"{self.name}: training", 1000) as bar:
+                shown = 0
+
+                def progress(told: Header) -> None:
+                    nonlocal shown
+                    done, total = told.get("done"), told.get("total")
+                    if type(done) is not int or type(total) is not int or not 0 <= done <= total:
+                        raise ValueError(f"progress {told}")
+                    now = 1000 * done // max(total, 1)
+                    bar.advance(now - shown, str(told.get("note", ""))[:40])
+                    shown = now
+
+                begun = time.monotonic()
+                where = {"scene": str(place), "pictures": pictures, "state": str(state)}
+                self._worker.ask("fit", self.fit_s, progress, **where, **job)
+                seconds = time.monotonic() - begun
+            shutil.rmtree(folder / "state", ignore_errors=True)
+            state.rename(folder / "state")
+            (folder / "output.txt").write_text(self._worker.output())
+        return seconds
+
+    def reset(self) -> None:
+        """Begin a new sequence."""
+        self._worker.ask("reset", self.frame_s)
+
+    def render(self, camera: Camera, probe: Probe) -> Frame:
+        """Let it render one frame; the times are its own."""
+        seen = data_camera(self._scene, camera)
+        told, arrays = self._worker.ask("render", self.frame_s, **_described(seen))
+        ns, stages, counters = (told.get(name, {}) for name in ("ns", "stages", "counters"))
+        peak = told.get("peak_bytes")
+        self._expect(type(ns) is int and ns > 0, "ns above 0", f"ns {ns}")
+        self._expect(_counts(stages) and sum(stages.values()) <= ns, f"stages within {ns}", stages)
+        self._expect(_counts(counters), "counters of 0 or more", counters)
+        self._expect(peak is None or _counts({"": peak}), "peak_bytes of 0 or more", peak)
+        probe.report(ns, stages, peak)
+        for name, done in counters.items():
+            probe.count(name, done)
+        return self._frame(arrays, (camera.height, camera.width))
+
+    def _frame(self, arrays: Mapping[str, np.ndarray], size: tuple[int, int]) -> Frame:
+        for name, shape in (("rgb", (*size, 3)), ("depth", size), ("alpha", size)):
+            if name in arrays or name == "rgb":
+                got = list(arrays[name].shape) if name in arrays else "none"
+                self._expect(got == list(shape), f"{name} {list(shape)}", f"{name} {got}")
+        rgb = torch.from_numpy(arrays["rgb"])
+        rgb = rgb / 255 if rgb.dtype == torch.uint8 else rgb.float()
+        if not math.isfinite(rgb.sum()):  # which reads the picture once, and writes no other
+            broken = int((~rgb.isfinite()).any(dim=2).sum())
+            self._expect(not broken, "finite numbers", f"{broken} pixels that are NaN or infinite")
+        depth = torch.tensor(math.inf).expand(size)
+        if "depth" in arrays:
+            depth = torch.from_numpy(arrays["depth"]).float() / self._scene.unit_length
+        alpha = torch.ones(()).expand(size)
+        if "alpha" in arrays:
+            alpha = torch.from_numpy(arrays["alpha"]).float()
+        return Frame(rgb, depth, alpha)
+
+    def _expect(self, holds: bool, expected: str, got: object) -> None:
+        self._worker.expect(holds, "render", expected, got)
+
+    def sizes(self) -> dict[str, int]:
+        """Bytes by component, as the worker tells."""
+        told, _ = self._worker.ask("sizes", self.frame_s)
+        sizes = told.get("sizes")
+        self._worker.expect(_counts(sizes), "sizes", "sizes in bytes", told)
+        return sizes
+
+
+def _described(camera: Camera) -> dict[str, object]:
+    names = ("width", "height", "fx", "fy", "cx", "cy")
+    return {**{name: getattr(camera, name) for name in names}, "c2w": camera.c2w.tolist()}
+
+
+def _counts(told: object) -> bool:
+    """Whether a worker has told whole numbers from 0 on, by name."""
+    return isinstance(told, dict) and all(type(x) is int and x >= 0 for x in told.values())
+
+
+def _files_at(path: Path) -> list[Path]:
+    """A file, or the files below a folder, without hidden ones and what Python compiles."""
+    if not path.exists():
+        raise unexpected("method.files", "files and folders", f"{path}, which is not there")
+    left_out = (".", "__pycache__")
+    return (
+        [path]
+        if path.is_file()
+        else [
+            file
+            for file in path.rglob("*")
+            if file.is_file()
+            and not any(x.startswith(left_out) for x in file.relative_to(path).parts)
+        ]
+    )
+
+
+def _close(worker: Worker) -> None:
+    try:
+        worker.close()
+    except SteerbenchError as error:
+        print(f"steerbench: {error}", file=sys.stderr)

@@ -1,0 +1,160 @@
+"""A renderer's process, and the conversation with it, whatever the process does."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import torch
+
+from bench.errors import SteerbenchError, Unavailable
+from steerbench_worker import VARIABLE, VERSION, Channel
+
+Header = dict[str, Any]
+
+END_S = 10.0  # a process that has been told to close is killed after so many seconds
+
+
+class Worker:
+    """A process that was started with `command` and speaks the protocol of docs/external.md.
+
+    Whatever it does wrong is one SteerbenchError with its name and its last words. It is killed
+    then, and so are the processes that it has started.
+    """
+
+    def __init__(self, command: Sequence[str], limit_s: float) -> None:
+        self.name = command[-1]  # until it tells one
+        self._output = tempfile.TemporaryFile()  # noqa: SIM115  it is closed by `_end`
+        here, there = socket.socketpair()
+        self._channel, self._socket = Channel(here), here
+        environment = {
+            **os.environ,
+            VARIABLE: str(there.fileno()),
+            "OMP_NUM_THREADS": str(torch.get_num_threads()),
+            "PYTHONUNBUFFERED": "1",  # or its last words are lost
+        }
+        try:
+            with there:
+                self._process = subprocess.Popen(
+                    command,
+                    env=environment,
+                    pass_fds=[there.fileno()],
+                    stdin=subprocess.DEVNULL,
+                    stdout=self._output,
+                    stderr=subprocess.STDOUT,
+                    start_new_session=True,  # with a group of its own, which can be killed
+                )
+        except OSError as error:
+            here.close()
+            self._output.close()
+            why = f"cannot start {command[0]!r}: {error.strerror}"
+            raise Unavailable(f"method.command: {why}; expected a program") from error
+        hello, _ = self._heard("hello", limit_s)
+        self.expect(hello.get("version") == VERSION, "hello", f"version {VERSION}", hello)
+        self.expect(isinstance(hello.get("name"), str), "hello", "a name", hello)
+        self.name = hello["name"]
+
+    def ask(
+        self,
+        message: str,
+        limit_s: float,
+        progress: Callable[[Header], object] | None = None,
+        **fields: object,
+    ) -> tuple[Header, dict[str, np.ndarray]]:
+        """Send a message with `fields`; the header of its answer, and arrays by name.
+
+        Before an answer, and before each message to `progress`, it may be silent for `limit_s`.
+        """
+        return self._heard(
+            message, limit_s, progress, lambda: self._channel.send(message, **fields)
+        )
+
+    def _heard(
+        self,
+        message: str,
+        limit_s: float,
+        progress: Callable[[Header], object] | None = None,
+        ask: Callable[[], None] = lambda: None,
+    ) -> tuple[Header, dict[str, np.ndarray]]:
+        try:
+            self._channel.until = time.monotonic() + limit_s
+            ask()
+            header, arrays = self._channel.receive()
+            while progress and header["message"] == "progress":
+                progress(header)
+                self._channel.until = time.monotonic() + limit_s
+                header, arrays = self._channel.receive()
+        except TimeoutError as error:
+            raise self.fault(f"was silent for {limit_s:g} s, {message!r} not answered") from error
+        except (EOFError, ConnectionError) as error:
+            raise self.fault(f"{self._ending()}, {message!r} not answered") from error
+        except (ValueError, MemoryError) as error:
+            raise self.fault(f"answered {message!r} with {error}") from error
+        except BaseException:
+            self._end()
+            raise
+        if header["message"] == "error":
+            raise self.fault(f"failed at {message!r}: {header.get('text')}")
+        self.expect(header["message"] == message, message, "the same message", header)
+        return header, arrays
+
+    def expect(self, holds: bool, message: str, expected: str, got: object) -> None:
+        """Raise the SteerbenchError about an answer to `message` unless something `holds`."""
+        if not holds:
+            raise self.fault(f"answered {message!r} with {got!s:.100}, expected {expected}")
+
+    def fault(self, why: str) -> SteerbenchError:
+        """Kill the process, and return the error that says `why`."""
+        words = [line.strip()[:160] for line in self.output().splitlines()[-200:] if line.strip()]
+        last = f"its last words: {' | '.join(words[-3:])}" if words else "it has printed nothing"
+        self._end()
+        return SteerbenchError(" ".join(f"worker {self.name}: {why}; {last}".split()))
+
+    def output(self) -> str:
+        """What it has printed so far."""
+        file = self._output.fileno()
+        # Not by seeking: the process writes where this file is read.
+        return os.pread(file, os.fstat(file).st_size, 0).decode(errors="replace")
+
+    def close(self) -> None:
+        """Let it end, or kill it; SteerbenchError if it still says anything."""
+        if self._output.closed:
+            return
+        self._channel.until = time.monotonic() + END_S
+        try:
+            with suppress(EOFError, OSError):
+                self._channel.send("close")
+                header, _ = self._channel.receive()
+                raise ValueError(header["message"])
+        except ValueError as error:
+            raise self.fault(f"still said {str(error)[:100]!r} after 'close'") from error
+        finally:
+            self._end()
+
+    def _ending(self) -> str:
+        """How it has ended, once the connection is closed."""
+        try:
+            status = self._process.wait(1.0)
+        except subprocess.TimeoutExpired:
+            return "closed the connection"
+        if status == -signal.SIGKILL:
+            return "was killed by SIGKILL, as by a system without memory"
+        if status < 0:
+            return f"was killed by {signal.Signals(-status).name}"
+        return f"ended with status {status}"
+
+    def _end(self) -> None:
+        """Kill the process and all that it has started, if that has not been done."""
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        self._socket.close()
+        self._output.close()

@@ -1,0 +1,42 @@
+"""A worker for a model of nerfstudio, run by the Python of an environment with that package.
+
+Options: `config`, the config.yml of a training on data in the coordinates of the cameras.
+"""
+
+import sys
+from pathlib import Path
+
+sys.path.pop(0)  # this folder: its names are those of packages
+sys.path.append(str(Path(__file__).parents[3]))
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.utils.eval_utils import eval_setup
+
+from steerbench_worker import serve
+
+
+class Nerfstudio:
+    def __init__(self, config):
+        trained, self.pipeline, checkpoint, _ = eval_setup(Path(config), test_mode="inference")
+        self.name, self.files = trained.method_name, [config, checkpoint]
+        data = self.pipeline.datamanager.train_dataparser_outputs
+        self.transform, self.scale = data.dataparser_transform.double(), data.dataparser_scale
+        self.device = str(self.pipeline.device)
+
+    @torch.no_grad()
+    def render(self, camera):
+        pose = torch.from_numpy(camera.c2w) * torch.tensor([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes
+        pose = self.transform @ torch.cat((pose, pose.new_tensor([[0.0, 0.0, 0.0, 1.0]])))
+        pose[:, 3] *= self.scale
+        lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
+        seen = Cameras(pose.float()[None], *lens).to(self.pipeline.device)
+        return self.pipeline.model.get_outputs_for_camera(seen)["rgb"]
+
+    def sizes(self):
+        parameters = self.pipeline.model.parameters()
+        return {"model": sum(x.numel() * x.element_size() for x in parameters)}
+
+
+if __name__ == "__main__":
+    serve(Nerfstudio)

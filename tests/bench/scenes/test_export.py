@@ -1,0 +1,83 @@
+"""Scenes as files: what is written is what our own loaders, and others' by their names, read."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from bench.errors import SteerbenchError
+from bench.scenes import blender, transforms
+from bench.scenes.export import write_blender
+from bench.types import Camera, Scene
+
+
+@pytest.fixture
+def moved_scene(tiny_scene: Scene) -> Scene:
+    """The unit cube is [-1.5, 1.5]^3 of the data set."""
+    return replace(tiny_scene, origin=torch.full((3,), -1.5))
+
+
+def changed(scene: Scene, *cameras: Camera) -> Scene:
+    """The scene with other first cameras in its training split."""
+    train = scene.splits["train"]
+    several = [*cameras, *train.cameras[len(cameras) :]]
+    return replace(scene, splits={**scene.splits, "train": replace(train, cameras=several)})
+
+
+def test_a_scene_that_was_written_is_read_bit_by_bit(moved_scene, quiet_log, tmp_path: Path):
+    write_blender(moved_scene, tmp_path, {"train": "train", "test": "test"}, quiet_log)
+    found = blender.load(tmp_path, bounds="full", log=quiet_log)
+    assert found.splits.keys() == {"train", "test"}
+    for name, split in found.splits.items():
+        given = moved_scene.splits[name]
+        for camera, image, wanted, picture in zip(
+            split.cameras, split.images, given.cameras, given.images, strict=True
+        ):
+            assert torch.equal(image, picture)
+            assert torch.equal(camera.c2w, wanted.c2w)
+            assert camera.fx == pytest.approx(wanted.fx, rel=1e-15)
+            assert (camera.cx, camera.cy, camera.width) == (20.0, 16.0, 40)
+
+
+def test_what_is_not_named_is_not_written(moved_scene, quiet_log, tmp_path: Path):
+    write_blender(moved_scene, tmp_path, {"train": "train", "test": "train"}, quiet_log)
+    assert len(list(tmp_path.rglob("*.png"))) == len(moved_scene.splits["train"])
+    found = blender.load(tmp_path, bounds="full", log=quiet_log)
+    assert found.splits["test"].names == found.splits["train"].names
+
+
+def test_pictures_without_alpha_are_opaque(moved_scene, quiet_log, tmp_path: Path):
+    train = moved_scene.splits["train"]
+    opaque = replace(train, images=[image[..., :3] for image in train.images])
+    scene = replace(moved_scene, splits={"train": opaque})
+    write_blender(scene, tmp_path, {"train": "train", "test": "train"}, quiet_log)
+    (image, *_) = blender.load(tmp_path, bounds="full", log=quiet_log).splits["train"].images
+    assert (image[..., 3] == 255).all()
+    assert torch.equal(image[..., :3], opaque.images[0])
+
+
+@pytest.mark.parametrize(
+    "lens", [{"fy": 61.0}, {"cx": 19.0}, {"fx": 70.0, "fy": 70.0}], ids=["fy", "cx", "one"]
+)
+def test_lenses_that_one_angle_does_not_describe_are_in_other_fields(
+    lens, moved_scene, quiet_log, tmp_path: Path
+):
+    cameras = moved_scene.splits["train"].cameras
+    count = len(cameras) if "cx" in lens or len(lens) == 1 else 1
+    scene = changed(moved_scene, *(replace(camera, **lens) for camera in cameras[:count]))
+    write_blender(scene, tmp_path, {"train": "train", "test": "train"}, quiet_log)
+    with pytest.raises(SteerbenchError, match="camera_angle_x"):
+        blender.load(tmp_path, bounds="full", log=quiet_log)
+    record = json.loads((tmp_path / "transforms_train.json").read_text())
+    for frame in record["frames"]:
+        frame["file_path"] += ".png"
+    (tmp_path / "transforms.json").write_text(json.dumps(record))
+    found = transforms.load(tmp_path, split_every=4, log=quiet_log)
+    (camera, *_) = found.splits["test"].cameras
+    wanted = scene.splits["train"].cameras[0]
+    shown = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+    assert shown == (wanted.fx, wanted.fy, wanted.cx, wanted.cy, wanted.width, wanted.height)

@@ -1,0 +1,297 @@
+"""A renderer in another process as a method: what it learns from, and what comes back."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import psutil
+import pytest
+import torch
+
+from bench.cameras import move_camera
+from bench.probes import StageClock
+from bench.scenes import blender
+from bench.scenes.assemble import hold_out
+from bench.study import Variant
+from bench.types import Budget, NullProbe, Scene, SteerbenchError
+from methods.gaussians import ply
+from methods.instant_ngp.method import InstantNgp
+from tests.methods.external.conftest import ROOT
+from tests.methods.gaussians.test_ply import some
+from tests.methods.trainings import GRID, QUICK
+
+BUDGET = Budget("test", steps=7, samples=9)
+
+
+@pytest.fixture
+def moved_scene(tiny_scene: Scene) -> Scene:
+    """The unit cube is [-1.5, 1.5]^3 of the data set."""
+    return replace(tiny_scene, origin=torch.full((3,), -1.5))
+
+
+STORES = """
+    class Stores(Grey):
+        knobs = {"shade": [0.5, 1.0]}
+        memory, precision = 2, "fp64"
+
+        def __init__(self, level=0.25, shade=1.0):
+            self.wanted, self.shade = level, shade
+
+        def fit(self, job):
+            print("trained")
+            self.level = self.wanted * self.shade
+            (job.state / "level").write_text(str(self.wanted))
+
+        def load(self, job):
+            self.level = float((job.state / "level").read_text()) * self.shade
+"""
+
+
+def level(method, scene) -> float:
+    return float(method.render(scene.splits["test"].cameras[0], NullProbe()).rgb.mean())
+
+
+def test_its_times_are_those_of_the_frame_and_the_pipe_is_beside_them(
+    worker, external, tiny_scene, quiet_log
+):
+    lines = """
+    from steerbench_worker import count, stage
+
+    class Staged(Grey):
+        def render(self, camera):
+            with stage("march"), stage("lookup"):
+                count("rays", 3)
+            count("rays", 4)
+            return super().render(camera)
+    """
+    method = external(worker(lines, after="serve(Staged)\n"))
+    method.fit(tiny_scene, BUDGET, quiet_log)
+    clock = StageClock("cpu")
+    with clock.frame():
+        frame = method.render(tiny_scene.splits["test"].cameras[0], clock)
+    (record,) = clock.frames
+    assert record.stages_ns.keys() == {"march", "march/lookup", "other"}
+    assert record.done == {"rays": 7}
+    assert record.wall_ns > record.total_ns > 0
+    assert record.peak_bytes > 1e6
+    assert torch.equal(frame.rgb, torch.full((32, 40, 3), 0.5))
+    assert (frame.depth == torch.inf).all()
+    assert (frame.alpha == 1).all()
+
+
+def test_depths_are_converted_to_scene_units(worker, external, moved_scene, quiet_log):
+    lines = """
+    class Deep(Grey):
+        def render(self, camera):
+            size = camera.height, camera.width
+            picture = np.full((*size, 3), 51, np.uint8)
+            return {"rgb": picture, "depth": np.full(size, 6.0), "alpha": np.zeros(size)}
+    """
+    method = external(worker(lines, after="serve(Deep)\n"))
+    method.fit(moved_scene, BUDGET, quiet_log)
+    frame = method.render(moved_scene.splits["test"].cameras[0], NullProbe())
+    torch.testing.assert_close(frame.rgb, torch.full((32, 40, 3), 0.2))
+    assert (frame.depth == 2).all()
+    assert (frame.alpha == 0).all()
+
+
+def test_cameras_are_in_the_units_of_the_data_set(worker, external, moved_scene, quiet_log):
+    lines = """
+    class Looks(Grey):
+        def render(self, camera):
+            values = [*camera.c2w.flatten(), camera.fx, camera.fy, camera.cx, camera.cy]
+            picture = np.zeros((camera.height, camera.width, 3))
+            picture[0, :16, 0] = values
+            return picture
+    """
+    method = external(worker(lines, after="serve(Looks)\n"))
+    method.fit(moved_scene, BUDGET, quiet_log)
+    camera = moved_scene.splits["test"].cameras[1]
+    shown = method.render(camera, NullProbe()).rgb[0, :16, 0]
+    pose = move_camera(camera, 3.0, moved_scene.origin).c2w.flatten()
+    assert torch.equal(shown, torch.cat((pose, torch.tensor([60.0, 60.0, 20.0, 16.0]))))
+
+
+def test_it_sees_only_training_pictures(worker, external, moved_scene, quiet_log, tmp_path: Path):
+    lines = f"""
+    import json, shutil
+
+    class Keeps(Grey):
+        def fit(self, job):
+            super().fit(job)
+            shutil.copytree(job.scene, {str(tmp_path / "seen")!r})
+            assert [path.is_file() for path, _ in job.pictures] == [True] * len(job.pictures)
+            told = [job.steps, job.samples, job.seed, job.bounds, len(job.pictures)]
+            print(json.dumps(told))
+    """
+    train = moved_scene.splits["train"]
+    several = replace(train, cameras=[*train.cameras] * 2, images=[*train.images] * 2)
+    several = replace(several, names=[str(i) for i in range(8)])
+    scene = hold_out(replace(moved_scene, splits={"train": several}), "validation", 8)
+    method = external(worker(lines, after="serve(Keeps)\n"))
+    method.fit(scene, BUDGET, quiet_log)
+    assert len(list((tmp_path / "seen").rglob("*.png"))) == 7
+    seen = blender.load(tmp_path / "seen", bounds="full", log=quiet_log)
+    for split in ("train", "val", "test"):
+        assert len(seen.splits[split]) == 7
+        for one, other in zip(seen.splits[split].images, scene.splits["train"].images, strict=True):
+            assert torch.equal(one, other)
+    (kept,) = tmp_path.glob("outputs/stages/*/output.txt")
+    bounds = [[-1.5] * 3, [1.5] * 3]
+    assert json.loads(kept.read_text()) == [7, 9, 3, bounds, 7]
+
+
+def test_what_it_stores_is_loaded_and_a_knob_needs_no_training(
+    worker, external, tiny_scene, quiet_log, tmp_path
+):
+    path = worker(STORES, after="serve(Stores)\n")
+    seconds = []
+    for options, shown in (({}, 0.25), ({"shade": 0.5}, 0.125), ({"level": 0.75}, 0.75)):
+        method = external(path, options=options)
+        method.fit(tiny_scene, BUDGET, quiet_log)
+        seconds.append(method.train_s)
+        assert level(method, tiny_scene) == shown
+    assert seconds[0] == seconds[1] > 0
+    assert len(list(tmp_path.glob("outputs/stages/external-*"))) == 2
+    assert method.sizes() == {"model": 4}
+    assert (method.name, method.memory) == ("Stores", 2)
+    shown = {"device": "cpu", "backend": "external", "engine": "none", "precision": "fp64"}
+    assert shown.items() < method.settings().items()
+    expected = Variant("shade 0.5", ("++method.options.shade=0.5",))
+    assert method.study.knobs["shade"][0] == expected
+
+
+def test_what_it_was_trained_with_makes_another_training(
+    worker, external, tiny_scene, quiet_log, tmp_path
+):
+    path = worker(STORES, after="serve(Stores)\n")
+    more = tmp_path / "more"
+    more.mkdir()
+
+    def stages(**settings) -> int:
+        external(path, **settings).fit(tiny_scene, BUDGET, quiet_log)
+        return len(list(tmp_path.glob("outputs/stages/external-*")))
+
+    assert stages() == stages() == 1
+    assert stages(seed=4) == 2
+    worker(STORES, after="\nserve(Stores)\n")
+    assert stages() == 3
+    (path.parent / "lib.py").write_text("")
+    worker(STORES, after="import lib\nserve(Stores)\n")
+    assert stages() == 4
+    (path.parent / "lib.py").write_text("SHADE = 1")
+    assert stages() == 5
+    (more / "data").write_text("one")
+    (more / ".hidden").write_text("")
+    assert stages(files=[str(more)]) == 6
+    (more / ".hidden").write_text("changed")
+    assert stages(files=[str(more)]) == 6
+    (more / "data").write_text("two")
+    assert stages(files=[str(more)]) == 7
+    assert stages(lock="echo torch==1") == 8
+    assert stages(lock="echo torch==2") == 9
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"files": ["nowhere"]}, "method.files: expected files and folders, got nowhere, which is"),
+        ({"lock": "ls /nowhere"}, "method.lock: ls /nowhere: .*No such file"),
+        ({"options": {"colour": 1}}, "worker Stores: failed at 'settings': TypeError: .*'colour'"),
+    ],
+)
+def test_a_setting_that_is_wrong_is_named(wrong, said, worker, external, tiny_scene, quiet_log):
+    method = external(worker(STORES, after="serve(Stores)\n"), **wrong)
+    with pytest.raises(SteerbenchError, match=said):
+        method.fit(tiny_scene, BUDGET, quiet_log)
+
+
+def test_a_training_that_failed_leaves_nothing_to_load(
+    worker, external, tiny_scene, quiet_log, tmp_path
+):
+    lines = (
+        STORES
+        + """
+        def fit(self, job):
+            (job.state / "half").write_text("of it")
+            raise ValueError("too bad")
+    """
+    )
+    with pytest.raises(SteerbenchError, match="ValueError: too bad"):
+        external(worker(lines, after="serve(Stores)\n")).fit(tiny_scene, BUDGET, quiet_log)
+    assert [path.name for path in tmp_path.glob("outputs/stages/external-*/*")] == ["lock"]
+
+
+def test_it_ends_with_the_method(worker, external):
+    method = external(worker())
+    assert method.name == "Grey"
+    process = psutil.Process(method._worker._process.pid)
+    del method
+    assert not process.is_running()
+
+
+# Our own renderers in another process
+
+
+def test_instant_ngp_renders_the_same_in_another_process(
+    worker, external, ball_scene, quiet_log, tmp_path
+):
+    before = f"""
+    import sys
+    sys.path.insert(1, {str(ROOT)!r})
+
+    import numpy as np
+    import torch
+
+    from bench.console import ConsoleLog
+    from bench.scenes import blender
+    from bench.types import Budget, Camera, NullProbe
+    from methods.instant_ngp.method import InstantNgp
+    from steerbench_worker import serve
+    from tests.methods.trainings import GRID, QUICK
+
+    class Ngp:
+        device = "cpu"
+
+        def fit(self, job):
+            log = ConsoleLog(job.state, quiet=True)
+            scene = blender.load(job.scene, bounds=job.bounds, log=log)
+            self.method = InstantNgp(grid=GRID, training=QUICK, device="cpu")
+            self.method.fit(scene, Budget("b", steps=job.steps, samples=job.samples), log)
+
+        def render(self, camera):
+            pose = torch.from_numpy(camera.c2w)
+            pose[:, 3] = (pose[:, 3] + 1.5) / 3
+            lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
+            return self.method.render(Camera(pose.float(), *lens), NullProbe()).rgb
+    """
+    cube = torch.tensor([[0.0] * 3, [1.0] * 3])
+    scene = replace(ball_scene, origin=torch.full((3,), -1.5), unit_length=3.0, bounds=cube)
+    budget = Budget("test", steps=8, samples=2048)
+    inside = InstantNgp(grid=GRID, training=QUICK, device="cpu")
+    outside = external(worker(before=before, after="serve(Ngp)\n"))
+    for method in (inside, outside):
+        method.fit(scene, budget, quiet_log)
+    for camera in scene.splits["test"].cameras:
+        expected = inside.render(camera, NullProbe()).rgb
+        assert torch.equal(outside.render(camera, NullProbe()).rgb, expected)
+
+
+def test_a_ply_file_is_rendered_without_its_data_set(external, moved_scene, tmp_path, quiet_log):
+    path = tmp_path / "some.ply"
+    gaussians = some()
+    ply.write(gaussians, moved_scene, path)
+    method = external("ply", options={"file": str(path)})
+    method.fit(moved_scene, BUDGET, quiet_log)
+    camera = moved_scene.splits["test"].cameras[2]
+    frame = method.render(camera, NullProbe())
+    with torch.no_grad():
+        pixels = gaussians.render(camera, 1e-4, NullProbe())
+    expected = pixels.over(torch.ones(3)).values.view(32, 40, 3)
+    # Where the file's units and ours round differently, a Gaussian's edge may fall the other way.
+    assert (frame.rgb - expected).abs().quantile(0.99) < 1e-4
+    assert method.sizes() == {"gaussians": 50 * 59 * 4}
+    assert path in method.reads
+    assert not (tmp_path / "outputs").exists()  # nothing was trained, nothing was written

@@ -1,0 +1,100 @@
+"""A method of NerfBaselines, in an environment that pip makes for it, as a method of ours."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from bench.types import Budget, NullProbe, Scene, composite
+
+VERSION = "1.2.12"
+
+METHOD = '''
+"""The mean colour of the training pictures, a share of it at each step."""
+
+import os
+
+import numpy as np
+from nerfbaselines import Method
+
+
+class Mean(Method):
+    def __init__(self, *, checkpoint=None, train_dataset=None, config_overrides=None):
+        self.overrides, self.checkpoint = config_overrides or {}, checkpoint
+        if checkpoint:
+            self.colour = np.load(os.path.join(checkpoint, "colour.npy"))
+        else:
+            over = np.array(train_dataset["metadata"]["background_color"]) / 255
+            pictures = np.array(train_dataset["images"]) / 255
+            alpha = pictures[..., 3:]
+            self.pictures = pictures[..., :3] * alpha + over * (1 - alpha)
+            self.colour = np.zeros(3)
+
+    @classmethod
+    def get_method_info(cls):
+        return {"method_id": "mean", "supported_camera_models": frozenset(("pinhole",))}
+
+    def get_info(self):
+        return {**self.get_method_info(), "num_iterations": self.overrides.get("steps", 4)}
+
+    def train_iteration(self, step):
+        self.colour += self.pictures.mean(axis=(0, 1, 2)) / self.get_info()["num_iterations"]
+        return {"psnr": 10.0}
+
+    def save(self, path):
+        np.save(os.path.join(path, "colour.npy"), self.colour)
+
+    def render(self, camera, *, options=None):
+        width, height = camera.item().image_sizes
+        return {"color": np.broadcast_to(self.colour, (height, width, 3)).astype(np.float32)}
+'''
+
+SPEC = """
+from nerfbaselines import register
+
+register({"id": "mean", "method_class": "mean_method:Mean"})
+"""
+
+
+@pytest.fixture(scope="module")
+def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The interpreter of an environment with NerfBaselines; skips where pip cannot install it."""
+    folder = tmp_path_factory.mktemp("environment")
+    subprocess.run([sys.executable, "-m", "venv", folder], check=True)
+    install = ["-m", "pip", "install", "--quiet", f"nerfbaselines=={VERSION}"]
+    done = subprocess.run(
+        [folder / "bin/python", *install], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        pytest.skip(f"pip cannot install NerfBaselines here: {done.stderr.strip()[-200:]}")
+    return folder / "bin/python"
+
+
+@pytest.mark.slow
+def test_a_registered_method_trains_renders_and_is_loaded(
+    python, external, tiny_scene: Scene, quiet_log, tmp_path, monkeypatch
+):
+    (tmp_path / "mean_method.py").write_text(METHOD)
+    (tmp_path / "mean_spec.py").write_text(SPEC)
+    monkeypatch.setenv("NERFBASELINES_REGISTER", str(tmp_path / "mean_spec.py"))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    scene = replace(tiny_scene, origin=torch.full((3,), -1.5))
+    train = [composite(image, scene.background) for image in scene.splits["train"].images]
+    expected = torch.stack(train).mean(dim=(0, 1, 2))
+    pictures, seconds = [], []
+    for _ in range(2):
+        options = {"id": "mean", "overrides": {"steps": 5}}
+        method = external("nerfbaselines", python=str(python), options=options)
+        method.fit(scene, Budget("test", steps=1, samples=1), quiet_log)
+        pictures.append(method.render(scene.splits["test"].cameras[0], NullProbe()).rgb)
+        seconds.append(method.train_s)
+        assert (method.name, method.sizes()) == ("mean", {"model": 128 + 3 * 8})
+    torch.testing.assert_close(pictures[0][0, 0], expected, rtol=0, atol=1e-6)
+    assert torch.equal(*pictures)
+    assert seconds[0] == seconds[1] > 0  # the second was loaded
+    assert method._environment["nerfbaselines"] == VERSION
