@@ -113,8 +113,8 @@ class Job:
 class JobFailed(SteerbenchError):
     """One of several jobs failed, `job`; its error is the cause."""
 
-    def __init__(self, job: Job, error: BaseException) -> None:
-        super().__init__(f"{job.name}: {reason(error)}")
+    def __init__(self, job: Job) -> None:
+        super().__init__(f"failed: {job.name}")
         self.job = job
 
 
@@ -172,7 +172,7 @@ def _ready(jobs: Sequence[Job], log: Log) -> list[_Ready]:
         except Exception as error:
             if len(jobs) == 1:
                 raise
-            raise JobFailed(job, error) from error
+            raise JobFailed(job) from error
     if not jobs[0].turns:
         return ready
     beside = sorted(content_key(each.parts) for each in ready)
@@ -229,8 +229,7 @@ def _measure(ready: Sequence[_Ready], log: Log) -> None:
         measurements = measure([each.method for each in ready], ready[0].task, log)
     except MethodFailed as failed:
         (job,) = (each.job for each in ready if each.method is failed.method)
-        cause = failed.__cause__ or failed
-        raise JobFailed(job, cause) from cause
+        raise JobFailed(job) from failed.__cause__
     for each in ready if len(ready) > 1 else ():
         each.job.store.remove(each.run)
     for each, measurement in zip(ready, measurements, strict=True):

@@ -27,7 +27,7 @@ from sweeps.configured import scene_digest, scene_folder
 from sweeps.execute import Launcher, attempt, divided, room, say, train_ahead
 from sweeps.measurement import job_key, stored
 from sweeps.overrides import composed
-from sweeps.plan import DataSet, Planned, chosen, find, plan
+from sweeps.plan import DataSet, Planned, chosen, data_sets, find, plan, scenes_of
 from sweeps.terminal import console, show
 
 Group = list[tuple[int, Planned]]
@@ -49,7 +49,7 @@ def main(options: argparse.Namespace) -> int:
     missing = data.missing if data else {}
     for name, why in missing.items():
         print(f"missing: {name}: {why}", file=sys.stderr)
-    tables = chosen(options.table, options.methods)
+    tables = chosen(options.table, options.methods, data_sets(scenes_of(words, data)))
     jobs = [job for table in tables for job in plan(table, words, data)]
     outputs = Path(jobs[0].config.outputs)
     failed = 0
