@@ -6,8 +6,8 @@ Quality, time and memory of a run come from the same rendering of the same frame
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
@@ -47,24 +47,45 @@ class Task:
     pictures: int = PICTURES  # scored frames whose pictures are kept
 
 
+class MethodFailed(Exception):
+    """One of several methods failed, `method`; its error is the cause."""
+
+    def __init__(self, method: Method) -> None:
+        super().__init__(method.name)
+        self.method = method
+
+
+@contextmanager
+def _named(method: Method, several: bool) -> Iterator[None]:
+    """Raise an error of the body as MethodFailed if there are `several` methods."""
+    try:
+        yield
+    except Exception as error:
+        if several:
+            raise MethodFailed(method) from error
+        raise
+
+
 def measure(methods: Sequence[Method], task: Task, log: Log) -> list[Measurement]:
     """Fit `methods` to the scene of `task`; render its trajectory under the clock and score it.
 
     Several methods render each frame one after the other, so that their times come from the same
     minutes. Peak memory of the process is that of all methods together. Raises SteerbenchError if
-    the scene does not fit the protocol, or a method rendered values that are not finite.
+    the scene does not fit the protocol, or a method rendered values that are not finite; of several
+    methods, MethodFailed for whatever one of them raises.
     """
     lpips, missing = task.protocol.load_lpips(task.weights_dir, log)
     task.protocol.check(task.scene, task.trajectory)
     for split in task.scene.splits.values():
         list(split.images)  # decode now, so damaged files raise here, not during training or timing
     for method in methods:
-        method.fit(task.scene, task.budget, log)
+        with _named(method, len(methods) > 1):
+            method.fit(task.scene, task.budget, log)
     takes = [_Take(method, task, lpips) for method in methods]
     neighbours = _render(takes, task, log)
     if neighbours.notable:
         log.info(f"{neighbours} while frames were timed: times are longer than they need be")
-    return [_measurement(take, task, missing, neighbours) for take in takes]
+    return [_measurement(take, task, missing, neighbours, len(takes)) for take in takes]
 
 
 class _Take:
@@ -88,11 +109,13 @@ class _Take:
         counts = warm or not self.meter.peak_bytes if self.meter.of_process else not warm
         return self.meter if counts else nullcontext()
 
-    def peak(self) -> tuple[float, str]:
-        """Peak memory in bytes, NaN if it is not known, and what was read."""
+    def peak(self, in_turns: int) -> tuple[float, str]:
+        """Peak memory in bytes, NaN if it is not known, and what was read; `in_turns` methods were
+        measured together."""
         frames = self.clock.frames
         if all(frame.wall_ns is None for frame in frames):
             source = self.meter.source + ", before its frames were scored" * self.meter.of_process
+            source += f", of {in_turns} methods in turns" * (in_turns > 1)
             return self.meter.peak_bytes, source
         told = [frame.peak_bytes for frame in frames if frame.peak_bytes is not None]
         if not told:
@@ -108,11 +131,12 @@ class _Take:
 
 
 def _measurement(
-    take: _Take, task: Task, missing: Mapping[str, str], neighbours: Neighbours
+    take: _Take, task: Task, missing: Mapping[str, str], neighbours: Neighbours, in_turns: int
 ) -> Measurement:
+    """What was measured of one of `in_turns` methods."""
     scene, trajectory, protocol, budget = task.scene, task.trajectory, task.protocol, task.budget
     method, scoring, sizes = take.method, take.scoring, take.method.sizes()
-    peak_bytes, source = take.peak()
+    peak_bytes, source = take.peak(in_turns)
     frames = _frame_table(take.rows, protocol)
     of_phases = ((phase, frames[frames["phase"] == phase]) for phase in (STEADY, COLD))
     summary = [
@@ -157,14 +181,19 @@ def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
             take.method.reset()
         for number, take in product(warmup, takes):
             settled = number > 0 or len(warmup) == 1  # in the first, kernels may be compiled
-            with take.metered(warm=True) if settled else nullcontext(), take.clock.frame():
+            with (
+                _named(take.method, len(takes) > 1),
+                take.metered(warm=True) if settled else nullcontext(),
+                take.clock.frame(),
+            ):
                 take.method.render(steps[number].camera, take.clock)
             progress.advance(note="warming up")
         for take in takes:
             take.method.reset()
         watch = Watch()
         for index, take in product(range(len(steps)), takes):
-            _draw(take, task, index, preceding[index])
+            with _named(take.method, len(takes) > 1):
+                _draw(take, task, index, preceding[index])
             scores = [row["psnr"] for row in take.rows if "psnr" in row]
             progress.advance(note=f"{np.mean(scores):.2f} dB" if scores else "")
         return watch.seen()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,6 +15,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, ScalarFormatter
+from matplotlib.transforms import Bbox
 from numpy.typing import ArrayLike
 
 from bench.results import COLD
@@ -26,7 +26,6 @@ from reports.tables import NOT_AVAILABLE
 
 STAGE, OTHER = "stage_ms.", "stage_ms.other"
 LEGEND_COLUMNS = 4
-LEGEND_WIDTH = 44  # characters per line in a legend of two columns
 MARKERS = "osD^vP*X<>"
 COLOURS = [matplotlib.colormaps["tab20"](index) for index in (*range(0, 20, 2), *range(1, 20, 2))]
 COLOURS = [colour for colour in COLOURS if len(set(colour[:3])) > 1]  # grey is for "other"
@@ -36,6 +35,12 @@ COSTS = {
     "size_bytes.total": ("psnr-bytes", 1e6, "MB of the model"),
 }
 """What quality is plotted against: prefix of the file name, unit and label of the axis."""
+
+PLACES = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
+"""Where the name of a point may stand, across and up: right of it at best."""
+
+RELEASE_STEPS = 300_000  # of stage 2
+STEP_TICKS = (10, 100, 1000, 10_000, RELEASE_STEPS)
 
 MARK = "mark-{}"  # the `gid` of the mark of the line with this number
 
@@ -85,41 +90,54 @@ def quality_plot(lines: Sequence[Repeated], metric: str) -> Picture:
 
 
 def quality_against(lines: Sequence[Repeated], metric: str, path: Path) -> None:
-    """Write a PNG: PSNR of each of `lines` against its `metric`, one of `COSTS`.
+    """Write a PNG: PSNR of each of `lines` against its `metric`, one of `COSTS`, with its name.
 
     With several seeds, error bars show the intervals of both.
     """
     _, unit, label = COSTS[metric]
-    labels = [textwrap.fill(line.label, LEGEND_WIDTH) for line in lines]
-    half = -(-len(labels) // 2)  # the legend has two columns
-    legend_lines = max("\n".join(part).count("\n") + 1 for part in (labels[:half], labels[half:]))
-    figure = Figure(figsize=(8, 4.0 + 0.25 * legend_lines), layout="constrained")
+    figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
     _label(axes, label)
+    points = {}
     for number, line in enumerate(lines):
         across, up = line.mean(metric), line.mean("psnr")
         if across is None or up is None:
             continue
         bars = [half if half > 0 else None for half in (line.half(metric), line.half("psnr"))]
-        drawn = axes.errorbar(
-            across / unit,
-            up,
-            xerr=bars[0] and bars[0] / unit,
-            yerr=bars[1],
-            **_style(number),
-            markersize=8,
-            label=labels[number],
-        )
+        style = {**_style(number), "xerr": bars[0] and bars[0] / unit, "yerr": bars[1]}
+        drawn = axes.errorbar(across / unit, up, **style, markersize=8)
         drawn[0].set_gid(MARK.format(number))
+        points[line.label] = (across / unit, up)
     axes.set_xscale("log")
+    axes.margins(0.1)
     low, high = axes.get_xlim()
     decades = math.log10(high / low)  # the more of them, the fewer ticks in each
     ticks = (1, 2, 3, 5, 7) if decades < 1.5 else (1, 2, 5) if decades < 3 else (1,)
     axes.xaxis.set_major_locator(LogLocator(subs=ticks))
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_locator(NullLocator())
-    figure.legend(loc="outside lower center", ncols=2, frameon=False)
+    _name(axes, points)
     figure.savefig(path, dpi=150)
+
+
+def _name(axes: Axes, points: Mapping[str, tuple[float, float]]) -> None:
+    """Write each name beside its point, where it covers no other name and no point."""
+    axes.get_figure().draw_without_rendering()  # type: ignore[union-attr]
+    on_page = [axes.transData.transform(point) for point in points.values()]
+    taken = [Bbox.from_extents(*(place - 6), *(place + 6)) for place in on_page]
+    for name, point in points.items():
+        text = axes.annotate(name, point, (0, 0), textcoords="offset points", size=9)
+        text.set_in_layout(False)
+        for across, up in PLACES:
+            text.xyann = (8 * across, 8 * up)
+            text.set(
+                ha=("right", "center", "left")[across + 1], va=("top", "center", "bottom")[up + 1]
+            )
+            box = text.get_window_extent()
+            inside = axes.bbox.x0 < box.x0 and box.x1 < axes.bbox.x1
+            if inside and not box.count_overlaps(taken):
+                break
+        taken.append(box)
 
 
 def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
@@ -145,23 +163,28 @@ class Curve:
     points: Mapping[float, Repeated]
 
 
-def quality_over_training(curves: Sequence[Curve], path: Path) -> None:
-    """Write a PNG: PSNR over training steps (log scale), one panel for each `panel` of `curves`."""
+def quality_over_training(curves: Sequence[Curve], ceiling: Repeated | None, path: Path) -> None:
+    """Write a PNG: PSNR over training steps (log scale), one panel for each `panel` of `curves`.
+
+    Bars show the intervals over several seeds. The axis ends with the steps of the release. The
+    PSNR of `ceiling` is a dashed line.
+    """
     titles = list(dict.fromkeys(curve.panel for curve in curves))
     figure = Figure(figsize=(4.2 * len(titles), 3.6), layout="constrained")
     for axes, title in zip(figure.subplots(1, len(titles), squeeze=False)[0], titles, strict=True):
         _label(axes, "steps of stage 2")
         axes.set_title(title, fontsize="medium")
-        shown = [curve for curve in curves if curve.panel == title]
-        for number, curve in enumerate(shown):
-            halves = [line.half("psnr") for line in curve.points.values()]
+        for number, curve in enumerate(curve for curve in curves if curve.panel == title):
+            bars = np.nan_to_num([line.half("psnr") for line in curve.points.values()])
             psnr = [line.mean("psnr") for line in curve.points.values()]
-            bars = np.nan_to_num(halves) if np.isfinite(halves).all() else None
             style = {**_style(number), "capsize": 3, "label": curve.label, "linestyle": "-"}
-            axes.errorbar(list(curve.points), psnr, yerr=bars, **style)
+            axes.errorbar(list(curve.points), psnr, yerr=bars if bars.any() else None, **style)
+        if ceiling and (top := ceiling.mean("psnr")) is not None:
+            axes.axhline(top, color="black", linestyle="--", linewidth=1, label="the field")
         axes.set_xscale("log")
-        steps = sorted({step for curve in shown for step in curve.points})
-        axes.set_xticks(steps, [f"{step:g}" for step in steps])
+        axes.axvline(RELEASE_STEPS, color="grey", linestyle=":", linewidth=1)
+        axes.set_xticks(STEP_TICKS, [f"{steps:,}" for steps in STEP_TICKS])
+        axes.set_xlim(axes.dataLim.x0 / 1.5, 1.5 * RELEASE_STEPS)
         axes.xaxis.set_minor_locator(NullLocator())
         axes.legend(frameon=False, fontsize="small")
     figure.savefig(path, dpi=150)

@@ -14,11 +14,12 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from reports import figures
+from reports.claims import claim_table, tally
 from reports.images import Part, Picture, frame_section, kept_frames
 from reports.outliers import Outlier, outlier_table
-from reports.paper_tables import SHARES, Lines, PaperTable, section
+from reports.paper_tables import METHOD, SHARES, Lines, PaperTable, comparisons, section
 from reports.publish import publish
-from reports.runs import Run
+from reports.runs import Repeated, Run
 
 PAGE: Any = OmegaConf.to_container(OmegaConf.load(Path(__file__).parent / "paper" / "page.yaml"))
 
@@ -40,12 +41,14 @@ def write_paper_page(
     runs = list({run.key: run for run in measured}.values())
     left_out = "\n".join(f"- missing: {name}: {why}" for name, why in missing.items())
     listed = outlier_table(found, runs)
+    flagged: list[Part] = [f"## {listed.title}", listed] if listed.lines else []
     sources = "\n".join(f"{run.key}  {run.record['command']}" for run in runs)
-    parts = [
+    parts: list[Part] = [
         f"# {PAGE['title']}",
-        PAGE["reading"].strip(),
+        *_conclusions(tables, lines),
         *([f"## Scenes that are left out\n\n{left_out}"] if left_out else []),
-        *([f"## {listed.title}", listed] if listed.lines else []),
+        *flagged,
+        f"## The tables\n\n{PAGE['reading'].strip()}",
         *(part for table in tables for part in section(table, lines.get(table.name, ()))),
         *(part for plot in PAGE["plots"] for part in _plot(plot, tables, lines)),
         *(part for images in PAGE["images"] for part in _images(images, lines)),
@@ -54,24 +57,35 @@ def write_paper_page(
     return publish(parts, folder, runs)
 
 
+def _conclusions(tables: Sequence[PaperTable], lines: Lines) -> Iterator[Part]:
+    """All that the paper concludes from the tables beside what was measured here."""
+    found = [each for table in tables for each in comparisons(table, lines.get(table.name, ()))]
+    sampled = sum(each.here.half > 0 for each in found)
+    words = {"count": len(found), "tally": tally(found), "sampled": sampled}
+    chances = {"missed": f"{sampled / 20:.1f}", "all_hold": f"{100 * 0.95**sampled:.0f} %"}
+    if found:
+        yield f"## {PAGE['conclusions']}\n\n{PAGE['tally'].format(**words).strip()}"
+        yield from (claim_table(found), PAGE["verdicts"].format(**words, **chances).strip())
+
+
 def _plot(plot: Mapping[str, Any], tables: Sequence[PaperTable], lines: Lines) -> Iterator[Part]:
     """A plot with heading and caption, if any of its lines was measured."""
-    some: Sequence[Any]
+    some: Sequence[Any] = _chosen(plot.get("lines", {}), lines)
     if "metric" in plot:
-        listed = {line.label for table in tables for block in table.blocks for line in block.lines}
-        some = [
-            replace(line, label=label.format(line.label))
-            for table, label in plot["tables"].items()
-            for line in lines.get(table, ())
-            if line.runs and line.label in listed  # but not a point of a curve
-        ]
+        every = ((table.name, line) for table in tables for line in table.lines)
+        added = {x.label: (name, x.label) for name, x in every if x.job == {METHOD: x.label}}
+        some = [*some, *_chosen(added, lines)]
         drawn = figures.quality_plot(some, plot["metric"])
-    else:
-        if "lines" in plot:
-            some = _chosen(plot["lines"], lines, one_scene=plot.get("one_scene", False))
-        else:
-            some = [curve for table in tables for curve in _curves(table, lines)]
+    elif "lines" in plot:
+        some = _first_runs(some, one_scene=plot.get("one_scene", False))
         draw = partial(getattr(figures, plot["draw"]), some)
+        drawn = Picture(plot["file"], plot["title"], draw)
+    else:
+        some = [curve for table in tables for curve in _curves(table, lines)]
+        views = {line.runs[0].views for curve in some for line in curve.points.values()}
+        fields = _chosen({"": plot["ceiling"]}, lines)
+        ceiling = next((line for line in fields if line.runs[0].views in views), None)
+        draw = partial(figures.quality_over_training, some, ceiling)
         drawn = Picture(plot["file"], plot["title"], draw)
     if some:
         yield from (f"## {plot['title']}", drawn, plot["caption"].strip())
@@ -99,7 +113,7 @@ def _steps(run: Run) -> Any:
 
 
 def _images(images: Mapping[str, Any], lines: Lines) -> Iterator[Part]:
-    runs = _chosen(images["lines"], lines, one_scene=True)
+    runs = _first_runs(_chosen(images["lines"], lines), one_scene=True)
     runs = [run for run in runs if run.views == runs[0].views]
     if runs and (frames := kept_frames(runs)):
         title, stem = images["title"], f"frames-{images['title'].lower()}"
@@ -107,9 +121,18 @@ def _images(images: Mapping[str, Any], lines: Lines) -> Iterator[Part]:
         yield from frame_section(runs, frames[len(frames) // 2], stem)
 
 
-def _chosen(wanted: Mapping[str, Sequence[str]], lines: Lines, one_scene: bool) -> list[Run]:
-    """The first run, over all scenes or of the first one, of each measured line in `wanted`."""
-    known = {(table, line.label): line for table in lines for line in lines[table]}
-    found = ((label, known.get((table, line))) for label, (table, line) in wanted.items())
-    runs = ((label, line.measured if one_scene else line.runs) for label, line in found if line)
-    return [replace(of_line[0], label=label) for label, of_line in runs if of_line]
+def _chosen(wanted: Mapping[str, Sequence[str]], lines: Lines) -> list[Repeated]:
+    """The measured lines in `wanted`: by their label here, a table and the first line of it that
+    was measured."""
+    known = {(table, line.label): line for table in lines for line in lines[table] if line.runs}
+    found = (
+        (label, next((known[table, x] for x in labels if (table, x) in known), None))
+        for label, (table, *labels) in wanted.items()
+    )
+    return [replace(line, label=label) for label, line in found if line]
+
+
+def _first_runs(lines: Sequence[Repeated], one_scene: bool) -> list[Run]:
+    """The first run of each line: the mean over all scenes, or that of the first scene."""
+    runs = ((line.label, (line.measured if one_scene else line.runs)[0]) for line in lines)
+    return [replace(run, label=label) for label, run in runs]

@@ -1,4 +1,4 @@
-"""The paper's tables, as experiments declare them: measured figures beside the published."""
+"""The paper's tables, as experiments declare them: measured figures, distances beside its own."""
 
 from __future__ import annotations
 
@@ -10,18 +10,22 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from reports.claims import ABSENT, Claim, Comparison, apart, compare, gap, told
 from reports.comparison import COMMON, conditions_of, marked, metric_format, written
+from reports.outliers import REFERENCES
 from reports.runs import Repeated, missing_figures
 from reports.tables import NOT_AVAILABLE, Table
-from reports.trends import Trend, differences, signed, trend_table
 
 METHOD = "method"
-AFTER, SHARES = "method.after", (0.125, 0.25, 0.5)
+AFTER, SHARES = "method.after", (0.25, 0.5)
 """The setting for the share of the training after which a method is rendered, and the shares that
 curves show besides the end."""
 OF_CURVES = {"protocol.name": "psnr", "protocol.lpips": "[]"}
-"""Curves need only PSNR; at 200x200 LPIPS would take most of a frame's time."""
-ABSENT = "–"  # stands for a figure that the paper does not give or that cannot be measured here
+"""Curves need only PSNR; LPIPS would take most of a frame's time."""
+
+DATA_SETS: Any = OmegaConf.to_container(OmegaConf.load(REFERENCES))["data_sets"]  # type: ignore[index,call-overload]
+FIRST = next(iter(DATA_SETS))
+"""The paper's data sets by name; scenes that none of them names are compared with the first."""
 
 Lines = Mapping[str, Sequence[Repeated]]
 """The measured lines of each table, by table name."""
@@ -31,24 +35,28 @@ Lines = Mapping[str, Sequence[Repeated]]
 class Line:
     """A line of a table: `job` has its settings, beside those of all lines; the paper's figures.
 
-    Without a `method` it is one of the paper's method. Units are bytes, ms and dB, as in our rows.
+    Without a `method` it is one of the paper's method, which is measured with every seed; so are
+    others with `every_seed`. Units are bytes, ms and dB, as in our rows.
     """
 
     label: str
     job: Mapping[str, str]
     published: Mapping[str, float] = field(default_factory=dict)
+    every_seed: bool = False
 
 
 @dataclass(frozen=True)
 class PaperTable:
     """A table of the paper, measured by the experiment `name`; `metrics` are its columns.
 
-    `published_on` has scenes, size and machine of the paper's figures. `notes` are what a reader
-    should know before comparing, `trends` what the paper concludes. `beyond` is a method beyond the
-    paper, shown with the same lines as the paper's method and notes of its own. The metrics
-    `scenes` are also shown for every scene of a data set. Where a table compares times, the lines
-    of a block are measured `in_turns`, frame by frame. With `curve`, the lines of the paper's
-    method are also shown as curves over the training.
+    `published_on` has scenes, size and machine of the paper's figures; they are those of a
+    `data_set`, "" for scenes of which the paper has none. `notes` are what a reader should know
+    before comparing, `claims` what the paper concludes. Distances are those to the line
+    `reference`, by default the first. `beside` has the figures of further data sets, `beyond` is a
+    method beyond the paper, shown with the same lines as the paper's method and notes of its own.
+    The metrics `scenes` are also shown for every scene of a data set. Where a table compares times,
+    its lines are measured `in_turns`, frame by frame. With `curve`, the lines of the paper's method
+    are also shown as curves over the training.
     """
 
     name: str
@@ -57,12 +65,15 @@ class PaperTable:
     metrics: Sequence[str]
     lines: Sequence[Line]
     notes: Sequence[str] = ()
-    trends: Sequence[Trend] = ()
+    claims: Sequence[Claim] = ()
     beyond: str | None = None
     beyond_notes: Sequence[str] = ()
     scenes: Sequence[str] = ()
     in_turns: bool = False
     curve: bool = False
+    reference: str = ""
+    data_set: str = FIRST
+    beside: Sequence[PaperTable] = ()
 
     @property
     def number(self) -> str:
@@ -83,28 +94,26 @@ class PaperTable:
 
     @property
     def blocks(self) -> list[PaperTable]:
-        """The table, then the lines and trends of the paper's method for the one beyond it."""
+        """The table, those of further data sets, then the lines of the method beyond the paper."""
         if self.beyond is None:
-            return [self]
-        of_paper = [line for line in self.lines if METHOD not in line.job]
-        names = {line.label: f"{line.label} ({self.beyond})" for line in of_paper}
-        trends = [
-            Trend(trend.metric, [names.get(label, label) for label in trend.rising])
-            for trend in self.trends
+            return [self, *self.beside]
+        lines = [
+            Line(line.label, {**line.job, METHOD: self.beyond})
+            for line in self.lines
+            if METHOD not in line.job
         ]
-        second = replace(
-            self,
-            title=f"Beyond the paper: {self.beyond}",
-            lines=[Line(names[line.label], {**line.job, METHOD: self.beyond}) for line in of_paper],
-            notes=self.beyond_notes,
-            trends=trends,
-            beyond=None,
-            curve=False,
-        )
-        return [self, second]
+        last = self.block(f"Beyond the paper: {self.beyond}", lines, self.beyond)
+        return [self, *self.beside, replace(last, notes=self.beyond_notes, claims=())]
+
+    def block(self, title: str, lines: Sequence[Line], mark: str) -> PaperTable:
+        """A further block with this title and these `lines`, whose labels then have this mark."""
+        marked_lines = [replace(line, label=f"{line.label} ({mark})") for line in lines]
+        names = {line.label: new.label for line, new in zip(lines, marked_lines, strict=True)}
+        block = replace(self, title=title, lines=marked_lines, notes=(), curve=False, beyond=None)
+        return replace(block, reference=names.get(self.reference, ""), beside=())
 
     def shown(self, measured: Container[str]) -> list[PaperTable]:
-        """The table, and its other block if any of the lines `measured` (labels) is there."""
+        """The table, and those further blocks of which any line is in `measured` (labels)."""
         first, *further = self.blocks
         return [first, *(x for x in further if any(line.label in measured for line in x.lines))]
 
@@ -113,17 +122,22 @@ class PaperTable:
         return [known.get(line.label, Repeated(line.label, ())) for line in self.lines]
 
 
-def paper_tables(folder: Path) -> list[PaperTable]:
-    """The tables that the experiments in `folder` declare, in the paper's order."""
+def paper_tables(folder: Path, data_sets: Sequence[str] = (FIRST,)) -> list[PaperTable]:
+    """The tables that the experiments in `folder` declare, in the paper's order.
+
+    A table has the figures of those of `data_sets` for which the paper has any, the first of them
+    in front.
+    """
     paths = sorted(folder.glob("table*.yaml"), key=lambda path: (len(path.stem), path.stem))
-    return [_table(path) for path in paths]
+    return [_table(path, data_sets) for path in paths]
 
 
-def _table(path: Path) -> PaperTable:
+def _table(path: Path, data_sets: Sequence[str]) -> PaperTable:
     """What an experiment declares below `table`; what its lines leave out follows from its grid.
 
     Without jobs of their own, there is a line for each value of the grid. The method beyond the
     paper is the one that the grid has besides that of the experiment and those that lines name.
+    What it declares of the paper is that of each data set by name, or of the first.
     """
     experiment: Any = OmegaConf.to_container(OmegaConf.load(path))
     content = experiment["table"]
@@ -134,70 +148,113 @@ def _table(path: Path) -> PaperTable:
     jobs = [line["job"] for line in declared if "job" in line] or [
         {name: value} for name, values in grid.items() for value in values
     ]
+    published_on = _by_data_set(content.pop("published_on"))
+    data_set, *others = [name for name in data_sets if name in published_on] or [""]
     lines = []
     for line, job in zip(declared, jobs, strict=True):
-        paper = zip(content["metrics"], line.get("published", ()), strict="published" in line)
+        known = _by_data_set(line.get("published", ())).get(data_set, ())
+        paper = zip(content["metrics"], known, strict=len(known) > 0)
         figures = {metric: figure for metric, figure in paper if figure is not None}
-        lines.append(Line(line.get("label") or label.format(*job.values()), job, figures))
-    trends = [Trend(metric, labels) for metric, labels in content.pop("rising").items()]
+        if "fps" in figures:
+            figures["frame_ms"] = 1000 / figures["fps"]
+        name = line.get("label") or label.format(*job.values())
+        lines.append(Line(name, job, figures, line.get("every_seed", False)))
+    claims = [
+        Claim(x["metric"], x.get("alike") or x["rising"], x["margin"], "alike" in x)
+        for x in content.pop("claims")
+    ]
+    only = content.pop("beside", [line.label for line in lines])
     named = {job.get(METHOD) for job in jobs}
     beyond = next((method for method in further if method not in named), None)
-    return PaperTable(path.stem, lines=lines, trends=trends, beyond=beyond, **content)
+    where = published_on.get(data_set, "")
+    table = PaperTable(path.stem, published_on=where, lines=lines, claims=claims, **content)
+    halves = [(name, _table(path, [name])) for name in others]
+    beside = [half.block(x, [y for y in half.lines if y.label in only], x) for x, half in halves]
+    return replace(table, data_set=data_set, beyond=beyond, beside=beside)
+
+
+def _by_data_set(declared: Any) -> Mapping[str, Any]:
+    return declared if isinstance(declared, dict) else {FIRST: declared}
+
+
+def comparisons(table: PaperTable, lines: Sequence[Repeated]) -> list[Comparison]:
+    """What the paper concludes from a table, compared with what was measured here."""
+    measured = {line.label: line for line in lines}
+    found = []
+    for block in table.shown(measured):
+        mark = "" if block is table else f" ({block.title})"  # of its labels
+        where = table.number if block is table else f"{table.number}, {block.title}"
+        own = {line.label.removesuffix(mark): line for line in block.lines}
+        known = {label: measured[x.label] for label, x in own.items() if x.label in measured}
+        for claim in block.claims:
+            paper = ((label, line.published.get(claim.metric)) for label, line in own.items())
+            figures = {label: figure for label, figure in paper if figure is not None}
+            found += [replace(x, table=where) for x in compare(claim, known, figures)]
+    return found
 
 
 def section(table: PaperTable, lines: Sequence[Repeated]) -> list[str | Table]:
-    """A table as parts of a page: the paper's lines, those of a method beyond it, each scene."""
+    """A table as parts of a page: the paper's lines, those of other blocks, each scene."""
     measured = {line.label: line for line in lines}
     parts: list[str | Table] = []
     for block in table.shown(measured):
         first = block is table
         parts.append(f"## {table.number}: {table.title}" if first else f"### {block.title}")
-        parts += _block(block, measured, f"Paper: {table.published_on}." if first else "")
-    if table.scenes and len({scene for line in lines for scene in line.by_scene}) > 1:
-        parts += ["### Each scene", _scenes(table.scenes, lines)]
+        parts += _block(block, measured)
+    elsewhere = {line.label for block in table.beside for line in block.lines}
+    own = [line for line in lines if line.label not in elsewhere]
+    if table.scenes and len({scene for line in own for scene in line.by_scene}) > 1:
+        parts += ["### Each scene", _scenes(table.scenes, own)]
     return parts
 
 
-def _block(
-    table: PaperTable, measured: Mapping[str, Repeated], published: str
-) -> list[str | Table]:
-    """Conditions of the measured and the published figures, then the figures, trends, notes."""
-    figures = {line.label: line.published for line in table.lines}
+def _block(table: PaperTable, measured: Mapping[str, Repeated]) -> list[str | Table]:
+    """What was measured, under which conditions; distances, here and in the paper; notes."""
     runs = [run for line in table.measured(measured) for run in line.runs]
     machines = [run.record["machine"] for run in runs]
     on = dict.fromkeys(f"{each['cpu']} with {each['threads']} threads" for each in machines)
     facts = conditions_of(runs, (*COMMON, "method", "seed", "commit"))
     where = f"Measured: {facts}, on {' / '.join(on)}." if runs else ""
-    grown = [each for trend in table.trends for each in differences(trend, measured, figures)]
-    trends = trend_table(grown) if grown else ""
+    parts: list[str | Table] = [where, figure_table(table, measured)]
+    if any(line.published for line in table.lines):
+        parts += [f"Paper: {table.published_on}.", distance_table(table, measured)]
     notes = dict.fromkeys((*table.notes, *missing_figures(runs)))
-    listed = "\n".join(f"- {note}" for note in notes)
-    shown = with_published(table, measured)
-    return [part for part in (where, published, shown, trends, listed) if part]
+    return [part for part in (*parts, "\n".join(f"- {note}" for note in notes)) if part]
 
 
-def with_published(table: PaperTable, measured: Mapping[str, Repeated]) -> Table:
-    """A table of measured figures (lines by label), the paper's figures and their differences.
+def figure_table(table: PaperTable, measured: Mapping[str, Repeated]) -> Table:
+    """A table of measured figures (lines by label).
 
     Among measured figures under the same conditions, the best of a column is bold and, of at least
     three, the second best is italic.
     """
     lines = table.measured(measured)
-    beside = any(line.published for line in table.lines)
-    columns = []
-    for metric in table.metrics:
-        texts = [text or ABSENT for text in marked(lines, metric, ("**%s**", "*%s*"))]
-        if beside:
-            texts = [
-                _beside(text, found.mean(metric), line.published.get(metric), metric)
-                for text, found, line in zip(texts, lines, table.lines, strict=True)
-            ]
-        columns.append(texts)
+    columns = [
+        [text or ABSENT for text in marked(lines, metric, ("**%s**", "*%s*"))]
+        for metric in table.metrics
+    ]
     names = [": ".join((line.label, *line.gaps)) for line in lines]
-    labels = (metric_format(metric)[0] for metric in table.metrics)
-    heads = ("measured / paper / difference" if beside else "measured", *labels)
+    heads = ("measured", *(metric_format(metric)[0] for metric in table.metrics))
     cells = tuple(zip(names, *columns, strict=True))
     return Table(table.title, heads, cells, sources=tuple(line.keys for line in lines))
+
+
+def distance_table(table: PaperTable, measured: Mapping[str, Repeated]) -> Table:
+    """How far each line is from the table's reference, here and in the paper, by metric."""
+    known = {line.label: line for line in table.lines}
+    reference = known[table.reference or table.lines[0].label]
+    others = [line for line in table.lines if line is not reference]
+    metrics = [x for x in table.metrics if any(x in line.published for line in others)]
+
+    def cell(line: Line, metric: str) -> str:
+        here = gap(metric, measured.get(reference.label), measured.get(line.label))
+        figures = (each.published.get(metric, math.nan) for each in (reference, line))
+        texts = told(metric, here.by if here else math.nan), told(metric, apart(metric, *figures))
+        return " / ".join(texts) if {*texts} != {ABSENT} else ABSENT
+
+    heads = (metric_format(metric)[0].rstrip(" ↑↓") for metric in metrics)
+    cells = tuple((line.label, *(cell(line, metric) for metric in metrics)) for line in others)
+    return Table("Distances", (f"here / paper, from {reference.label}", *heads), cells)
 
 
 def _scenes(metrics: Sequence[str], lines: Sequence[Repeated]) -> Table:
@@ -214,14 +271,3 @@ def _scenes(metrics: Sequence[str], lines: Sequence[Repeated]) -> Table:
     )
     heads = ("measured", *(metric_format(metric)[0] for metric in metrics))
     return Table("Each scene", heads, cells, sources=tuple(of_scene.keys for _, of_scene in shown))
-
-
-def _beside(text: str, measured: float | None, published: float | None, metric: str) -> str:
-    """A cell: the measured figure (as `text`), the published one and their difference."""
-    if measured is None and published is None:
-        return ABSENT
-    _, write = metric_format(metric)
-    texts = [text, ABSENT if published is None else write(published)]
-    if measured is not None and published is not None and not math.isnan(measured):
-        texts.append(signed(measured - published, write))
-    return " / ".join(texts)

@@ -56,6 +56,15 @@ class Run:
         """Figures of the headline by metric."""
         return {str(metric): value for metric, value in self.headline["value"].items()}
 
+    def figure(self, metric: str) -> float | None:
+        """A figure of the headline; a stage includes its nested stages. None if there is none."""
+        figures = [
+            value
+            for name, value in self.values.items()
+            if name == metric or name.startswith(f"{metric}/")
+        ]
+        return math.fsum(figures) if figures else None
+
     def phases(self) -> list[Run]:
         """The run once per phase, with only the figures of that phase."""
         whole = self.rows[self.rows["phase"] == WHOLE]
@@ -164,15 +173,8 @@ class Repeated:
         return half_interval(np.array(self._figures(metric)))
 
     def _figures(self, metric: str) -> list[float]:
-        of_runs = (
-            [
-                value
-                for name, value in run.values.items()
-                if name == metric or name.startswith(f"{metric}/")
-            ]
-            for run in self.runs
-        )
-        return [math.fsum(figures) for figures in of_runs if figures]
+        figures = (run.figure(metric) for run in self.runs)
+        return [figure for figure in figures if figure is not None]
 
 
 def readable(store: Store, keys: Collection[str] | None = None) -> list[Run]:

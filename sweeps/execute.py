@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import as_completed
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -35,7 +35,7 @@ from bench.study import study_of
 from reports.runs import load
 from reports.tables import decimal
 from sweeps.configured import build, trained
-from sweeps.measurement import Job, obtain, reason
+from sweeps.measurement import Job, JobFailed, obtain, reason
 from sweeps.overrides import CONFIGS, composed, explain, setting, target_of
 from sweeps.processes import device_lock, on_gpu, processes, set_up
 from sweeps.terminal import time_left
@@ -160,32 +160,43 @@ def read(folder: Path) -> list[Ended]:
     return sorted((Ended(**json.loads(text)) for text in texts), key=lambda job: job.number)
 
 
-def attempt(jobs: Sequence[Job], first: int, total: int) -> None:
-    """Obtain the runs of `jobs`, in a job of Hydra's; print and record how each ended.
+def attempt(numbered: Sequence[tuple[int, Job]], total: int, folder: Path) -> list[Exception]:
+    """Obtain the runs of jobs that are measured together; print, and record in `folder`, how each
+    ended.
 
-    `first` is the number of the first one in the sweep, `total` how many jobs that has; 0: not
-    known. A failure is printed, kept for reports, and raised.
+    Each job has its number in the sweep; `total` is how many jobs that has; 0: not known. A job
+    that fails is left out, and the others are measured without it. Returns the errors; they are
+    printed, and kept for reports.
     """
-    folder, begun = Path(HydraConfig.get().runtime.output_dir), time.time()
-    records = [
-        Ended(number, job.name, str(job.config.outputs), job.config.report, begun)
-        for number, job in enumerate(jobs, first)
-    ]
-    try:
-        runs, measured = obtain(jobs)
-    except Exception as error:
-        why = reason(error)
-        for job, ended in zip(jobs, records, strict=True):
-            print(f"steerbench: failed: {job.name}: {error}", file=sys.stderr)
-            with _printed():
-                job.keep_failure(why)
-            with _printed():
-                replace(ended, failure=why).write(folder)
-        raise
-    for ended, run in zip(records, runs, strict=True):
-        replace(ended, run=run, measured=measured).write(folder)
-    for job, run in zip(jobs, runs, strict=True):
-        say(job, run, _progress(folder, total))
+    begun, errors = time.time(), []
+
+    def end(number: int, job: Job, **how: Any) -> None:
+        outputs = str(job.config.outputs)
+        Ended(number, job.name, outputs, job.config.report, begun, **how).write(folder)
+
+    left = list(numbered)
+    while left:
+        try:
+            runs, measured = obtain([job for _, job in left])
+        except Exception as error:
+            alone = error.job if isinstance(error, JobFailed) else None
+            cause = error.__cause__ if alone and isinstance(error.__cause__, Exception) else error
+            errors.append(cause)
+            for number, job in left:
+                if alone is None or job is alone:
+                    print(f"steerbench: failed: {job.name}: {cause}", file=sys.stderr)
+                    with _printed():
+                        job.keep_failure(reason(cause))
+                    with _printed():
+                        end(number, job, failure=reason(cause))
+            left = [each for each in left if alone and each[1] is not alone]
+            continue
+        for (number, job), run in zip(left, runs, strict=True):
+            end(number, job, run=run, measured=measured)
+        for (_, job), run in zip(left, runs, strict=True):
+            say(job, run, _progress(folder, total))
+        break
+    return errors
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, explained
 from bench.provenance import computed_by
 from bench.results import Store, content_key
-from bench.run import Task, measure
+from bench.run import MethodFailed, Task, measure
 from bench.sharing import whole
 from bench.types import Log, Method
 from reports.runs import load
@@ -35,14 +35,15 @@ def described(config: DictConfig) -> dict[str, Any]:
     """The settings that determine a run; equal for equal jobs.
 
     Left out are: locations, except the last part of a scene's folder, which rows show; `split`,
-    which is in the trajectory; the engine, if the method uses none; and what only the tables read.
+    which is in the trajectory; the engine, if the method uses none; what only the tables read; and
+    whether a sweep is measured in turns, which is in `Job.turns`.
     """
     try:
         plain: Any = OmegaConf.to_container(config, resolve=True)
     except OmegaConfBaseException as error:  # a setting that others use was removed
         raise SteerbenchError(" ".join(str(error).split())) from error
     unused = () if "engine" in plain["method"] else ("engine", "precision")
-    left_out = ("split", "tables", *PLACES, *unused)
+    left_out = ("split", "tables", "in_turns", *PLACES, *unused)
     kept = {key: value for key, value in plain.items() if key not in left_out}
     kept["scene"] = {name: value for name, value in plain["scene"].items() if name != "root"}
     if "path" in kept["scene"]:
@@ -109,11 +110,20 @@ class Job:
                 new.write_text(f"{why}\n", encoding="utf-8")
 
 
+class JobFailed(SteerbenchError):
+    """One of several jobs failed, `job`; its error is the cause."""
+
+    def __init__(self, job: Job) -> None:
+        super().__init__(f"failed: {job.name}")
+        self.job = job
+
+
 def obtain(jobs: Sequence[Job]) -> tuple[list[str], bool]:
     """The keys of the runs of `jobs`, whose `turns` are equal, and whether they are measured now.
 
     They are measured unless the store has all of them: figures that are compared come from the same
-    hour. Earlier failures are forgotten. The runs are sent to their tracker.
+    hour. Earlier failures are forgotten. The runs are sent to their tracker. Raises JobFailed if
+    one of several jobs fails, for whatever reason: the others can then be obtained without it.
     """
     log = ConsoleLog(jobs[0].outputs)
     ready, measured = _ready(jobs, log), False
@@ -155,7 +165,14 @@ def _ready(jobs: Sequence[Job], log: Log) -> list[_Ready]:
     With `turns`, each key includes the keys of all of them: if one job changes, all are measured
     again.
     """
-    ready = [_prepared(job, log) for job in jobs]
+    ready = []
+    for job in jobs:
+        try:
+            ready.append(_prepared(job, log))
+        except Exception as error:
+            if len(jobs) == 1:
+                raise
+            raise JobFailed(job) from error
     if not jobs[0].turns:
         return ready
     beside = sorted(content_key(each.parts) for each in ready)
@@ -208,7 +225,11 @@ def _told(ready: Sequence[_Ready], measured: bool, log: Log) -> list[str]:
 
 def _measure(ready: Sequence[_Ready], log: Log) -> None:
     """Measure all, and put them in the place of what an interruption has left of them."""
-    measurements = measure([each.method for each in ready], ready[0].task, log)
+    try:
+        measurements = measure([each.method for each in ready], ready[0].task, log)
+    except MethodFailed as failed:
+        (job,) = (each.job for each in ready if each.method is failed.method)
+        raise JobFailed(job) from failed.__cause__
     for each in ready if len(ready) > 1 else ():
         each.job.store.remove(each.run)
     for each, measurement in zip(ready, measurements, strict=True):

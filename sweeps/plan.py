@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -15,8 +14,7 @@ from bench.errors import SteerbenchError, unexpected, unknown
 from bench.scenes.blender import camera_file, picture_path
 from bench.scenes.files import data_folder, frames_of, read_json
 from bench.scenes.nsvf import picture_files
-from reports.outliers import REFERENCES
-from reports.paper_tables import METHOD, Line, PaperTable, paper_tables
+from reports.paper_tables import DATA_SETS, FIRST, METHOD, Line, PaperTable, paper_tables
 from sweeps.configured import build
 from sweeps.measurement import Job
 from sweeps.overrides import CONFIGS, changed, choices, composed, setting, swept, target_of
@@ -54,9 +52,12 @@ class Planned(Job):
     scene: str = ""
 
 
-def chosen(name: str | None, methods: Sequence[str]) -> list[PaperTable]:
-    """The table called `name`, or all; `methods` get extra lines in the table of methods."""
-    tables = {table.name: table for table in paper_tables(TABLES)}
+def chosen(
+    name: str | None, methods: Sequence[str], data_sets: Sequence[str] = (FIRST,)
+) -> list[PaperTable]:
+    """The table called `name`, or all, with the paper's figures on `data_sets`; `methods` get extra
+    lines in the table of methods."""
+    tables = {table.name: table for table in paper_tables(TABLES, data_sets)}
     if name is not None and name not in tables:
         raise unknown("table", name, tables)
     wanted = [tables[name]] if name else list(tables.values())
@@ -78,74 +79,109 @@ def repeats(seeds: int, beyond: bool) -> tuple[int, bool]:
 
 
 def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -> list[Planned]:
-    """The jobs of `table` under the settings in `words`, for each line, seed and scene of `data`.
+    """The jobs of `table` under the settings in `words`, for each line, seed and scene.
 
-    Seeds are those in `words`, otherwise the first `tables.seeds`; curves and methods other than
-    the paper's use only one of them. Settings that a line lacks are those of the experiment. Lines
-    at a precision that the engine lacks are left out. On a GPU the engine is torch, unless `words`
-    choose another. SteerbenchError if a word gives several values to another setting than the seed.
+    Scenes are those of `data` or in `words`; each goes to the blocks with figures of its data set.
+    Seeds are those in `words`, otherwise the first `tables.seeds`; methods other than the paper's
+    use only one of them, but for lines with `every_seed`. Settings that a line lacks are those of
+    the experiment. Lines at a precision that the engine lacks are left out. On a GPU the engine is
+    torch, unless `words` choose another. SteerbenchError if a word gives several values to another
+    setting than scene and seed.
     """
-    words, seeds = _seeds(words)
+    scenes = scenes_of(words, data)
+    words, seeds = _taken(words, "seed")
+    single = data is None and len(scenes) == 1
+    words = words if single else _taken(words, "scene")[0]
     fixed = [f"+experiment={table.name}", *words, *([f"scene={data.layout}"] if data else [])]
-    experiment = composed(fixed)
+    first = [] if single or data else [f"scene={scenes[0]}"]
+    experiment = composed([*fixed, *first])
     if on_gpu(str(experiment.get("device"))):
         fixed.insert(1, "engine=torch")  # Table 1 uses OpenVINO, which computes on a CPU
-        experiment = composed(fixed)
+        experiment = composed([*fixed, *first])
     build(experiment, "budget")  # refuses a wrong one before anything runs
     several, beyond = build(experiment, "tables")
     usual = [str(seed) for seed in range(several)]
     precisions = target_of(experiment.engine).precisions
-    scenes = {name: str(folder) for name, folder in data.scenes.items()} if data else {"": ""}
 
     @cache  # values are set afterwards without composing again
     def with_choices(*groups: str) -> DictConfig:
         return composed([*fixed, *groups])
 
     jobs = []
-    for block, line, repeated in _lines(table, beyond):
+    for title, block, line, repeated in _lines(table, beyond):
         if "precision" in line.job and line.job["precision"] not in precisions:
             continue
         settings = [f"{name}={value}" for name, value in line.job.items()]
         groups = [word for word in settings if choices(word.partition("=")[0], fixed)]
         values = [word for word in settings if word not in groups]
         of_line = seeds or (usual if repeated else usual[:1])
-        for seed, (scene, folder) in product(of_line, scenes.items()):
-            word = f"seed={seed}"
-            config = changed(with_choices(*groups), [*values, word])
-            place = []
+        of_block = [name for name in scenes if block.data_set in (data_set_of(name), "")]
+        for seed, name in product(of_line, of_block):
+            scene = "" if single else name
+            place = [] if single or data else [f"scene={name}"]
+            config = changed(with_choices(*groups, *place), [*values, f"seed={seed}"])
             if data:
+                folder = str(data.scenes[name])
                 config.scene.path = folder
                 place = [setting("scene.path", folder)]
             OmegaConf.resolve(config)  # once, or each build would resolve `${...}` again
-            command = ["steerbench", "run", *fixed, *settings, *place, word, "hydra.mode=RUN"]
+            own = [*settings, *place, f"seed={seed}"]
+            command = ["steerbench", "run", *fixed, *own, "hydra.mode=RUN"]
             parts = (f"{table.name}: {line.label}", scene, f"seed {config.seed}")
-            name = ", ".join(filter(None, parts))
-            turns = f"{table.name}, {block}, {seed}, {scene}" if table.in_turns else ""
-            where = {"table": table.name, "block": block, "line": line.label, "scene": scene}
-            jobs.append(Planned(config, command, name, turns, **where))
+            told = ", ".join(filter(None, parts))
+            turns = f"{table.name}, {seed}, {scene}" if block.in_turns else ""
+            where = {"table": table.name, "block": title, "line": line.label, "scene": scene}
+            jobs.append(Planned(config, command, told, turns, **where))
     return jobs
 
 
-def _lines(table: PaperTable, beyond: bool) -> Iterator[tuple[str, Line, bool]]:
-    """The lines of a table's blocks and curves, each with its block's title and whether it repeats.
+def _lines(table: PaperTable, beyond: bool) -> Iterator[tuple[str, PaperTable, Line, bool]]:
+    """The lines of a table's blocks and curves, each with its block and whether it repeats.
 
     Only lines of the paper's method are repeated with several seeds, because the paper's
-    conclusions are about it. A table that varies the training omits the method beyond the paper
-    unless `beyond`.
+    conclusions are about it, and those that it is trained from. A table that varies the training
+    omits the method beyond the paper unless `beyond`.
     """
-    for block in table.blocks if beyond or not table.curve else [table]:
-        yield from ((block.title, line, METHOD not in line.job) for line in block.lines)
-    yield from (("curves", line, False) for line in table.marks.values())
+    for block in table.blocks if beyond or not table.curve else [table, *table.beside]:
+        for line in block.lines:
+            yield block.title, block, line, line.every_seed or METHOD not in line.job
+    curves = replace(table, in_turns=False)  # they are not timed
+    yield from (("curves", curves, line, True) for line in table.marks.values())
 
 
-def _seeds(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The words that all jobs share, and the seeds given by the other words."""
+def scenes_of(words: Sequence[str], data: DataSet | None = None) -> list[str]:
+    """The names of the scenes in `data` or in `words`; of a folder, its last part."""
+    if data:
+        return list(data.scenes)
+    folders = [
+        word.partition("=")[2] for word in words if word.lstrip("+").startswith("scene.path=")
+    ]
+    return [Path(folders[-1]).name] if folders else _taken(words, "scene")[1] or [""]
+
+
+def data_set_of(scene: str) -> str:
+    """The data set of the paper whose figures a scene is compared with."""
+    wanted = (name for name, of in DATA_SETS.items() if scene in (*of["scenes"], *of["stand_ins"]))
+    return next(wanted, FIRST)
+
+
+def data_sets(scenes: Sequence[str]) -> list[str]:
+    """The data sets of `scenes`, in the paper's order."""
+    there = {data_set_of(scene) for scene in scenes}
+    return [name for name in DATA_SETS if name in there]
+
+
+def _taken(words: Sequence[str], name: str) -> tuple[list[str], list[str]]:
+    """The words without those that set `name`, and the values that they give it.
+
+    SteerbenchError if one gives several values to another setting than scene and seed.
+    """
     several = swept(words)
-    if others := sorted(several.keys() - {"seed"}):
-        got = f"{', '.join(several[others[0]])}; only seed may take several here"
+    if others := sorted(several.keys() - {"scene", "seed"}):
+        got = f"{', '.join(several[others[0]])}; only scene and seed may take several here"
         raise unexpected(others[0], "one value", got)
-    named = [word for word in words if word.lstrip("+").partition("=")[0] == "seed"]
-    values = several.get("seed") or [word.partition("=")[2] for word in named[-1:]]
+    named = [word for word in words if word.lstrip("+").partition("=")[0] == name]
+    values = several.get(name) or [word.partition("=")[2] for word in named[-1:]]
     return [word for word in words if word not in named], list(dict.fromkeys(values))
 
 
@@ -160,9 +196,8 @@ def find(path: str) -> DataSet:
         for name, folder in folders.items()
         if (folder / mark).is_file()
     }
-    known: Any = OmegaConf.load(REFERENCES)
-    data_sets = [set(known["psnr"]), set(known["tanks_and_temples"])]
-    wanted = next((names for names in data_sets if names & folders.keys()), set())
+    known = [set(of["scenes"]) for of in DATA_SETS.values()]
+    wanted: set[str] = next((names for names in known if names & folders.keys()), set())
     no_cameras = f"no {' or '.join(MARKS.values())}"
     why = {name: no_cameras if name in folders else "no folder" for name in wanted - layouts.keys()}
     why |= {name: _lack(folders[name], layout) for name, layout in layouts.items()}

@@ -14,6 +14,7 @@ from itertools import chain, groupby
 from pathlib import Path
 from typing import NamedTuple
 
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from bench.errors import SteerbenchError, Unavailable
@@ -26,8 +27,11 @@ from sweeps.configured import scene_digest, scene_folder
 from sweeps.execute import Launcher, attempt, divided, room, say, train_ahead
 from sweeps.measurement import job_key, stored
 from sweeps.overrides import composed
-from sweeps.plan import DataSet, Planned, chosen, find, plan
+from sweeps.plan import DataSet, Planned, chosen, data_sets, find, plan, scenes_of
 from sweeps.terminal import console, show
+
+Group = list[tuple[int, Planned]]
+"""Jobs that are measured together, each with its number among all."""
 
 DATA = "data="  # prefix of the word that names the folder of a data set
 
@@ -45,7 +49,7 @@ def main(options: argparse.Namespace) -> int:
     missing = data.missing if data else {}
     for name, why in missing.items():
         print(f"missing: {name}: {why}", file=sys.stderr)
-    tables = chosen(options.table, options.methods)
+    tables = chosen(options.table, options.methods, data_sets(scenes_of(words, data)))
     jobs = [job for table in tables for job in plan(table, words, data)]
     outputs = Path(jobs[0].config.outputs)
     failed = 0
@@ -93,22 +97,20 @@ def _run(jobs: Sequence[Planned], launcher: Launcher) -> int:
         groups, measured = _groups(some, look_up=ahead)
         if ahead:
             train_ahead(some, measured)
-        total = sum(len(group) for _, group in groups)
+        total = sum(map(len, groups))
         failed += sum(launcher.run(partial(_attempted, total=total), groups))
     return failed
 
 
-def _groups(
-    jobs: Sequence[Planned], look_up: bool
-) -> tuple[list[tuple[int, list[Planned]]], set[str]]:
-    """The jobs that are measured in turns, together, after the number of the first of them.
+def _groups(jobs: Sequence[Planned], look_up: bool) -> tuple[list[Group], set[str]]:
+    """The jobs that are measured in turns, together.
 
     With `look_up`, without those that the store has; and the keys of these.
     """
     by_turns: dict[str, list[Planned]] = {}
     for job in jobs:
         by_turns.setdefault(job.turns or job.key, []).append(job)
-    groups: list[tuple[int, list[Planned]]] = []
+    groups: list[Group] = []
     measured: set[str] = set()
     for together in by_turns.values():
         runs: list[str] = []
@@ -119,22 +121,16 @@ def _groups(
             for job, run in zip(together, runs, strict=True):
                 say(job, run)
         else:
-            groups.append((sum(len(group) for _, group in groups), together))
+            groups.append(list(enumerate(together, sum(map(len, groups)))))
     return groups, measured
 
 
-def _attempted(group: tuple[int, Sequence[Planned]], total: int) -> int:
+def _attempted(group: Group, total: int) -> int:
     """Attempt jobs that are measured together; return how many failed that can run here."""
-    first, jobs = group
-    for number, job in enumerate(jobs, first + 1):
-        print(f"{number} of {total}, {job.name}", file=sys.stderr)
-    try:
-        attempt(jobs, first, total)
-    except Unavailable:
-        return 0
-    except Exception:  # already printed; the other jobs still run
-        return len(jobs)
-    return 0
+    for number, job in group:
+        print(f"{number + 1} of {total}, {job.name}", file=sys.stderr)
+    errors = attempt(group, total, Path(HydraConfig.get().runtime.output_dir))
+    return sum(not isinstance(error, Unavailable) for error in errors)
 
 
 def _check(store: Store) -> int:

@@ -17,20 +17,24 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from bench.errors import unexpected
 from sweeps.overrides import CONFIGS, explain, of_hydra, settled, swept
 
 if TYPE_CHECKING:
     from sweeps.execute import Ended
+    from sweeps.measurement import Job
 
 
 class SweepCallback(Callback):
     """Records that a sweep starts; run.yaml lists it among Hydra's callbacks.
 
     Hydra creates the object and never hands it out, so the record is kept on the class: the
-    `folder` where jobs record how they ended; None without a sweep.
+    `folder` where jobs record how they ended; None without a sweep. `waiting` are the jobs of a
+    sweep that is measured in turns, with their numbers.
     """
 
     folder: ClassVar[Path | None] = None
+    waiting: ClassVar[list[tuple[int, Job]]] = []
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Record the folder of the sweep, before its launcher is made."""
@@ -51,7 +55,7 @@ def main(argv: Sequence[str]) -> int:
     sys.argv = [sys.argv[0], *flags, *(word for word in argv if word not in flags)]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its errors instead of printing them
     _hide_subcommand_from_completion()
-    SweepCallback.folder = None
+    SweepCallback.folder, SweepCallback.waiting = None, []
     errors: list[Exception] = []
 
     def job(config: DictConfig) -> None:
@@ -72,6 +76,7 @@ def main(argv: Sequence[str]) -> int:
     except Exception as error:
         errors.append(explain(error, argv) if of_hydra(error) else error)
     if SweepCallback.folder is not None:
+        errors += _in_turns(SweepCallback.waiting, SweepCallback.folder)
         _finish(SweepCallback.folder)
     if errors:
         raise errors[0]
@@ -108,7 +113,28 @@ def _one_of_many(config: DictConfig, command: Sequence[str]) -> None:
     sizes = _sizes(Path(present.runtime.output_dir) / "multirun.yaml")
     name = label(present.runtime.choices["method"], present.overrides.task, sizes or ())
     total = 0 if sizes is None else prod(sizes.values())
-    attempt([Job(config, command, name)], present.job.num, total)
+    number, folder = present.job.num, Path(present.runtime.output_dir)
+    if config.in_turns:
+        launcher = present.runtime.choices["hydra/launcher"]
+        if launcher != "basic":
+            expected = "false with a launcher, because one process renders all frames"
+            raise unexpected("in_turns", expected, f"true with hydra/launcher={launcher}")
+        SweepCallback.waiting.append((number, Job(config, command, name, turns="sweep")))
+    elif errors := attempt([(number, Job(config, command, name))], total, folder):
+        raise errors[0]
+
+
+def _in_turns(waiting: Sequence[tuple[int, Job]], folder: Path) -> list[Exception]:
+    """Measure the jobs of a sweep: those that differ only in their method together, in turns."""
+    from bench.results import content_key
+    from sweeps.execute import attempt
+
+    groups: dict[str, list[tuple[int, Job]]] = {}
+    for number, job in waiting:
+        of_method = ("method", "engine", "precision")
+        shared = {name: of for name, of in job.settings.items() if name not in of_method}
+        groups.setdefault(content_key(shared), []).append((number, job))
+    return [error for group in groups.values() for error in attempt(group, len(waiting), folder)]
 
 
 def _sizes(file: Path) -> dict[str, int] | None:

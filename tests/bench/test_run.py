@@ -15,7 +15,7 @@ from bench.intervals import path_interval
 from bench.metrics import psnr, quantise
 from bench.protocol import EvaluationProtocol
 from bench.results import COLUMNS
-from bench.run import Task, measure
+from bench.run import MethodFailed, Task, measure
 from bench.trajectories import from_split
 from bench.types import Budget, SteerbenchError, composite
 
@@ -299,3 +299,22 @@ def test_methods_in_turns_draw_frames_as_if_alone(run, offset_method, tiny_scene
     for method, measured in zip((offset_method, other), both, strict=True):
         assert measured.frames["psnr"].tolist() == run(method).frames["psnr"].tolist()
     assert value(both[0].rows, "psnr") > value(both[1].rows, "psnr")
+
+
+@pytest.mark.parametrize("where", ["fit", "render"])
+def test_of_several_methods_the_one_that_failed_is_named(
+    where, run, offset_method, tiny_scene, quiet_log, monkeypatch
+):
+    other, error = type(offset_method)("cpu", 16 / 255), RuntimeError("no")
+
+    def failing(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(other, where, failing)
+    task = Task(tiny_scene, from_split(tiny_scene), QUICK, BUDGET, seed=5)
+    with pytest.raises(MethodFailed) as caught:
+        measure([offset_method, other], task, quiet_log)
+    assert caught.value.method is other
+    assert caught.value.__cause__ is error
+    with pytest.raises(RuntimeError, match="no"):
+        run(other)

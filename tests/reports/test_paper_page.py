@@ -12,8 +12,9 @@ from reports import figures
 from reports.images import Picture
 from reports.outliers import Outlier
 from reports.paper_page import PAGE, _curves, write_paper_page
+from reports.paper_tables import Line
 from reports.runs import Repeated, Run
-from tests.reports.conftest import TABLES
+from tests.reports.conftest import TABLES, changed, shifted
 
 
 def of(run: Run, label: str) -> Repeated:
@@ -25,9 +26,10 @@ def test_every_line_that_is_shown_in_a_figure_is_one_of_the_tables():
     blocks = [block for table in TABLES.values() for block in table.blocks]
     lines = {(block.name, line.label) for block in blocks for line in block.lines}
     shown = [entry["lines"] for entry in (*PAGE["plots"], *PAGE["images"]) if "lines" in entry]
-    assert shown
-    assert {tuple(line) for entry in shown for line in entry.values()} <= lines
-    assert all(set(plot.get("tables", ())) <= {name for name, _ in lines} for plot in PAGE["plots"])
+    shown += [{"": plot["ceiling"]} for plot in PAGE["plots"] if "ceiling" in plot]
+    named = [(table, label) for x in shown for table, *labels in x.values() for label in labels]
+    assert len(named) > len(shown) > 4
+    assert {*named} <= lines
 
 
 def test_the_page_has_every_table_and_every_figure(run, tmp_path):
@@ -51,25 +53,50 @@ def test_the_page_has_every_table_and_every_figure(run, tmp_path):
     assert html.count('<div class="frame"') == 2
 
 
-def test_points_of_a_curve_are_not_plotted_against_cost(run, tmp_path, monkeypatch):
-    table = TABLES["table6"]
-    lines = [of(run, line.label) for line in (*table.lines, *table.marks.values())]
-    drawn: list[str] = []
+def test_a_method_has_one_mark_at_its_first_measured_line_and_an_added_one_too(
+    run, tmp_path, monkeypatch
+):
+    table = replace(TABLES["table1"], lines=[*TABLES["table1"].lines, Line("x", {"method": "x"})])
+    labels = [line.label for line in table.lines if line.label != "SteerNeRF, bf16 for FP16"]
+    drawn: list[list[str]] = []
     real = figures.quality_plot
 
     def watched(shown: Sequence[Repeated], metric: str) -> Picture:
-        drawn.extend(line.label for line in shown)
+        drawn.append([line.label for line in shown])
         return real(shown, metric)
 
     monkeypatch.setattr(figures, "quality_plot", watched)
-    write_paper_page([table], {"table6": lines}, [], tmp_path)
-    assert drawn == [f"SteerNeRF, {line.label}" for line in table.lines]
+    write_paper_page([table], {"table1": [of(run, label) for label in labels]}, [], tmp_path)
+    methods = ["NeRF", "NSVF", "KiloNeRF", "PlenOctree", "DIVeR", "Instant-NGP", "3D Gaussians"]
+    assert drawn == 2 * [[*methods, "SteerNeRF", "x"]]
+
+
+def test_conclusions_come_first_and_say_how_many_intervals_may_miss(run, tmp_path):
+    table, seeds = TABLES["table6"], range(3)
+    lines = [
+        Repeated(
+            line.label,
+            [shifted(run, 0.1 * place + 0.01 * seed * place, seed=seed) for seed in seeds],
+        )
+        for place, line in enumerate(reversed(table.lines))
+    ]
+    text = write_paper_page([table], {"table6": lines}, [], tmp_path).read_text()
+    before, after = text.split("## The tables")
+    assert "| Table 6, PSNR, dB: T = 2^14 < T = 2^16 | +0.33 | +0.11 |" in before
+    assert "| Table 6, PSNR, dB: T = 2^16 ≈ T = 2^19 | +0.02 | +0.11 |" in before
+    assert "4 comparisons: " in before
+    assert "2 of the 4 comparisons have an interval" in before  # sizes are computed
+    assert "about 0.1\nof them" in before.replace("  ", " ") or "about 0.1" in before
+    assert "90 %" in before  # 0.95 ** 2
+    assert "verdict" not in after
 
 
 def test_a_page_of_nothing_still_says_what_is_missing(tmp_path):
     lines = {"table5": [Repeated("with joint training", [], ["not measured yet"])]}
     text = write_paper_page([*TABLES.values()], lines, [], tmp_path).read_text()
-    assert "| with joint training: not measured yet | – / 33.05 |" in text
+    assert "| with joint training: not measured yet | – |" in text
+    assert "| without joint training | – / -1.07 |" in text
+    assert "comparisons" not in text
     assert "![" not in text
     assert "Outliers" not in text
 
@@ -106,9 +133,35 @@ def test_a_curve_has_a_point_for_every_measured_share(of_method, of_budget, run,
         (first.label, [20, 40, 80]),
         (second.label, [40, 80]),
     ]
-    figures.quality_over_training(curves, tmp_path / "curves.png")
+    ceiling = Repeated("field", [changed(run, {"psnr": 99.0})])
+    figures.quality_over_training(curves, ceiling, tmp_path / "curves.png")
     (axes,) = drawn[0].axes
+    *lines, field, release = axes.lines
+    assert set(field.get_ydata()) == {99.0}
+    assert set(release.get_xdata()) == {300_000}
+    assert axes.get_xlim()[1] > 300_000
     assert axes.get_title() == "Table 5"
-    for line, curve in zip(axes.lines, curves, strict=True):
+    for line, curve in zip(lines, curves, strict=True):
         assert list(line.get_xdata()) == list(curve.points)
         assert set(line.get_ydata()) == {run.values["psnr"]}
+
+
+def test_several_seeds_have_bars_on_a_curve_and_one_has_none(run, tmp_path, drawn):
+    seeds = [shifted(run, by, seed=seed) for seed, by in enumerate((0.0, 1.0, 2.0))]
+    points = {10.0: Repeated("a", seeds), 20.0: Repeated("b", [run])}
+    curve = figures.Curve("Table 9", "L = 2", points)
+    figures.quality_over_training([curve], None, tmp_path / "curves.png")
+    (axes,) = drawn[0].axes
+    low, high = axes.collections[0].get_segments()[0][:, 1]
+    assert high - low == pytest.approx(2 * points[10.0].half("psnr"))
+
+
+def test_every_mark_has_its_name_beside_it_and_none_covers_another(run, tmp_path, drawn):
+    """Even of marks that nearly coincide."""
+    psnr = {"PlenOctree": 31.0, "DIVeR": 31.05, "3D Gaussians": 31.1, "Instant-NGP": 33.0}
+    lines = [of(changed(run, {"psnr": value}), label) for label, value in psnr.items()]
+    figures.quality_against(lines, "frame_ms", tmp_path / "marks.png")
+    (axes,) = drawn[0].axes
+    assert [text.get_text() for text in axes.texts] == list(psnr)
+    boxes = [text.get_window_extent() for text in axes.texts]
+    assert not any(box.count_overlaps(boxes[:number]) for number, box in enumerate(boxes))

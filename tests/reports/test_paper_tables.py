@@ -1,4 +1,4 @@
-"""The paper's tables: what their files hold, and cells of measured beside published figures."""
+"""The paper's tables: what their files hold, measured figures, and distances beside published."""
 
 from __future__ import annotations
 
@@ -8,14 +8,26 @@ import pandas as pd
 import pytest
 from omegaconf import OmegaConf
 
-from reports.paper_tables import ABSENT, Line, PaperTable, section, with_published
+from reports.claims import ABSENT, Claim
+from reports.paper_tables import (
+    DATA_SETS,
+    FIRST,
+    Line,
+    PaperTable,
+    comparisons,
+    distance_table,
+    figure_table,
+    paper_tables,
+    section,
+)
 from reports.publish import markdown
 from reports.runs import Repeated, Run
 from reports.tables import QUALITY
-from reports.trends import Trend
 from sweeps.overrides import CONFIGS
 from tests.reports.conftest import TABLES, changed
 
+_, SECOND = DATA_SETS
+BOTH = {table.name: table for table in paper_tables(CONFIGS / "experiment", [FIRST, SECOND])}
 METRICS = {*QUALITY, "fps", "frame_ms", "size_bytes.total", "work.samples"}
 TABLE = PaperTable(
     "table9",
@@ -42,28 +54,62 @@ def test_the_experiments_declare_the_six_tables_of_the_paper():
     for table in TABLES.values():
         labels = [line.label for line in table.lines]
         assert len(set(labels)) == len(labels)
+        assert {table.reference} <= {"", *labels}
         for line in table.lines:
-            assert set(line.published) <= set(table.metrics), line.label
-        for trend in table.trends:
-            assert set(trend.rising) <= set(labels), trend.rising
+            assert set(line.published) <= {*table.metrics, "frame_ms"}, line.label
+        for claim in table.claims:
+            assert set(claim.lines) <= set(labels), claim
         for metric in table.metrics:
             assert metric in METRICS or metric.startswith("stage_ms."), metric
+    assert len(TABLES["table1"].notes) <= 5
+
+
+def test_milliseconds_follow_from_published_frames_per_second():
+    fast = next(line for line in TABLES["table1"].lines if line.label == "PlenOctree")
+    assert fast.published["frame_ms"] == pytest.approx(1000 / 167.7)
 
 
 @pytest.mark.parametrize("name", [name for name, table in TABLES.items() if table.beyond])
-def test_the_block_beyond_the_paper_has_its_lines_and_trends_but_no_published_figure(name):
+def test_the_block_beyond_the_paper_has_its_lines_but_no_published_figure_nor_claim(name):
     first, second = TABLES[name].blocks
     own = [line for line in first.lines if "method" not in line.job]
     assert [line.job for line in second.lines] == [
         {**line.job, "method": "steernerf_lean"} for line in own
     ]
+    assert not second.claims
     assert not any(line.published for line in second.lines)
     labels = {line.label for line in (*first.lines, *second.lines)}
     assert len(labels) == len(first.lines) + len(second.lines)
-    assert len(second.trends) == len(first.trends)
-    for one, other in zip(first.trends, second.trends, strict=True):
-        assert set(other.rising) <= labels
-        assert one.rising != other.rising
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_second_data_set_has_its_figures_in_a_block_if_the_paper_has_any(name):
+    (alone,) = (x for x in paper_tables(CONFIGS / "experiment", [SECOND]) if x.name == name)
+    first, both = TABLES[name], BOTH[name]
+    assert both.lines == first.lines
+    assert [block.data_set for block in both.beside] == [SECOND] * (name in ("table1", "table2"))
+    assert alone.data_set == (SECOND if both.beside else "")
+    assert [line.label for line in alone.lines] == [line.label for line in first.lines]
+    assert [line.job for line in alone.lines] == [line.job for line in first.lines]
+    for block in both.beside:
+        figures = {f"{line.label} ({SECOND})": line.published for line in alone.lines}
+        assert all(line.published == figures[line.label] for line in block.lines)
+        assert block.published_on == alone.published_on != first.published_on
+    if not both.beside:
+        assert not any(line.published for line in alone.lines)
+
+
+def test_both_halves_make_claims_each_with_its_own_figures(run):
+    """The paper gives PSNR, and FPS, of both lines on both data sets."""
+    lines = ["SteerNeRF, bf16 for FP16", "Instant-NGP"]
+    marks = ("", f" ({SECOND})")
+    measured = [Repeated(f"{line}{mark}", [run]) for mark in marks for line in lines]
+    found = [x for x in comparisons(BOTH["table1"], measured) if x.claim.metric == "psnr"]
+    assert [(x.table, x.smaller, x.larger) for x in found] == [
+        ("Table 1", *lines),
+        (f"Table 1, {SECOND}", *lines),
+    ]
+    assert [x.paper for x in found] == pytest.approx([32.79 - 31.60, 28.77 - 28.65])
 
 
 @pytest.mark.parametrize("name", TABLES)
@@ -75,72 +121,83 @@ def test_the_lines_of_a_table_take_every_value_of_its_grid_and_no_other(name):
         assert {usual, *(job[setting] for job in jobs if setting in job)} == {usual, *others}
 
 
-def test_a_section_shows_both_blocks_each_with_its_trends(run, tmp_path):
+def test_a_section_shows_both_blocks_and_distances_of_the_first(run, tmp_path):
     table = TABLES["table5"]
     lines = [Repeated(line.label, [run]) for block in table.blocks for line in block.lines]
     text = markdown(section(table, lines), tmp_path)
     paper, beyond = text.split("### Beyond the paper: steernerf_lean")
-    assert "PSNR, dB: without joint training < with joint training |" in paper
     assert "(steernerf_lean)" not in paper
-    shown = "without joint training (steernerf_lean) < with joint training (steernerf_lean)"
-    assert f"PSNR, dB: {shown} |" in beyond
-    assert "| measured |" in beyond
-    assert "/ 33.05" in paper
-    assert "33.05" not in beyond.partition("- ")[0]
+    assert "| with joint training (steernerf_lean) |" in beyond
+    assert paper.count("| measured |") == beyond.count("| measured |") == 1
+    assert "| here / paper, from with joint training | PSNR, dB | SSIM | LPIPS vgg |" in paper
+    assert "| without joint training | +0.00 / -1.07 |" in paper
+    assert "here / paper" not in beyond
 
 
-def test_a_cell_is_measured_published_and_their_difference(run):
-    shown = with_published(TABLE, {"here": Repeated("here", [run])})
-    assert shown.columns == (
-        "measured / paper / difference",
-        *("PSNR, dB ↑", "ms / frame ↓", "model, MB ↓", "other, ms ↓"),
-    )
-    assert shown.lines[0] == (
-        "here",
-        "30.46 / 31.00 / -0.54",
-        "12.0 / 10.0 / +2.0",
-        ABSENT,
-        f"8.00 / {ABSENT}",
-    )
-    assert shown.lines[1] == ("elsewhere", ABSENT, ABSENT, f"{ABSENT} / 5.00", ABSENT)
+def test_a_cell_has_the_distance_to_the_reference_here_and_in_the_paper(run):
+    other = changed(run, {"psnr": 29.0, "frame_ms": 6.0})
+    measured = {
+        label: Repeated(label, [changed(each, {}, seed=seed) for seed in (0, 1)])
+        for label, each in (("here", run), ("elsewhere", other))
+    }
+    published = {"psnr": 30.0, "frame_ms": 1.2 * 9.98, "size_bytes.total": 5e6}
+    lines = [TABLE.lines[0], replace(TABLE.lines[1], published=published)]
+    table = replace(TABLE, reference="here", lines=lines)
+    (line,) = distance_table(table, measured).lines
+    assert line == ("elsewhere", "-1.46 / -1.00", "×0.50 / ×1.20", ABSENT)
+    (line,) = distance_table(table, {}).lines
+    assert line == ("elsewhere", f"{ABSENT} / -1.00", f"{ABSENT} / ×1.20", ABSENT)
+    heads = ("here / paper, from here", "PSNR, dB", "ms / frame", "model, MB")
+    assert distance_table(table, {}).columns == heads
+
+
+def test_a_cell_of_figures_is_measured_or_absent(run):
+    shown = figure_table(TABLE, {"here": Repeated("here", [run], ["seed 1 failed"])})
+    labels = ("PSNR, dB ↑", "ms / frame ↓", "model, MB ↓", "other, ms ↓")
+    assert shown.columns == ("measured", *labels)
+    assert shown.lines[0] == ("here: seed 1 failed", "30.46", "12.0", ABSENT, "8.00")
+    assert shown.lines[1] == ("elsewhere", *[ABSENT] * 4)
 
 
 def test_a_stage_holds_the_stages_inside_it(run):
     inside = run.rows[run.rows["metric"] == "stage_ms.other"]
     inside = inside.assign(metric="stage_ms.other/march", value=3.0)
     whole = replace(run, rows=pd.concat([run.rows, inside]))
-    shown = with_published(TABLE, {"here": Repeated("here", [whole])})
-    assert shown.lines[0][4] == f"11.00 / {ABSENT}"
+    shown = figure_table(TABLE, {"here": Repeated("here", [whole])})
+    assert shown.lines[0][4] == "11.00"
 
 
 def test_several_seeds_give_their_mean_and_its_interval(run):
-    shown = with_published(
+    shown = figure_table(
         TABLE, {"here": Repeated("here", [changed(run, {"psnr": x}) for x in (29.0, 31.0)])}
     )
     # Half of a t-interval of two values that are 2 apart: t(0.975, 1) * sqrt(2) / sqrt(2).
-    assert shown.lines[0][1] == "30.00 ± 12.71 / 31.00 / -1.00"
-    assert shown.lines[0][2] == "12.0 / 10.0 / +2.0"
+    assert shown.lines[0][1] == "30.00 ± 12.71"
+    assert shown.lines[0][2] == "12.0"
 
 
 def test_the_best_is_bold_and_the_second_of_three_italic(run):
     table = replace(TABLE, lines=[Line(name, {"method": name}) for name in "abc"])
     psnr = {"a": 1.0, "b": 3.0, "c": 2.0}
     of = {name: Repeated(name, [changed(run, {"psnr": value})]) for name, value in psnr.items()}
-    cells = [line[1] for line in with_published(table, of).lines]
+    cells = [line[1] for line in figure_table(table, of).lines]
     assert cells == ["1.00", "**3.00**", "*2.00*"]
-    two = with_published(table, {name: of[name] for name in "ab"})
+    two = figure_table(table, {name: of[name] for name in "ab"})
     assert [line[1] for line in two.lines] == ["1.00", "**3.00**", ABSENT]
 
 
-def test_a_section_says_on_what_and_what_to_mind_and_whether_trends_hold(run, tmp_path):
-    trend = Trend("psnr", ["elsewhere", "here"])
+def test_a_section_says_on_what_and_what_to_mind(run, tmp_path):
+    claim = Claim("psnr", ["elsewhere", "here"], 0.1)
     lines = [Repeated("here", [changed(run, {"psnr": 31.0})]), Repeated("elsewhere", [run])]
-    published = [TABLE.lines[0], replace(TABLE.lines[1], published={"psnr": 30.4})]
-    parts = section(replace(TABLE, lines=published, trends=[trend]), lines)
-    text = markdown(parts, tmp_path)
+    table = replace(TABLE, claims=[claim])
+    text = markdown(section(table, lines), tmp_path)
     assert text.startswith("## Table 9: What is shown")
     assert "Paper: Chair." in text
     assert f"scene {run.facts['scene']}" in text
-    assert "| PSNR, dB: elsewhere < here | +0.60 | " in text
     assert "- Mind this." in text
     assert "- lpips_alex: n/a. no weights were found" in text
+    # Of the line elsewhere the paper does not give this metric.
+    assert comparisons(table, lines) == []
+    published = [TABLE.lines[0], replace(TABLE.lines[1], published={"psnr": 30.4})]
+    (found,) = comparisons(replace(table, lines=published), lines)
+    assert found.paper == pytest.approx(0.6)

@@ -13,7 +13,6 @@ from bench.run import phase_rows
 from reports.paper_tables import Line, PaperTable, section
 from reports.publish import markdown
 from reports.runs import Repeated, Run, over_common_frames, over_scenes
-from reports.trends import SEEN, Trend, differences
 from tests.reports.conftest import elsewhere, run_of, shifted
 
 PSNR = [20.0, 26.0, 29.0, 30.0, 31.0, 30.0]
@@ -102,15 +101,6 @@ def test_other_scenes_and_other_machines_are_other_conditions(run):
     assert over_scenes([a, b]).conditions == over_scenes([a, b]).conditions
     assert over_scenes([a, b]).conditions != over_scenes([a, c]).conditions
     assert over_scenes([a, elsewhere(b)]).computer != run.computer
-
-
-def test_one_seed_is_compared_over_the_frames_of_all_scenes(run):
-    one = over_scenes([of_scene(run, "a"), of_scene(run, "b")])
-    other = over_scenes([of_scene(run, "a", 1.0), of_scene(run, "b", 2.0)])
-    lines = {"one": Repeated("one", [one]), "two": Repeated("two", [other])}
-    (found,) = differences(Trend("psnr", ["one", "two"]), lines, {})
-    assert (found.over, found.verdict) == ("12 frames of one seed", SEEN)
-    assert found.by == pytest.approx(1.5)
 
 
 @pytest.mark.parametrize("scenes", ["ab", "a"])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from functools import cache
-from types import SimpleNamespace
 
 import pytest
 
@@ -43,16 +42,15 @@ def test_a_label_has_method_and_what_varies_by_whole_names_where_ends_are_alike(
 
 
 def test_a_failure_that_cannot_be_kept_is_printed_all_the_same(tmp_path, monkeypatch, capsys):
-    def obtain(jobs: list[Job]) -> None:
-        raise SteerbenchError("the cause")
+    cause = SteerbenchError("the cause")
 
-    runtime = SimpleNamespace(output_dir=str(tmp_path / "sweep"))
-    monkeypatch.setattr(execute.HydraConfig, "get", lambda: SimpleNamespace(runtime=runtime))
+    def obtain(jobs: list[Job]) -> None:
+        raise cause
+
     monkeypatch.setattr(execute, "obtain", obtain)
     (tmp_path / "outputs").touch()  # no folder can be made there
     job = Job(composed([f"outputs={tmp_path / 'outputs'}"]), [], "a job")
-    with pytest.raises(SteerbenchError, match="the cause"):
-        execute.attempt([job], 0, 1)
+    assert execute.attempt([(0, job)], 1, tmp_path / "sweep") == [cause]
     printed = capsys.readouterr().err
     assert "failed: a job: the cause" in printed
     assert "cannot write to" in printed
@@ -90,6 +88,24 @@ def test_what_an_interruption_left_of_a_group_is_measured_again_with_the_rest(el
     assert measured(0.5, 0.75)
     assert not mark.exists()
     assert stored(in_turns(0.5, 0.75)) == [first, second]
+
+
+@pytest.mark.parametrize("broken", ["method.level=7", "device=cuda:99"])
+def test_a_job_that_fails_is_left_out_and_the_others_are_measured_in_turns(
+    broken, elsewhere, tmp_path, capsys
+):
+    """Whether its training fails, or it cannot be used here at all."""
+    first, last = in_turns(0.5, 0.75)
+    jobs = [first, Job(composed([*STAND_INS, broken]), [], "broken", turns="table"), last]
+    for _ in range(2):
+        (error,) = execute.attempt(list(enumerate(jobs)), 3, tmp_path)
+        assert isinstance(error, SteerbenchError)
+        assert jobs[1].failure == str(error)
+    ended = read(tmp_path)
+    assert [job.failure for job in ended] == [None, str(error), None]
+    assert [job.measured for job in ended] == [False] * 3  # the second time
+    assert [job.run for job in ended if job.run] == stored([first, last])
+    assert capsys.readouterr().err.count("failed: broken") == 2
 
 
 def test_a_line_alone_is_another_run_than_the_same_in_turns(elsewhere):

@@ -20,7 +20,7 @@ from reports.runs import Run, load
 from sweeps import configured, execute
 from sweeps.commands import paper
 from sweeps.commands.paper import gather, newest
-from sweeps.measurement import Job, described
+from sweeps.measurement import Job, JobFailed, described
 from sweeps.plan import DataSet, Planned, chosen, plan
 from tests.reports.conftest import rewrite
 from tests.sweeps.conftest import CONFIGS, HERE
@@ -48,20 +48,22 @@ def measured(
     asked: list[DictConfig] = []
 
     def obtain(jobs: list[Job]) -> tuple[list[str], bool]:
-        (config,) = [job.config for job in jobs]
-        asked.append(config)
-        if config.method.model.frames == 3:
-            raise SteerbenchError("no room\nfor L = 3")
-        return [put(store, stored_run, config)], True
+        for job in jobs:
+            if job.config.method.model.frames == 3:
+                asked.append(job.config)
+                error = SteerbenchError("no room\nfor L = 3")
+                raise error if len(jobs) == 1 else JobFailed(job) from error
+        asked.extend(job.config for job in jobs)
+        return [put(store, stored_run, job) for job in jobs], True
 
     monkeypatch.setattr(execute, "obtain", obtain)
     monkeypatch.chdir(tmp_path)
     return asked
 
 
-def put(store: Store, source: str, config: DictConfig, key: str = "") -> str:
-    """A copy of the run `source` as that of `config`."""
-    parts = {"config": described(config)}
+def put(store: Store, source: str, job: Job, key: str = "") -> str:
+    """A copy of the run `source` as that of `job`."""
+    parts = {"config": described(job.config), "turns": job.turns}
     key = key or store.key(parts)
     if store.find(key) is None:
         folder = shutil.copytree(store.folder / source, store.folder / key)
@@ -73,20 +75,21 @@ def put(store: Store, source: str, config: DictConfig, key: str = "") -> str:
 
 
 def labels(page: Path) -> list[str]:
-    """The lines of Table 3 on a page."""
-    lines = [line for line in page.read_text().splitlines() if line.startswith("| L = ")]
+    """The lines of the measured figures of Table 3 on a page."""
+    table = page.read_text().partition("| measured |")[2].partition("\n\n")[0]
+    lines = [line for line in table.splitlines() if line.startswith("| L = ")]
     return [line.split("|")[1].strip() for line in lines]
 
 
 def test_a_job_that_fails_stands_in_its_line_and_the_others_run(steerbench, measured, outputs):
     outcome = steerbench("paper", "--table", "table3", "seed=0", outputs)
     assert outcome.status == 1
-    assert len(measured) == 4 * (1 + 3)  # lines; thrice each for their curves
+    assert len(measured) == 4 * (1 + 2)  # lines; twice each for their curves
     assert "failed: table3: L = 3, seed 0: no room" in outcome.err
     assert "about 0:00:0" in outcome.err
     page = Path(re.search(r"report: (.*)", outcome.err)[1])
     assert labels(page) == ["L = 0", "L = 1", "L = 2", "L = 3: failed: no room for L = 3"]
-    assert "/ 33.14 /" in page.read_text()
+    assert "/ +0.20 |" in page.read_text()  # from L = 0 to 2
 
 
 def test_the_jobs_go_where_hydras_launcher_puts_them(steerbench, measured, launched, outputs):
@@ -107,7 +110,7 @@ def test_what_cannot_run_here_says_so_and_does_not_fail(steerbench, monkeypatch,
 
 def test_a_report_has_what_is_there_alone(steerbench, measured, outputs, store, stored_run):
     jobs = plan(TABLE3, [outputs, "seed=0"])
-    put(store, stored_run, jobs[1].config)
+    put(store, stored_run, jobs[1])
     jobs[2].keep_failure("killed")
     outcome = steerbench("report", "--table", "table3", "seed=0", outputs)
     assert (outcome.status, measured) == (0, [])
@@ -120,7 +123,7 @@ def test_a_report_has_what_is_there_alone(steerbench, measured, outputs, store, 
 
 
 def test_a_check_names_the_broken_rows_of_the_store(steerbench, outputs, store, stored_run):
-    key = put(store, stored_run, plan(TABLE3, [outputs, "seed=0"])[0].config)
+    key = put(store, stored_run, plan(TABLE3, [outputs, "seed=0"])[0])
     rows = store.folder / key / "rows.csv"
     table = pd.read_csv(rows)
     named = table["metric"].str.startswith("stage_ms.") & (table["metric"] != "stage_ms.other")
@@ -135,7 +138,7 @@ def test_a_check_names_the_broken_rows_of_the_store(steerbench, outputs, store, 
 
 
 def test_frames_of_runs_that_are_not_on_a_page_are_not_read(steerbench, outputs, store, stored_run):
-    key = put(store, stored_run, plan(TABLE3, [outputs, "seed=0"])[0].config)
+    key = put(store, stored_run, plan(TABLE3, [outputs, "seed=0"])[0])
     for run in (stored_run, key):
         (store.folder / run / "frames.csv").unlink()
     checked = steerbench("report", "--check", outputs)
@@ -165,7 +168,7 @@ def scenes(store: Store, stored_run: str, tmp_path: Path) -> Store:
     for number, name in enumerate("ab"):
         path = tmp_path / name / "mic"
         path.mkdir(parents=True)
-        key = put(store, stored_run, job(path).config, f"{number}{stored_run[1:]}")
+        key = put(store, stored_run, job(path), f"{number}{stored_run[1:]}")
         rewrite(store, key, scene={"digest": name}, scene_path=str(path))
         os.utime(store.folder / key, (number, number))
     return store
@@ -304,14 +307,16 @@ def test_the_page_of_a_data_set_has_means_scenes_and_gaps(steerbench, tmp_path, 
         for level in (128, 64)
     )
     mean = f"{sum(grey) / 2:.2f}"
-    assert f"| a grey | **{mean}** / 1.00 / " in page
-    assert f"| a dark one | {sum(dark) / 2:.2f} / – |" in page
+    assert f"| a grey | **{mean}** |" in page
+    assert f"| a dark one | {sum(dark) / 2:.2f} |" in page
+    by = sum(one - other for one, other in zip(grey, dark, strict=True)) / 2
+    assert f"| a dark one | -{by:.2f} / -0.50 |" in page
     assert "### Each scene" in page
     for place, scene in enumerate(values):
         assert f"| {scene}: a grey | {grey[place]:.2f} |" in page
         assert f"| {scene}: a dark one | {dark[place]:.2f} |" in page
-    assert "| PSNR, dB: a dark one < a grey |" in page
-    assert "2 seeds" in page
+    assert f"| Table 9, PSNR, dB: a dark one < a grey | +0.50 | +{by:.2f} |" in page
+    assert "2 scenes × 2 seeds" in page
     again = steerbench("report", *words)
-    assert f"| a grey | **{mean}** / 1.00 / " in (tmp_path / "outputs/paper/report.md").read_text()
+    assert f"| a grey | **{mean}** |" in (tmp_path / "outputs/paper/report.md").read_text()
     assert again.status == 0

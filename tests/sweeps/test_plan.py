@@ -13,11 +13,12 @@ import torch
 from PIL import Image
 
 from bench.errors import SteerbenchError
+from reports.paper_tables import DATA_SETS
 from sweeps.commands.breakdown import with_engine
 from sweeps.commands.paper import data_set
 from sweeps.measurement import described
 from sweeps.overrides import composed, setting
-from sweeps.plan import Planned, chosen, find, plan
+from sweeps.plan import Planned, chosen, data_sets, find, plan, scenes_of
 
 CURVED = {table.name: table for table in chosen(None, [])}
 TABLES = {name: replace(table, curve=False) for name, table in CURVED.items()}
@@ -46,7 +47,7 @@ def test_a_curve_has_the_lines_of_the_papers_method_at_several_shares_of_one_tra
     lines, jobs = (plan(one, ["budget=demo"]) for one in (TABLES["table5"], table))
     marks = [job for job in jobs if "after" in job.line]
     assert [job.key for job in jobs if job not in marks] == [job.key for job in lines]
-    assert len(marks) == 2 * 3  # lines, shares; of the first seed
+    assert len(marks) == 2 * 2 * 3  # lines, shares, seeds
     for job in marks:
         label, _, share = job.line.partition(", after ")
         where = (label, job.config.seed)
@@ -78,16 +79,32 @@ def test_only_the_papers_method_is_repeated_unless_seeds_are_asked_for(words, se
     assert found == {"steernerf": 2 * expected, "steernerf_lean": 2 * of_ours}
 
 
-def test_only_the_table_of_times_is_measured_in_turns():
-    """The lines of a method with one seed together."""
-    for name in TABLES:
-        jobs = with_one_seed(name)
-        turns = {job.turns for job in jobs}
-        assert (turns == {""}) == (name != "table2")
-        for turn in turns - {""}:
-            together = [job for job in jobs if job.turns == turn]
-            assert len(together) == 2
-            assert len({(job.config.method.name, job.config.seed) for job in together}) == 1
+def test_the_field_that_the_papers_method_is_trained_from_is_rendered_with_every_seed():
+    seeds: dict[str, set[int]] = {}
+    for job in plan(TABLES["table1"], ["tables.seeds=2"]):
+        seeds.setdefault(job.line, set()).add(job.config.seed)
+    own = {line for line, of in seeds.items() if of == {0, 1}}
+    assert "Instant-NGP" in own
+    assert all(line.startswith("SteerNeRF") for line in own - {"Instant-NGP"})
+    assert seeds["DIVeR"] == {0}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_the_lines_of_a_table_of_times_are_measured_in_turns(name):
+    """All of them, also those beyond the paper; but for the points of curves."""
+    jobs = with_one_seed(name)
+    timed = {"fps", "frame_ms"} & {*TABLES[name].metrics}
+    assert {job.turns == "" for job in jobs} == {not timed}
+    assert len({job.turns for job in jobs}) == 1
+    marks = [job for job in plan(CURVED[name], ["seed=0"]) if job.block == "curves"]
+    assert {job.turns for job in marks} <= {""}
+
+
+def test_turns_are_of_one_seed_and_one_scene():
+    jobs = plan(TABLES["table2"], ["seed=0,1", "scene=totem,wires"])
+    of = {job.turns: (job.config.seed, job.scene) for job in jobs}
+    assert len(of) == 4
+    assert all(of[job.turns] == (job.config.seed, job.scene) for job in jobs)
 
 
 def test_settings_hold_for_every_job():
@@ -119,12 +136,18 @@ def test_the_lines_of_table_3_differ_in_l_alone():
 
 
 def test_tables_share_the_run_that_they_have_in_common():
-    """But for the table of times: a time in turns is another figure than one alone."""
-    lines = [("table3", 2), ("table4", 1), ("table5", 0), ("table2", 0)]
-    *jobs, timed = (with_one_seed(name)[place] for name, place in lines)
-    assert len({job.key for job in jobs}) == 1
-    assert described(timed.config) == described(jobs[0].config)
-    assert timed.key != jobs[0].key
+    """But for the tables of times: a time in turns is another figure than one alone."""
+    jobs = [
+        next(x for x in plan(TABLES[name], ["budget=paper", "seed=0"]) if x.line == line)
+        for name, line in (("table4", "K = 6"), ("table6", "T = 2^16"), ("table3", "L = 2"))
+    ]
+    assert jobs[0].key == jobs[1].key != jobs[2].key
+    assert described(jobs[2].config) == described(jobs[0].config)
+
+
+def test_both_stages_of_table_5_march_with_the_same_step():
+    for job in with_one_seed("table5"):
+        assert job.config.method.training.march_step == job.config.method.model.step
 
 
 @pytest.mark.parametrize(
@@ -133,7 +156,6 @@ def test_tables_share_the_run_that_they_have_in_common():
         ("ngp", "table1", "Instant-NGP"),
         ("steernerf", "table4", "K = 6"),
         ("steernerf_lean", "table4", "K = 6 (steernerf_lean)"),
-        ("steernerf_lean_frozen", "table5", "without joint training (steernerf_lean)"),
         ("steernerf_lean_k3", "table4", "K = 3 (steernerf_lean)"),
     ],
 )
@@ -152,7 +174,7 @@ def test_what_only_the_tables_read_changes_no_key(word):
     ("override", "said"),
     [
         ("budgt=tiny", "budgt"),
-        ("scene=totem,wires", "totem, wires"),
+        ("budget=tiny,demo", "tiny, demo"),
         ("a=b=,", "a=b=,"),
         ("tables.seeds=0", "tables: seeds: expected 1 or more"),
         ("budget.threads=0", "threads: expected 1 or more"),
@@ -174,7 +196,43 @@ def test_the_engine_of_the_first_table_is_one_for_the_device(gpu, engine, asked,
     assert composed(words).engine._target_.split(".")[-1] in targets
 
 
-# Data sets
+# Scenes and data sets
+
+
+def test_a_scene_is_compared_with_the_figures_of_its_data_set(monkeypatch):
+    """An embedded scene with those of the first, unless it stands in for another."""
+    monkeypatch.setitem(DATA_SETS["Tanks & Temples"], "stand_ins", ["wires"])
+    words = ["scene=wires,totem", "scene.downscale=2", "budget=tiny", "seed=0"]
+    scenes = scenes_of(words)
+    assert data_sets(scenes) == ["NeRF-Synthetic", "Tanks & Temples"]
+    tables = {table.name: table for table in chosen(None, [], data_sets(scenes))}
+    of_block: dict[str, set[tuple[str, str]]] = {}
+    for job in plan(tables["table1"], words):
+        assert job.config.scene.name == job.scene
+        assert job.config.scene.downscale == 2
+        of_block.setdefault(job.block, set()).add((job.scene, job.line))
+        again = composed([text for text in job.command[2:] if text != "hydra.mode=RUN"])
+        assert described(again) == described(job.config)
+    first, second, beyond = of_block.values()
+    assert {scene for scene, _ in (*first, *beyond)} == {"totem"}
+    assert {scene for scene, _ in second} == {"wires"}
+    assert {line for _, line in second} == {line.label for line in tables["table1"].beside[0].lines}
+    assert len(second) == 3
+    assert {job.scene for job in plan(replace(tables["table5"], curve=False), words)} == {"totem"}
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ([], [""]),
+        (["scene=totem"], ["totem"]),
+        (["scene=totem,wires", "seed=1"], ["totem", "wires"]),
+        (["scene=nsvf", "scene.path=/data/Barn"], ["Barn"]),
+    ],
+)
+def test_a_scene_is_known_by_its_choice_or_its_folder(words, found):
+    assert scenes_of(words) == found
+    assert data_sets(["Barn"]) == data_sets(["Truck", "Barn"]) == ["Tanks & Temples"]
 
 
 def blender(folder: Path, value: int = 255, pictures: bool = True) -> Path:

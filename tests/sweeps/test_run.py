@@ -145,6 +145,27 @@ def test_a_sweep_says_how_far_it_is_and_ends_with_one_table_and_one_page(run, tm
     assert len(list((tmp_path / "page/pictures").iterdir())) == 3 + 2  # the plots, two frames
 
 
+def test_a_sweep_in_turns_measures_together_what_differs_in_the_method_alone(run, tmp_path):
+    outcome = run("-m", "method.level=0.5,0.25,7", "seed=0,1", "in_turns=true")
+    assert outcome.status == 2
+    assert outcome.err.count("failed: grey (level=7") == 2
+    made_of = [json.loads((x / "record.json").read_text())["made_of"] for x in stored(tmp_path)]
+    assert len(made_of) == 4
+    for seed in (0, 1):
+        beside = {tuple(x["beside"]) for x in made_of if x["config"]["seed"] == seed}
+        assert [len(keys) for keys in beside] == [2]
+    assert run("-m", "method.level=0.5,0.25", "seed=0,1").status == 0
+    assert len(stored(tmp_path)) == 4 + 4  # alone they are other runs
+
+
+def test_no_launcher_renders_in_turns(run, tmp_path):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    outcome = run("-m", "seed=0,1", "in_turns=true", "hydra/launcher=joblib")
+    assert outcome.status == 2
+    assert "in_turns: expected false with a launcher" in outcome.err
+    assert stored(tmp_path) == []
+
+
 def test_a_folder_named_after_what_is_swept_gets_a_page_of_its_own(run, tmp_path):
     run("-m", "scene.frames=2,3", "seed=0,1", "report=pages/${scene.frames}")
     for frames in (2, 3):

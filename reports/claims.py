@@ -1,0 +1,213 @@
+"""What the paper concludes, claim by claim: how large a difference is there, and how large here."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from bench.intervals import half_interval, path_interval
+from reports.comparison import metric_format
+from reports.regression import Figures, frames_apart
+from reports.runs import Repeated, Run
+from reports.tables import Table, decimal
+
+AS, LARGER, SMALLER = "as in the paper", "larger than in the paper", "smaller than in the paper"
+AT_MOST = "smaller than in the paper, if there is one"
+AGREES = "same direction"
+"""Of a difference whose size the paper does not give."""
+OPPOSITE, OPEN = "opposite", "cannot be told"
+BY_ONE = ", by one seed"
+"""Ends a verdict from the frames of one training, which another training may reverse."""
+
+TIMES = ("frame_ms", "fps", "stage_ms")
+RATIOS = (*TIMES, "work", "size_bytes")
+"""Metrics, by name up to the first dot, whose figures are compared by their ratio: a difference
+would depend on machine and scene. `TIMES` can be compared on one machine only."""
+
+ABSENT = "–"  # stands for a figure that the paper does not give or that cannot be measured here
+
+
+@dataclass(frozen=True)
+class Claim:
+    """`metric` grows from each of the `lines` (labels) to the next or, if `alike`, hardly changes.
+
+    Differences that are apart by no more than `margin` count as equal: in the unit of the metric,
+    or as a factor where figures are compared by their ratio.
+    """
+
+    metric: str
+    lines: Sequence[str]
+    margin: float
+    alike: bool = False
+
+
+@dataclass(frozen=True)
+class Gap:
+    """How far one line is above another in a metric, the mean `by` over what `over` says.
+
+    Of metrics that are compared by their ratio, its logarithm. `half` is half the 95 % interval,
+    nan if unknown; `proves` says whether it accounts for differences between trainings.
+    """
+
+    by: float
+    half: float
+    over: str
+    proves: bool
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A claim about two lines: their gap in the `paper`, nan if it gives none, and `here`."""
+
+    claim: Claim
+    smaller: str
+    larger: str
+    paper: float
+    here: Gap
+    table: str = ""  # where the claim is made
+
+    @property
+    def verdict(self) -> str:
+        """Whether the gap is here as it is in the paper; it tells the sign and the size apart."""
+        if (word := self._verdict) == OPEN or self.here.proves:
+            return word
+        return word + BY_ONE
+
+    @property
+    def _verdict(self) -> str:
+        low, high = self.here.by - self.here.half, self.here.by + self.here.half
+        margin = math.log(self.claim.margin) if _by_ratio(self.claim.metric) else self.claim.margin
+        if self.claim.alike:
+            if -margin <= low and high <= margin:
+                return AS
+            return LARGER if low > margin else OPPOSITE if high < -margin else OPEN
+        if high < 0:
+            return OPPOSITE
+        if low > 0 and math.isnan(self.paper):
+            return AGREES
+        if low > self.paper + margin:
+            return LARGER
+        if high < self.paper - margin:
+            return SMALLER if low > 0 else AT_MOST
+        return AS if low > 0 else OPEN
+
+
+def compare(
+    claim: Claim, lines: Mapping[str, Repeated], published: Mapping[str, float]
+) -> Iterator[Comparison]:
+    """A claim between all of its neighbours that were measured; `published` is the paper's metric.
+
+    Where the paper has the opposite order, on another data set, the claim is turned round. Where it
+    gives the metric, but not of both lines, it claims nothing about them.
+    """
+    for smaller, larger in pairwise(claim.lines):
+        paper = apart(claim.metric, *(published.get(x, math.nan) for x in (smaller, larger)))
+        if published and math.isnan(paper):
+            continue
+        if paper < 0:
+            smaller, larger, paper = larger, smaller, -paper
+        here = gap(claim.metric, lines.get(smaller), lines.get(larger))
+        if here is not None:
+            yield Comparison(claim, smaller, larger, paper, here)
+
+
+def apart(metric: str, one: float, other: float) -> float:
+    """How far `other` is above `one`, as in `Gap`; nan if either is not known or has no ratio."""
+    if not _by_ratio(metric):
+        return 0.0 if one == other else other - one  # of equal pictures, both are infinite
+    return math.log(other / one) if one > 0 and other > 0 else math.nan
+
+
+def gap(metric: str, one: Repeated | None, other: Repeated | None) -> Gap | None:
+    """How far `other` is above `one` here: the mean over pairs; None if there are no pairs.
+
+    A pair has the same scene and the same seed. If there is only one, the frames are compared.
+    """
+    pairs = [
+        (run, twin, apart(metric, low, high))
+        for run in (one.measured if one else ())
+        for twin in (other.measured if other else ())
+        if _identity(run, metric) == _identity(twin, metric)
+        and (low := run.figure(metric)) is not None
+        and (high := twin.figure(metric)) is not None
+    ]
+    if not pairs:
+        return None
+    by_pair = np.array([by for *_, by in pairs])
+    by = float(by_pair.mean())
+    if metric.startswith("size_bytes"):
+        return Gap(by, 0.0, "computed, not sampled", True)
+    if len(pairs) == 1:
+        return _over_frames(metric, *pairs[0][:2]) or Gap(by, math.nan, "one figure each", False)
+    kinds = zip(*(_identity(run, metric)[:2] for run, *_ in pairs), strict=True)
+    counts = zip((len(set(kind)) for kind in kinds), ("scenes", "seeds"), strict=True)
+    over = " × ".join(f"{count} {kind}" for count, kind in counts if count > 1)
+    return Gap(by, half_interval(by_pair), over, True)
+
+
+def _identity(run: Run, metric: str) -> tuple[object, ...]:
+    """Scene and seed of a run and, if the metric is a time, its machine: equal in a pair."""
+    machine = run.computer if metric.partition(".")[0] in TIMES else ()
+    return (run.record["scene"]["digest"], run.facts["seed"], machine)
+
+
+def _over_frames(metric: str, run: Run, twin: Run) -> Gap | None:
+    """The gap between two runs over their common frames; None if these have no figures."""
+    figures = Figures.of(run), Figures.of(twin)
+    one, other = (of.frames.get(metric, {}) for of in figures)
+    common = [name for name in one if name in other]
+    if len(common) < 2:
+        return None
+    over = f"{len(common)} frames of one seed"
+    if not _by_ratio(metric):
+        by_frame = frames_apart(metric, *figures)
+        return Gap(float(by_frame.mean()), path_interval(by_frame), over, False)
+    below, above = (np.array([of[name] for name in common]) for of in (one, other))
+    # A mean that is wrong by a small share shifts the logarithm by this share.
+    shares = above / above.mean() - below / below.mean()
+    by = apart(metric, below.mean(), above.mean())
+    return Gap(by, path_interval(shares), over, False)
+
+
+def _by_ratio(metric: str) -> bool:
+    return metric.partition(".")[0] in RATIOS
+
+
+def told(metric: str, by: float) -> str:
+    """A gap as text: +0.61 or ×1.25."""
+    if math.isnan(by):
+        return ABSENT
+    if not _by_ratio(metric):
+        return ("-" if by < 0 else "+") + metric_format(metric)[1](abs(by))
+    factor = math.exp(by)
+    if factor < 0.1:
+        return f"×{factor:.2g}"
+    return f"×{decimal(factor, 2 if factor < 10 else 1 if factor < 100 else 0)}"
+
+
+def claim_table(comparisons: Sequence[Comparison]) -> Table:
+    """A table of `comparisons`, one line each."""
+    lines = []
+    for each in comparisons:
+        metric, here = each.claim.metric, each.here
+        label = metric_format(metric)[0].rstrip(" ↑↓")
+        sign = "≈" if each.claim.alike else "<"
+        name = f"{each.table}, {label}: {each.smaller} {sign} {each.larger}"
+        ends = (told(metric, here.by + side * here.half) for side in (-1, 1))
+        interval = " – ".join(ends) if here.half > 0 else ""
+        margin = f"×{each.claim.margin:g}" if _by_ratio(metric) else f"{each.claim.margin:g}"
+        figures = (told(metric, each.paper), told(metric, here.by), interval, here.over, margin)
+        lines.append((name, *figures, each.verdict))
+    columns = ("claim", "paper", "here", "95 % interval", "over", "margin", "verdict")
+    return Table("What the paper concludes", columns, tuple(lines))
+
+
+def tally(comparisons: Sequence[Comparison]) -> str:
+    """How many comparisons have which verdict, the most frequent first."""
+    counts = Counter(each.verdict for each in comparisons).most_common()
+    return "; ".join(f"{count} {verdict}" for verdict, count in counts)
