@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
 
 from bench import pictures as given
 from bench.console import ConsoleLog
@@ -17,6 +18,7 @@ from bench.errors import SteerbenchError, unknown
 from bench.protocol import EvaluationProtocol
 from bench.provenance import digest, libraries
 from bench.results import Store
+from bench.types import Camera
 from reports.runs import Run, load
 from sweeps.configured import build, checked_settings, scene_of
 from sweeps.measurement import send
@@ -56,8 +58,9 @@ def score(
     log, store = ConsoleLog(Path(plain.outputs)), Store(Path(plain.outputs))
     protocol: EvaluationProtocol = build(config, "protocol")
     weights = Path(plain.weights_dir) if plain.weights_dir else None
+    surface = None
     if truth is None:
-        pairs, place = _against_scene(folder, config, protocol, match)
+        pairs, place, surface = _against_scene(folder, config, protocol, match)
     else:
         if named := [word for word in settings if word.startswith("scene")]:
             raise SteerbenchError(f"--truth and {named[0]}: expected one of them")
@@ -69,9 +72,16 @@ def score(
     log.info(f"{len(pairs)} pictures, matched by {match}: {example}")
     lpips, missing = protocol.load_lpips(weights, log)
     measurement = given.score(
-        pairs, protocol, lpips, facts, log, sequence=sequence, kept=plain.pictures
+        pairs,
+        protocol,
+        lpips,
+        facts,
+        log,
+        sequence=sequence,
+        kept=plain.pictures,
+        surface=surface,
     )
-    record = measurement.record
+    record: Any = measurement.record
     parts = {
         "score": digest(given.score),
         "libraries": libraries(given.score),
@@ -86,7 +96,7 @@ def score(
     typed += ["--sequence"] if sequence else []
     more = {
         "command": shlex.join(["steerbench", "score", str(folder), *typed, *settings]),
-        "missing": missing,
+        "missing": {**record["missing"], **missing},
         "scene": {"name": facts["scene"], "digest": record["truths"]},
         "budget": {"name": NOTHING},
     }
@@ -100,11 +110,12 @@ def score(
 
 def _against_scene(
     folder: Path, config: DictConfig, protocol: EvaluationProtocol, match: given.Match
-) -> tuple[Sequence[given.Pair], dict[str, Any]]:
-    """Pairs of the pictures with those of the scene's split, and the facts for their rows."""
+) -> tuple[Sequence[given.Pair], dict[str, Any], Callable[[Camera], Tensor] | None]:
+    """Pairs of the pictures with those of the scene's split, the facts for their rows, and what
+    renders the depth of its surface."""
     OmegaConf.update(config, "scene.background", protocol.background)
     scene, split = scene_of(config), config.split
     if split not in scene.splits:
         raise unknown("split", split, scene.splits)
     pairs = given.pairs_with_split(folder, scene.splits[split], match)
-    return pairs, {"scene": scene.name, "split": split}
+    return pairs, {"scene": scene.name, "split": split}, scene.surface
