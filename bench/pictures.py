@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +19,7 @@ from bench.errors import unexpected
 from bench.metrics import Lpips, check_size
 from bench.protocol import PICTURES, EvaluationProtocol, Scoring
 from bench.results import STEADY, Measurement
-from bench.run import UNITS, score_rows, single
+from bench.run import UNITS, phase_rows, score_rows, single
 from bench.scenes.images import contents, decode_bytes
 from bench.trajectories import resolution, spread
 from bench.types import BACKGROUNDS, Camera, Log, Split, SteerbenchError, composite
@@ -89,6 +90,37 @@ def listed(folder: Path) -> list[Path]:
     return files
 
 
+def reported_times(file: Path, pairs: Sequence[Pair]) -> list[float]:
+    """The time of each picture in milliseconds, the column `frame_ms` of a CSV file.
+
+    With a column `name`, lines are matched by the name of the true picture without its ending, and
+    others are ignored; without, there is one for each picture, in their order. Raises
+    SteerbenchError if the file cannot be read, or a time is missing or not above 0.
+    """
+    try:
+        table = pd.read_csv(file, dtype={"name": "str"})
+    except (OSError, ValueError) as error:
+        raise unexpected(file, "a readable CSV file", error) from error
+    if "frame_ms" not in table:
+        raise unexpected(file, "a column frame_ms", ", ".join(map(str, table)) or "none")
+    if "name" in table:
+        table = table.dropna(subset="name").set_index("name")
+        table.index = table.index.map(lambda name: Path(name).stem)
+        names = [Path(pair.name).stem for pair in pairs]
+        counts = table.index.value_counts().reindex(names, fill_value=0)
+        if wrong := [name for name, count in counts.items() if count != 1]:
+            raise unexpected(
+                file, "one line for each picture", f"none or several of {_some(wrong)}"
+            )
+        table = table.loc[names]
+    times = pd.to_numeric(table["frame_ms"], errors="coerce").tolist()
+    if len(times) != len(pairs):
+        raise unexpected(file, f"{len(pairs)} lines, one for each picture", len(times))
+    if not all(0 < ms < math.inf for ms in times):
+        raise unexpected(f"{file}: frame_ms", "numbers above 0", table["frame_ms"].tolist())
+    return times
+
+
 def score(
     pairs: Sequence[Pair],
     protocol: EvaluationProtocol,
@@ -99,13 +131,14 @@ def score(
     sequence: bool = False,
     kept: int = PICTURES,
     surface: Callable[[Camera], Tensor] | None = None,
+    times: Sequence[float] = (),
 ) -> Measurement:
     """Score pictures under a protocol, on whose background any alpha is composited.
 
     `facts` (method, scene and so on) are for the rows. Pictures in `sequence` are consecutive
-    frames, so that what needs those is scored, too; `surface` is that of their scene, if known. So
-    many pictures are `kept`, with truth and error map. Raises SteerbenchError if a picture cannot
-    be read, or differs in size from its true picture.
+    frames, so that what needs those is scored, too; `surface` is that of their scene, if known.
+    `times` in ms are as reported. So many pictures are `kept`, with truth and error map. Raises
+    SteerbenchError if a picture cannot be read, or differs in size from its true picture.
     """
     background = torch.full((3,), BACKGROUNDS[protocol.background])
     scoring = Scoring(protocol, lpips, background, spread(len(pairs), kept), surface)
@@ -130,10 +163,12 @@ def score(
     if alphas:
         log.info(f"{alphas} pictures with an alpha channel were put on {protocol.background}")
     table = pd.DataFrame(frames).reindex(columns=["frame", "name", "phase", *scoring.names])
-    summary = score_rows(table, scoring.names)
+    if times:
+        table["frame_ms"] = times
+    summary = phase_rows(table) if times else score_rows(table, scoring.names)
     summary += [single(name, value) for name, value in scoring.whole().items()]
     rows = pd.DataFrame([{"phase": STEADY, **row} for row in summary]).assign(
-        unit=lambda of: [UNITS.get(name, "1") for name in of["metric"]],
+        unit=lambda of: [UNITS.get(name.split(".")[0], "1") for name in of["metric"]],
         resolution=resolution(sizes),
         protocol=protocol.name,
         **facts,

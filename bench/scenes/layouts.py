@@ -143,8 +143,13 @@ def _nerfbaselines(
         got = f"{first.width} x {first.height} on {scene.background.tolist()}"
         raise unexpected("--layout nerfbaselines", "square pictures on white", got)
     _blender(scene, known, folder, log)
-    about = {"loader": "blender", "id": "steerbench", "scene": scene.name, "type": "object-centric"}
-    info = {**about, "evaluation_protocol": "default"}
+    info = {
+        "loader": "nerfbaselines.datasets.blender:load_blender_dataset",
+        "id": "steerbench",
+        "scene": scene.name,
+        "type": "object-centric",
+        "evaluation_protocol": "default",
+    }
     (folder / "nb-info.json").write_text(json.dumps(info, indent=1))
 
 

@@ -96,7 +96,7 @@ def test_the_points_of_a_colmap_model_fill_the_bounds(scene, path, tmp_path, qui
 def test_nerfbaselines_gets_its_description_and_the_path(scene, path, tmp_path, quiet_log):
     export(scene, path, tmp_path / "out", "nerfbaselines", quiet_log)
     about = json.loads((tmp_path / "out/nb-info.json").read_text())
-    assert (about["loader"], about["scene"]) == ("blender", "totem")
+    assert (about["id"], about["scene"]) == ("steerbench", "totem")
     found = follow(scene, str(tmp_path / "out/trajectory.json"))
     for step, other in zip(found.steps, path.steps, strict=True):
         torch.testing.assert_close(step.camera.c2w, other.camera.c2w, atol=2e-6, rtol=0)
