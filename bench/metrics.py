@@ -20,7 +20,8 @@ from torch import Tensor
 from bench.published import load_features
 from bench.types import Log, SteerbenchError, Unavailable, check_shape
 
-SMALLEST_SIDE = {"psnr": 1, "ssim": 11, "lpips_alex": 31, "lpips_vgg": 16, "lpips_squeeze": 17}
+LPIPS_SIDE = {"lpips_alex": 31, "lpips_vgg": 16, "lpips_squeeze": 17}
+SMALLEST_SIDE = {"psnr": 1, "ssim": 11, **LPIPS_SIDE, "flip": 1}
 """Smallest side in pixels: SSIM needs room for its window, LPIPS for one feature at its deepest."""
 
 
@@ -45,7 +46,7 @@ def as_bytes(image: Tensor) -> np.ndarray:
 
 def psnr(image: Tensor, reference: Tensor) -> float:
     """Peak signal-to-noise ratio in dB for a peak of 1; +inf where the pictures are equal."""
-    _check_pair(image, reference)
+    check_pair(image, reference)
     return psnr_of_mse((image.double() - reference.double()).square().mean().item())
 
 
@@ -58,8 +59,8 @@ def flicker(
     image: Tensor, reference: Tensor, previous_image: Tensor, previous_reference: Tensor
 ) -> float:
     """RMS of the change of the error from frame to frame: 0 for what is wrong but stands still."""
-    _check_pair(image, reference)
-    _check_pair(previous_image, previous_reference)
+    check_pair(image, reference)
+    check_pair(previous_image, previous_reference)
     check_shape("previous_image", previous_image, *image.shape)
     error = image.double() - reference.double()
     previous_error = previous_image.double() - previous_reference.double()
@@ -74,7 +75,7 @@ def ssim(image: Tensor, reference: Tensor, window: str = "gaussian") -> float:
     The mean is taken over the valid region, where the window lies inside the picture. Raises
     SteerbenchError if a side is shorter than 11 pixels.
     """
-    _check_pair(image, reference)
+    check_pair(image, reference)
     check_size("ssim", image.shape[1], image.shape[0])
     variants: dict[str, dict[str, object]] = {
         "gaussian": {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False},
@@ -111,7 +112,7 @@ class Lpips:
     @torch.inference_mode()
     def __call__(self, image: Tensor, reference: Tensor) -> float:
         """LPIPS between two pictures [H, W, 3] in [0, 1]."""
-        _check_pair(image, reference)
+        check_pair(image, reference)
         check_size(f"lpips_{self.net}", image.shape[1], image.shape[0])
         pair = torch.stack((image, reference)).float().permute(0, 3, 1, 2)  # channels last
         # float32 on a GPU, too: by default cuDNN rounds the inputs of convolutions to TF32.
@@ -125,10 +126,17 @@ _torchvision_operators: torch.library.Library | None = None
 
 
 def _lpips_package() -> ModuleType:
-    """Import `lpips`, which needs torchvision only for its network definitions.
+    """Import `lpips`, which needs torchvision only for its network definitions."""
+    declare_torchvision()
+    import lpips
 
-    Torchvision's binary does not load beside a torch built for another device: two operators are
-    then undeclared. Declaring them makes the definitions importable.
+    return lpips
+
+
+def declare_torchvision() -> None:
+    """Make torchvision importable whose binary does not load, beside a torch for another device.
+
+    Two operators are then undeclared. Declaring them is enough for what needs no others.
     """
     global _torchvision_operators
     try:
@@ -140,11 +148,8 @@ def _lpips_package() -> ModuleType:
         for name in ("nms", "qnms"):
             arguments = "Tensor dets, Tensor scores, float iou_threshold"
             _torchvision_operators.define(f"{name}({arguments}) -> Tensor")
-    import lpips
-
-    return lpips
 
 
-def _check_pair(image: Tensor, reference: Tensor) -> None:
+def check_pair(image: Tensor, reference: Tensor) -> None:
     check_shape("image", image, None, None, 3)
     check_shape("reference", reference, *image.shape)

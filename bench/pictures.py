@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -18,10 +19,10 @@ from bench.errors import unexpected
 from bench.metrics import Lpips, check_size
 from bench.protocol import PICTURES, EvaluationProtocol, Scoring
 from bench.results import STEADY, Measurement
-from bench.run import UNITS, mean_row
+from bench.run import UNITS, phase_rows, score_rows, single
 from bench.scenes.images import contents, decode_bytes
 from bench.trajectories import resolution, spread
-from bench.types import BACKGROUNDS, Log, Split, SteerbenchError, composite
+from bench.types import BACKGROUNDS, Camera, Log, Split, SteerbenchError, composite
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 """Endings of files that count as pictures; other files in a folder are ignored."""
@@ -32,11 +33,13 @@ Match = Literal["name", "order"]
 
 
 class Pair(NamedTuple):
-    """A file to score; `name` and `truth` of its true picture, a file or uint8 [H, W, 3 or 4]."""
+    """A file to score; `name`, `truth` (a file or uint8 [H, W, 3 or 4]) and, if known, `camera` of
+    its true picture."""
 
     picture: Path
     name: str
     truth: Path | Tensor
+    camera: Camera | None = None
 
 
 def pairs_with_folder(pictures: Path, truth: Path, match: Match = "name") -> list[Pair]:
@@ -49,7 +52,8 @@ def pairs_with_folder(pictures: Path, truth: Path, match: Match = "name") -> lis
 def pairs_with_split(pictures: Path, split: Split, match: Match = "name") -> list[Pair]:
     """Pair each picture of a scene's `split` with its counterpart in `pictures`; see `matched`."""
     files = matched(pictures, [Path(name).stem for name in split.names], match)
-    return [Pair(*pair) for pair in zip(files, split.names, split.images, strict=True)]
+    cameras: Sequence[Camera | None] = split.cameras or [None] * len(files)
+    return [Pair(*pair) for pair in zip(files, split.names, split.images, cameras, strict=True)]
 
 
 def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
@@ -86,6 +90,37 @@ def listed(folder: Path) -> list[Path]:
     return files
 
 
+def reported_times(file: Path, pairs: Sequence[Pair]) -> list[float]:
+    """The time of each picture in milliseconds, the column `frame_ms` of a CSV file.
+
+    With a column `name`, lines are matched by the name of the true picture without its ending, and
+    others are ignored; without, there is one for each picture, in their order. Raises
+    SteerbenchError if the file cannot be read, or a time is missing or not above 0.
+    """
+    try:
+        table = pd.read_csv(file, dtype={"name": "str"})
+    except (OSError, ValueError) as error:
+        raise unexpected(file, "a readable CSV file", error) from error
+    if "frame_ms" not in table:
+        raise unexpected(file, "a column frame_ms", ", ".join(map(str, table)) or "none")
+    if "name" in table:
+        table = table.dropna(subset="name").set_index("name")
+        table.index = table.index.map(lambda name: Path(name).stem)
+        names = [Path(pair.name).stem for pair in pairs]
+        counts = table.index.value_counts().reindex(names, fill_value=0)
+        if wrong := [name for name, count in counts.items() if count != 1]:
+            raise unexpected(
+                file, "one line for each picture", f"none or several of {_some(wrong)}"
+            )
+        table = table.loc[names]
+    times = pd.to_numeric(table["frame_ms"], errors="coerce").tolist()
+    if len(times) != len(pairs):
+        raise unexpected(file, f"{len(pairs)} lines, one for each picture", len(times))
+    if not all(0 < ms < math.inf for ms in times):
+        raise unexpected(f"{file}: frame_ms", "numbers above 0", table["frame_ms"].tolist())
+    return times
+
+
 def score(
     pairs: Sequence[Pair],
     protocol: EvaluationProtocol,
@@ -95,21 +130,24 @@ def score(
     *,
     sequence: bool = False,
     kept: int = PICTURES,
+    surface: Callable[[Camera], Tensor] | None = None,
+    times: Sequence[float] = (),
 ) -> Measurement:
     """Score pictures under a protocol, on whose background any alpha is composited.
 
     `facts` (method, scene and so on) are for the rows. Pictures in `sequence` are consecutive
-    frames, so that flicker is scored, too. So many pictures are `kept`, with truth and error map.
-    Raises SteerbenchError if a picture cannot be read, or differs in size from its true picture.
+    frames, so that what needs those is scored, too; `surface` is that of their scene, if known.
+    `times` in ms are as reported. So many pictures are `kept`, with truth and error map. Raises
+    SteerbenchError if a picture cannot be read, or differs in size from its true picture.
     """
     background = torch.full((3,), BACKGROUNDS[protocol.background])
-    scoring = Scoring(protocol, lpips, background, spread(len(pairs), kept))
+    scoring = Scoring(protocol, lpips, background, spread(len(pairs), kept), surface)
     frames: list[dict[str, Any]] = []
     sizes: list[tuple[int, int]] = []
     alphas = 0
     seen, truths = hashlib.sha256(), hashlib.sha256()
     with log.progress("scoring", len(pairs)) as progress:
-        for index, (path, name, true) in enumerate(pairs):
+        for index, (path, name, true, camera) in enumerate(pairs):
             picture, truth = (
                 decode_bytes(contents(x), x) if isinstance(x, Path) else x for x in (path, true)
             )
@@ -118,17 +156,19 @@ def score(
             truths.update(truth.numpy().tobytes())
             alphas += picture.shape[2] == 4
             rgb = composite(picture, background)
-            figures = scoring.score(index, rgb, truth, cut=not sequence)
+            figures = scoring.score(index, rgb, truth, cut=not sequence, camera=camera)
             frames.append({"frame": index, "name": name, "phase": STEADY, **figures})
             sizes.append((rgb.shape[1], rgb.shape[0]))
             progress.advance()
     if alphas:
         log.info(f"{alphas} pictures with an alpha channel were put on {protocol.background}")
-    table = pd.DataFrame(frames)
-    metrics = [*protocol.metric_names, *(["flicker"] if "flicker" in table else [])]
-    rows = pd.DataFrame([mean_row(metric, table[metric]) for metric in metrics]).assign(
-        unit=lambda of: [UNITS.get(name, "1") for name in of["metric"]],
-        phase=STEADY,
+    table = pd.DataFrame(frames).reindex(columns=["frame", "name", "phase", *scoring.names])
+    if times:
+        table["frame_ms"] = times
+    summary = phase_rows(table) if times else score_rows(table, scoring.names)
+    summary += [single(name, value) for name, value in scoring.whole().items()]
+    rows = pd.DataFrame([{"phase": STEADY, **row} for row in summary]).assign(
+        unit=lambda of: [UNITS.get(name.split(".")[0], "1") for name in of["metric"]],
         resolution=resolution(sizes),
         protocol=protocol.name,
         **facts,
@@ -138,6 +178,7 @@ def score(
         "pictures": seen.hexdigest(),
         "truths": truths.hexdigest(),
         "with_alpha": alphas,
+        "missing": scoring.path.missing([row["metric"] for row in summary if row["n"]]),
     }
     return Measurement(rows, table, scoring.images, record)
 

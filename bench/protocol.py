@@ -6,7 +6,7 @@ Its name is in every row.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bench import metrics
+from bench import metrics, video_metrics
 from bench.errors import unexpected
 from bench.provenance import sha256
 from bench.published import locate
@@ -44,6 +44,8 @@ CHOICES = {
 }
 """The values of the protocol's options; "8bit" clips and rounds the prediction."""
 
+COLUMNS = ("flip", *video_metrics.NEEDS)  # further metrics that a protocol can name
+
 _named: set[str] = set()  # reasons why figures are missing that this process has logged
 
 
@@ -55,7 +57,7 @@ class EvaluationProtocol:
     mixed with those of another. A method keeps its preceding frames along the trajectory ("steady")
     or is reset before every frame ("cold"). The flicker needs true pictures of consecutive frames:
     those with a ground truth have one ("split"), or the scene renders it for the other frames
-    ("exact"), which takes about half a second at 400 x 400.
+    ("exact"), which takes about half a second at 400 x 400. So do the further `columns`.
     """
 
     name: str = "steerbench-1"
@@ -67,15 +69,23 @@ class EvaluationProtocol:
     memory: str = "steady"
     flicker: str = "split"
     stages: bool = True  # whether to time the stages of a frame: a GPU is waited for at each
+    columns: tuple[str, ...] = ()  # further metrics, of `COLUMNS`
+    fps: float = 30.0  # frames a second at which the path is seen, for the JOD
+    display: str = "standard_4k"  # on which it is seen, a name of `cvvdp`
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "lpips", tuple(self.lpips))  # a list, when read from YAML
+        for option in ("lpips", "columns"):  # a list, when read from YAML
+            object.__setattr__(self, option, tuple(getattr(self, option)))
         for option, allowed in CHOICES.items():
             if getattr(self, option) not in allowed:
                 got = repr(getattr(self, option))
                 raise unexpected(f"protocol.{option}", " or ".join(allowed), got)
         if self.warmup < 0:
             raise unexpected("protocol.warmup", "0 or more", self.warmup)
+        if not set(self.columns) <= set(COLUMNS):
+            raise unexpected("protocol.columns", f"some of {', '.join(COLUMNS)}", [*self.columns])
+        if not 0 < self.fps < math.inf:
+            raise unexpected("protocol.fps", "more than 0", self.fps)
         default = {field.name: field.default for field in fields(self)}
         changed = [key for key, value in default.items() if getattr(self, key) != value]
         if changed and self.name == default["name"]:
@@ -87,7 +97,8 @@ class EvaluationProtocol:
     @property
     def metric_names(self) -> tuple[str, ...]:
         """Names of the metrics that `score` returns, in the order of the table."""
-        return ("psnr", "ssim", *(f"lpips_{net}" for net in self.lpips))
+        lpips = (f"lpips_{net}" for net in self.lpips)
+        return ("psnr", "ssim", *lpips, *(["flip"] if "flip" in self.columns else []))
 
     def check(self, scene: Scene, trajectory: Trajectory) -> None:
         """Raise SteerbenchError before any training if the frames could not be scored afterwards:
@@ -119,7 +130,14 @@ class EvaluationProtocol:
     def load_lpips(
         self, weights_dir: Path | None, log: Log
     ) -> tuple[dict[str, metrics.Lpips], dict[str, str]]:
-        """LPIPS by backbone; by metric, why it is missing, which is also logged once a process."""
+        """LPIPS by backbone; by metric, why it is missing, which is also logged once a process.
+
+        Raises Unavailable if a further column needs a package that is not installed.
+        """
+        if "flip" in self.columns:
+            video_metrics.flip_package()
+        if "jod" in self.columns:
+            video_metrics.color_video_vdp(self.display)
         loaded, missing = {}, {}
         for net in self.lpips:
             try:
@@ -148,7 +166,9 @@ class EvaluationProtocol:
         scores = {"psnr": metrics.psnr(image, truth), "ssim": metrics.ssim(image, truth, self.ssim)}
         for net in self.lpips:
             scores[f"lpips_{net}"] = lpips[net](image, truth) if net in lpips else math.nan
-        return scores
+        return scores | (
+            {"flip": video_metrics.flip(image, truth)} if "flip" in self.columns else {}
+        )
 
 
 def check_frame(frame: Frame, camera: Camera, method: str, index: int) -> None:
@@ -164,10 +184,11 @@ def check_frame(frame: Frame, camera: Camera, method: str, index: int) -> None:
 
 
 class Scoring:
-    """Scores the frames of a sequence in order; keeps the last one for the flicker.
+    """Scores the frames of a sequence in order, alone and against the frames before them.
 
-    `images` holds 8-bit pictures by file name: ground truth, rendering and error map of the `shown`
-    frames, once they are scored.
+    `surface` is that of the scene: without it, flow comes from the depth of the frames. `images`
+    holds 8-bit pictures by file name: ground truth, rendering and error map of the `shown` frames,
+    once they are scored.
     """
 
     def __init__(
@@ -176,34 +197,50 @@ class Scoring:
         lpips: Mapping[str, metrics.Lpips],
         background: Tensor,
         shown: Collection[int],
+        surface: Callable[[Camera], Tensor] | None = None,
     ) -> None:
         self.images: dict[str, np.ndarray] = {}
         self._protocol, self._lpips = protocol, lpips
-        self._background, self._shown = background, shown
-        self._last: tuple[Tensor, Tensor] | None = None
+        self._background, self._shown, self._surface = background, shown, surface
+        self.path = video_metrics.PathScoring(
+            protocol.columns, protocol.lpips, lpips, exact_flow=surface is not None
+        )
+        self.names = (*protocol.metric_names, *self.path.names)  # of a frame's figures, in order
 
     def score(
-        self, index: int, rgb: Tensor, truth: Tensor | None, *, scored: bool = True, cut: bool
+        self,
+        index: int,
+        rgb: Tensor,
+        truth: Tensor | None,
+        *,
+        scored: bool = True,
+        cut: bool,
+        camera: Camera | None = None,
+        depth: Tensor | None = None,
     ) -> dict[str, float]:
-        """The figures of frame `index`, rendered as `rgb` [H, W, 3]; none without `truth`.
+        """The figures of frame `index`, rendered as `rgb` [H, W, 3].
 
-        `truth` is uint8 [H, W, 3 or 4]; that of a frame which is not `scored` serves the flicker
-        alone. After a `cut`, or a frame of another size or without truth, there is no flicker.
+        `truth` is uint8 [H, W, 3 or 4]; that of a frame which is not `scored` serves the path
+        alone. `depth` [H, W] is the method's own. Frames before a `cut`, or of another size, are
+        not compared with.
         """
         figures: dict[str, float] = {}
-        last, self._last = self._last, None
-        if truth is None:
-            return figures
-        if scored:
+        true = None if truth is None else composite(truth.to(rgb.device), self._background)
+        if truth is not None and true is not None and scored:
             figures |= self._protocol.score(rgb, truth, self._background, self._lpips)
             if index in self._shown:
-                self.images |= _pictures(index, rgb, composite(truth, self._background))
-        true = composite(truth.to(rgb.device), self._background)
-        # On the GPU it would count as memory of the method.
-        self._last = self._protocol.rounded(rgb).cpu(), true.cpu()
-        if not cut and last is not None and last[0].shape == rgb.shape:
-            figures["flicker"] = metrics.flicker(*self._last, *last)
-        return figures
+                self.images |= _pictures(index, rgb, true)
+        view = None
+        if camera is not None and self.path.warps:
+            depth = depth if self._surface is None else self._surface(camera)
+            view = None if depth is None else video_metrics.View(camera, depth.cpu())
+        # On a GPU these would count as memory of the method.
+        kept = self._protocol.rounded(rgb).cpu(), None if true is None else true.cpu()
+        return figures | self.path.add(video_metrics.Shot(*kept, view), cut, rgb.device)
+
+    def whole(self) -> dict[str, float]:
+        """The figures of the whole sequence."""
+        return self.path.whole(self._protocol.fps, self._protocol.display)
 
 
 def _pictures(index: int, rgb: Tensor, truth: Tensor) -> dict[str, np.ndarray]:

@@ -28,8 +28,8 @@ from bench.types import Budget, Log, Method, Scene
 
 QUANTILES = (50, 95, 99)
 UNITS = {
-    **{"psnr": "dB", "frame_ms": "ms", "wall_ms": "ms", "stage_ms": "ms", "fps": "1/s"},
-    **{"work": "1/frame", "size_bytes": "B", "peak_bytes": "B", "train_s": "s"},
+    **{"psnr": "dB", "tpsnr": "dB", "jod": "JOD", "fps": "1/s", "work": "1/frame", "train_s": "s"},
+    **{"frame_ms": "ms", "wall_ms": "ms", "stage_ms": "ms", "size_bytes": "B", "peak_bytes": "B"},
 }
 """Units of metrics, by name up to the first dot; other metrics have no unit."""
 
@@ -97,7 +97,8 @@ class _Take:
         self.meter = MemoryMeter(device)
         scored = [n for n, step in enumerate(task.trajectory.steps) if step.truth is not None]
         shown = {scored[n] for n in spread(len(scored), task.pictures)}
-        self.scoring = Scoring(task.protocol, lpips, task.scene.background, shown)
+        scene = task.scene
+        self.scoring = Scoring(task.protocol, lpips, scene.background, shown, scene.surface)
         self.rows: list[dict[str, Any]] = []
 
     def metered(self, *, warm: bool = False) -> AbstractContextManager[object]:
@@ -137,15 +138,17 @@ def _measurement(
     scene, trajectory, protocol, budget = task.scene, task.trajectory, task.protocol, task.budget
     method, scoring, sizes = take.method, take.scoring, take.method.sizes()
     peak_bytes, source = take.peak(in_turns)
-    frames = _frame_table(take.rows, protocol)
+    frames = _frame_table(take.rows, scoring.names)
     of_phases = ((phase, frames[frames["phase"] == phase]) for phase in (STEADY, COLD))
     summary = [
         *(row | {"phase": phase} for phase, of in of_phases if len(of) for row in phase_rows(of)),
-        *(_single(f"size_bytes.{part}", size) for part, size in sizes.items()),
-        *([_single("size_bytes.total", sum(sizes.values()))] if sizes else []),
-        _single("peak_bytes", peak_bytes),
-        _single("train_s", method.train_s),
+        *(single(f"size_bytes.{part}", size) for part, size in sizes.items()),
+        *([single("size_bytes.total", sum(sizes.values()))] if sizes else []),
+        single("peak_bytes", peak_bytes),
+        single("train_s", method.train_s),
+        *(single(name, value) for name, value in scoring.whole().items()),
     ]
+    known = [row["metric"] for row in summary if row["n"]]
     rows = pd.DataFrame(summary).assign(
         unit=lambda table: [UNITS.get(name.split(".")[0], "1") for name in table["metric"]],
         method=method.name,
@@ -162,7 +165,7 @@ def _measurement(
         "protocol": asdict(protocol),
         "budget": asdict(budget),
         "scene": {"name": scene.name, "digest": scene.digest, "unit_length": scene.unit_length},
-        "missing": missing,
+        "missing": {**missing, **scoring.path.missing(known)},
         "neighbours": neighbours._asdict(),
         "peak_bytes": source,
         "times": take.times,
@@ -229,16 +232,23 @@ def _draw(take: _Take, task: Task, index: int, before: int) -> None:
     elif task.protocol.flicker == "exact" and task.scene.exact is not None:
         truth = task.scene.exact(step.camera)
     scored = step.truth is not None
-    scores = take.scoring.score(index, frame.rgb, truth, scored=scored, cut=step.cut)
+    scores = take.scoring.score(
+        index,
+        frame.rgb,
+        truth,
+        scored=scored,
+        cut=step.cut,
+        camera=step.camera,
+        depth=frame.depth,
+    )
     take.rows.append(figures | scores)
 
 
-def _frame_table(table: list[dict[str, Any]], protocol: EvaluationProtocol) -> pd.DataFrame:
+def _frame_table(table: list[dict[str, Any]], scores: Sequence[str]) -> pd.DataFrame:
     """One row per frame; missing stages and counters are 0, missing scores NaN."""
     frames = pd.DataFrame(table)
     touched = [name for name in map(str, frames) if name.startswith(("stage_ms.", "work."))]
     touched.sort(key=lambda name: (name.startswith("work."), name == "stage_ms.other"))
-    scores = (*protocol.metric_names, "flicker")
     times = [name for name in ("frame_ms", "wall_ms") if name in frames]
     columns = ["frame", "name", "phase", *scores, *times, *touched]
     return frames.reindex(columns=columns).fillna(dict.fromkeys(touched, 0))
@@ -247,25 +257,30 @@ def _frame_table(table: list[dict[str, Any]], protocol: EvaluationProtocol) -> p
 def phase_rows(frames: pd.DataFrame) -> list[dict[str, Any]]:
     """Mean and interval of every column, quantiles of the frame time, frames per second.
 
-    `frames` are at least one, in path order, with columns `frame`, `name` and `phase`, scores up to
-    `flicker`, times, work.
+    `frames` are at least one, in path order, with columns `frame`, `name` and `phase`, scores,
+    times, work.
     """
     columns = list(map(str, frames))
-    scores = columns[columns.index("phase") + 1 : columns.index("flicker")]
-    blink = ["flicker"] if frames["flicker"].notna().any() else []
+    scores = columns[columns.index("phase") + 1 : columns.index("frame_ms")]
     parts = [name for name in columns if name.startswith(("stage_ms.", "work."))]
     times = frames["frame_ms"]
     ms = mean_row("frame_ms", times)
     return [
-        *(mean_row(name, frames[name]) for name in (*scores, *blink)),
+        *score_rows(frames, scores),
         ms,
-        *(_single(f"frame_ms.p{part}", np.percentile(times, part)) for part in QUANTILES),
+        *(single(f"frame_ms.p{part}", np.percentile(times, part)) for part in QUANTILES),
         # No upper end if the interval of the time reaches 0.
         {"metric": "fps", "n": ms["n"], "value": 1000 / ms["value"], "lo": 1000 / ms["hi"]}
         | {"hi": 1000 / ms["lo"] if ms["lo"] > 0 else math.nan},
         *(mean_row(name, frames[name]) for name in columns if name == "wall_ms"),
         *(mean_row(name, frames[name]) for name in parts),
     ]
+
+
+def score_rows(frames: pd.DataFrame, scores: Sequence[str]) -> list[dict[str, Any]]:
+    """Mean and interval of each of `scores`; of the flicker only where a frame has one."""
+    named = [name for name in scores if name != "flicker" or frames[name].notna().any()]
+    return [mean_row(name, frames[name]) for name in named]
 
 
 def mean_row(metric: str, values: pd.Series) -> dict[str, Any]:
@@ -277,7 +292,7 @@ def mean_row(metric: str, values: pd.Series) -> dict[str, Any]:
     return {"metric": metric} | figures
 
 
-def _single(metric: str, value: float) -> dict[str, Any]:
+def single(metric: str, value: float) -> dict[str, Any]:
     """The row of a single figure; it belongs to the whole run unless its phase is replaced."""
     known = int(not math.isnan(value))
     row = {"metric": metric, "value": float(value), "n": known, "lo": math.nan, "hi": math.nan}

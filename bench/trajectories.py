@@ -16,6 +16,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -45,6 +46,7 @@ SAMPLES = 65
 """Poses per segment for measuring its length: 64 chords of half a circle are 0.01 % too short."""
 
 KEYFRAMES = "camera_path"  # under which a file of nerfstudio's viewer lists its cameras
+NERFBASELINES = "nerfbaselines-v1"  # the `format` of a path of NerfBaselines
 
 
 @dataclass(frozen=True)
@@ -219,7 +221,9 @@ def follow(scene: Scene, path: str, limit: int = 0) -> Trajectory:
 
     nerfstudio's file has a list `camera_path`, each entry with a `camera_to_world` of 16 numbers
     row by row and a vertical `fov` in degrees; `render_width` and `render_height` hold for all. A
-    `transforms.json` has `frames`; missing intrinsics are taken from the first test camera.
+    `transforms.json` has `frames`; missing intrinsics are taken from the first test camera. That of
+    NerfBaselines has `frames`, too, and `format` nerfbaselines-v1: each with a `pose` of 12 numbers
+    row by row, in OpenCV axes, and `intrinsics` fx, fy, cx, cy; `image_size` holds for all.
 
     Raises SteerbenchError if the file is damaged or has no cameras, or a pose is not rigid.
     """
@@ -227,6 +231,8 @@ def follow(scene: Scene, path: str, limit: int = 0) -> Trajectory:
     record = read_json(file.parent, file.name)
     if KEYFRAMES in record:
         cameras = _of_viewer(record, file)
+    elif record.get("format") == NERFBASELINES:
+        cameras = _of_nerfbaselines(record, file)
     else:
         usual = scene.splits["test"].cameras[0]
         cameras = [
@@ -263,17 +269,29 @@ def spline(
     return Trajectory(name, through.split, tuple(steps), through.reads)
 
 
-def write_path(path: Path, cameras: Sequence[Camera], scene: Scene, fps: float = 30.0) -> None:
-    """Write `cameras` (scene units, all of one size) as a path that nerfstudio's viewer reads."""
+def write_path(
+    path: Path,
+    cameras: Sequence[Camera],
+    scene: Scene,
+    fps: float = 30.0,
+    form: Literal["nerfstudio", "nerfbaselines"] = "nerfstudio",
+) -> None:
+    """Write `cameras` (scene units, all of one size) as a path that nerfstudio's viewer reads, or
+    NerfBaselines."""
+    moved = [move_camera(camera, scene.unit_length, scene.origin) for camera in cameras]
+    record = (_viewers if form == "nerfstudio" else _nerfbaselines)(moved, fps)
+    path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+
+
+def _viewers(cameras: Sequence[Camera], fps: float) -> dict:
     first, keyframes = cameras[0], []
     for camera in cameras:
-        moved = move_camera(camera, scene.unit_length, scene.origin)
-        pose = opengl_to_opencv(moved.c2w.double())  # its own inverse: it flips two axes
+        pose = opengl_to_opencv(camera.c2w.double())  # its own inverse: it flips two axes
         fov = math.degrees(2 * math.atan(camera.height / 2 / camera.fy))
         flat = [*pose.flatten().tolist(), 0.0, 0.0, 0.0, 1.0]
         aspect = camera.width / camera.height
         keyframes.append({"camera_to_world": flat, "fov": fov, "aspect": aspect})
-    record = {
+    return {
         "camera_type": "perspective",
         "render_width": first.width,
         "render_height": first.height,
@@ -281,7 +299,42 @@ def write_path(path: Path, cameras: Sequence[Camera], scene: Scene, fps: float =
         "seconds": len(cameras) / fps,
         KEYFRAMES: keyframes,
     }
-    path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+
+
+def _nerfbaselines(cameras: Sequence[Camera], fps: float) -> dict:
+    frames = [
+        {
+            "pose": camera.c2w.flatten().tolist(),
+            "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+            "appearance_weights": [],
+        }
+        for camera in cameras
+    ]
+    size = [cameras[0].width, cameras[0].height]
+    about = {"format": NERFBASELINES, "camera_model": "pinhole", "image_size": size, "fps": fps}
+    return {**about, "source": None, "appearances": [], "frames": frames}
+
+
+def _of_nerfbaselines(record: dict, file: Path) -> list[Camera]:
+    """The cameras of a path of NerfBaselines; appearances are ignored."""
+    if record.get("camera_model") != "pinhole":
+        raise unexpected(f"{file}: camera_model", "pinhole", describe(record.get("camera_model")))
+    size = _numbers(record.get("image_size"), 2, f"{file}: image_size")
+    width, height = (whole_number(x, f"{file}: image_size", 1) for x in size)
+    cameras = []
+    for where, frame in entries_of(record, "frames", file):
+        flat = _numbers(frame.get("pose"), 12, f"{where}.pose")
+        pose = rigid_pose([flat[row : row + 4] for row in (0, 4, 8)], f"{where}.pose")
+        lens = _numbers(frame.get("intrinsics"), 4, f"{where}.intrinsics")
+        fx, fy, cx, cy = (number(x, f"{where}.intrinsics", 0) for x in lens)
+        cameras.append(Camera(pose, fx, fy, cx, cy, width, height))
+    return cameras
+
+
+def _numbers(value: object, count: int, where: str) -> list:
+    if not isinstance(value, list) or len(value) != count:
+        raise unexpected(where, f"{count} numbers", describe(value))
+    return value
 
 
 def _of_viewer(record: dict, file: Path) -> list[Camera]:
@@ -291,9 +344,7 @@ def _of_viewer(record: dict, file: Path) -> list[Camera]:
     )
     cameras = []
     for where, entry in entries_of(record, KEYFRAMES, file):
-        flat = entry.get("camera_to_world")
-        if not isinstance(flat, list) or len(flat) != 16:
-            raise unexpected(f"{where}.camera_to_world", "16 numbers", describe(flat))
+        flat = _numbers(entry.get("camera_to_world"), 16, f"{where}.camera_to_world")
         rows = [flat[row : row + 4] for row in range(0, 16, 4)]
         pose = opengl_to_opencv(rigid_pose(rows, f"{where}.camera_to_world"))
         angle = number(entry.get("fov", record.get("default_fov")), f"{where}.fov", 0, 180)

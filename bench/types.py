@@ -114,7 +114,8 @@ class Scene:
     """Everything a method may learn from and everything it is scored on.
 
     A point of the data set is origin + unit_length * scene point, with the same axes. `exact`
-    renders the true picture of any camera as in a split; None if the scene cannot.
+    renders the true picture of any camera as in a split, `surface` its z-depth [H, W] at the centres
+    of pixels, +inf where empty; None if the scene cannot, or has no opaque surface.
     """
 
     name: str  # as shown in result rows
@@ -125,6 +126,7 @@ class Scene:
     digest: str  # content hash of cameras, pictures and normalisation
     origin: Tensor = field(default_factory=lambda: torch.zeros(3))
     exact: Callable[[Camera], Tensor] | None = None
+    surface: Callable[[Camera], Tensor] | None = None
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from bench.results import COLD, STEADY
+from bench.results import COLD, STEADY, WHOLE
 
 NOT_AVAILABLE = "n/a"
 DENSE = ".dense"  # suffix of a work counter for the work of a method that skips nothing
@@ -22,7 +22,14 @@ QUALITY = {
     "lpips_alex": ("LPIPS alex ↓", 4),
     "lpips_vgg": ("LPIPS vgg ↓", 4),
     "lpips_squeeze": ("LPIPS squeeze ↓", 4),
+    "flip": ("FLIP ↓", 4),
     "flicker": ("flicker ↓", 4),
+    "tpsnr": ("tPSNR, dB ↑", 2),
+    **{f"tlpips_{net}": (f"tLPIPS {net} ↓", 4) for net in ("alex", "vgg", "squeeze")},
+    **{f"warp_{k}": (f"warping error, {k} apart ↓", 5) for k in (1, 7)},
+    **{f"warp_{k}_true": (f"warping error of the truth, {k} apart", 5) for k in (1, 7)},
+    **{f"warp_{k}_own": (f"warping error, {k} apart, own depth ↓", 5) for k in (1, 7)},
+    "jod": ("JOD ↑", 3),
 }
 """Label and decimals of each quality metric. The arrow points to better values."""
 
@@ -86,11 +93,13 @@ def phases(rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
 def run_tables(rows: pd.DataFrame) -> list[Table]:
     """The tables of one run: quality, time by stage and work for each phase; memory.
 
-    For pictures that were only scored, there is only quality.
+    For pictures that were only scored, there is only quality. That of a whole path, the JOD, stands
+    with the first phase.
     """
+    whole = rows[rows["phase"] == WHOLE]
     tables = [
-        table(of_phase, suffix)
-        for suffix, of_phase in phases(rows)
+        table(of_phase if number else pd.concat([of_phase, whole]), suffix)
+        for number, (suffix, of_phase) in enumerate(phases(rows))
         for table in (_quality, _time, _work)
     ]
     return [table for table in (*tables, _memory(rows)) if table.lines]

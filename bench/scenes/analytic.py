@@ -24,7 +24,7 @@ from bench.scenes import blender
 from bench.scenes.files import opengl_to_opencv, whole_number
 from bench.scenes.medley import medley
 from bench.scenes.models import MODELS
-from bench.scenes.raytrace import Model, render
+from bench.scenes.raytrace import Model, Solids, render
 from bench.threads import in_parallel
 from bench.types import Camera, Log, Scene, SteerbenchError, Unavailable
 
@@ -91,7 +91,12 @@ def load(
     def exact(camera: Camera) -> Tensor:
         return picture(model, move_camera(camera, scene.unit_length, scene.origin))
 
-    return replace(scene, exact=exact)
+    def surface(camera: Camera) -> Tensor:
+        moved = move_camera(camera, scene.unit_length, scene.origin)
+        with torch.no_grad():
+            return render(model, moved, torch.zeros(3), samples=1).depth / scene.unit_length
+
+    return replace(scene, exact=exact, surface=surface if isinstance(model, Solids) else None)
 
 
 def find(name: str) -> Model:

@@ -12,7 +12,7 @@ from reports.tables import NOT_AVAILABLE, Table
 from sweeps.terminal import show
 
 SHOWN = (
-    *("run", "method", "scene", "trajectory", "seed", "phase"),
+    *("run", "method", "scene", "trajectory", "device", "seed", "phase"),
     *("metric", "value", "lo", "hi", "n", "unit"),
 )
 """The columns of the printed table; csv and json have all columns."""

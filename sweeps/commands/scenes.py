@@ -1,4 +1,4 @@
-"""`steerbench scenes`: downloads published data sets, and checks copies of them."""
+"""`steerbench scenes`: downloads published data sets, checks copies, exports scenes."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from pathlib import Path
 from bench.console import ConsoleLog
 from bench.errors import unknown
 from bench.published import Published, get, published, verify
+from bench.scenes import layouts
+from sweeps.configured import build, scene_of
+from sweeps.overrides import composed
 
 SHOWN = 5  # missing or extra files to print by name, because there may be hundreds
 
@@ -17,6 +20,8 @@ def main(options: argparse.Namespace) -> int:
     log = ConsoleLog(Path("outputs"))
     if options.action == "verify":
         return _verify(Path(options.name), log)
+    if options.action == "export":
+        return _export(options, log)
     known: dict[str, tuple[Published, list[str]]] = {}
     for data in published():
         known |= {name: (data, [name]) for name in data.scenes}
@@ -29,6 +34,19 @@ def main(options: argparse.Namespace) -> int:
         path = get(data, scene, folder, log)
         print(f"{path}: scene={data.layout} scene.path={path}")
     print(f"licence: {data.licence}")
+    return 0
+
+
+def _export(options: argparse.Namespace, log: ConsoleLog) -> int:
+    """Write the scene and its path; print how to run on it, and how to score what others render."""
+    words = [f"scene={options.name}", f"trajectory={options.path}", *options.overrides]
+    config = composed(words)
+    scene = scene_of(config)
+    path = build(config, "trajectory", scene)
+    layouts.export(scene, path, options.to, options.layout, log)
+    reader, inner = ("colmap", "test/images") if options.layout == "colmap" else ("blender", "test")
+    print(f"{options.to}: scene={reader} scene.path={options.to}")
+    print(f"its path: steerbench score PICTURES --truth {options.to / inner} --sequence")
     return 0
 
 

@@ -249,10 +249,16 @@ def viewer(*keyframes: dict[str, Any]) -> dict[str, Any]:
     return {"render_width": 40, "render_height": 30, "camera_path": list(keyframes)}
 
 
-def test_a_path_comes_back_as_it_was_written(scene, tmp_path):
+def nerfbaselines(**others: Any) -> dict[str, Any]:
+    about = {"format": "nerfbaselines-v1", "camera_model": "pinhole", "image_size": [40, 30]}
+    return about | others
+
+
+@pytest.mark.parametrize("form", ["nerfstudio", "nerfbaselines"])
+def test_a_path_comes_back_as_it_was_written(scene, tmp_path, form):
     first = scene.splits["test"].cameras[0]
     second = moved(first, 0.125)
-    write_path(tmp_path / "there.json", [first, second], scene)
+    write_path(tmp_path / "there.json", [first, second], scene, form=form)
     trajectory = follow(scene, str(tmp_path / "there.json"))
     assert trajectory.name == "there"
     assert trajectory.reads == (tmp_path / "there.json",)
@@ -302,6 +308,9 @@ def test_a_transforms_file_gives_intrinsics_or_leaves_them_to_the_test_camera(sc
             viewer(keyframe(camera_to_world=[2.0, *keyframe()["camera_to_world"][1:]])),
             "expected an orthonormal rotation",
         ),
+        (nerfbaselines(camera_model="opencv"), "camera_model: expected pinhole, got 'opencv'"),
+        (nerfbaselines(image_size=[40]), "image_size: expected 2 numbers"),
+        (nerfbaselines(frames=[{"pose": [1.0] * 16}]), r"frames\[0\]\.pose: expected 12 numbers"),
         ({"nothing": 1}, "frames: expected a list with at least one entry, got nothing"),
     ],
 )

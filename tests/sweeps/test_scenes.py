@@ -30,3 +30,16 @@ def test_get_says_how_to_run_on_what_it_got(steerbench, monkeypatch, web, tmp_pa
     assert "licence: free" in outcome.out
     assert (tmp_path / "mine/release/mic/a.png").read_bytes() == b"a"
     assert steerbench("scenes", "verify", "mine/release").status == 0
+
+
+def test_export_says_how_to_train_on_it_and_how_to_score_what_others_render(steerbench):
+    sizes = "scene.width=16", "scene.train=2", "scene.test=3"
+    outcome = steerbench("scenes", "export", "totem", "--to", "out", "--path", "orbit", *sizes)
+    assert outcome.status == 0, outcome.err
+    assert "scene=blender scene.path=out\n" in outcome.out
+    told = outcome.out.split("its path: steerbench ")[1].split()
+    words = [word.replace("PICTURES", "out/test") for word in told]
+    scored = steerbench(*words, "protocol.lpips=[]", "protocol.name=quick")
+    assert scored.status == 0, scored.err
+    assert "3 pictures" in scored.err
+    assert steerbench("scenes", "export", "totem", "--to", "out", *sizes).status == 2

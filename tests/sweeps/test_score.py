@@ -85,6 +85,44 @@ def test_the_pictures_of_a_scene_are_its_own_truth(steerbench):
     assert (rows["scene"].iloc[0], rows["split"].iloc[0], rows["n"].iloc[0]) == ("totem", "test", 3)
 
 
+def test_reported_times_are_in_the_rows_and_marked(steerbench, folders):
+    theirs, true = folders
+    Path("named.csv").write_text("frame_ms,name\n30,1\n10,0\n99,other\n")
+    Path("plain.csv").write_text("frame_ms\n10\n30\n")
+    keys = []
+    for file in ("named.csv", "plain.csv"):
+        outcome = steerbench("score", theirs, "--truth", true, *QUICK, "--times", file)
+        assert outcome.status == 0, outcome.err
+        keys.append(re.search(r"run (\w+)", outcome.out)[1])
+    assert keys[0] == keys[1]
+    store = Store(Path("outputs"))
+    rows = store.rows().set_index("metric")
+    assert rows["value"][["frame_ms", "fps"]].tolist() == [20, 50]
+    assert rows["unit"]["frame_ms.p50"] == "ms"
+    assert set(rows["device"]) == {"reported"}
+    assert store.frames(keys[0])["frame_ms"].tolist() == [10, 30]
+    assert "reported" in steerbench("results").out
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("ms\n1\n", "expected a column frame_ms, got ms"),
+        ("frame_ms\n1\n", "expected 2 lines, one for each picture, got 1"),
+        ("frame_ms\n1\n-1\n", "frame_ms: expected numbers above 0"),
+        (
+            "name,frame_ms\n0,1\n2,1\n",
+            "expected one line for each picture, got none or several of 1",
+        ),
+    ],
+)
+def test_times_that_do_not_fit_the_pictures_are_refused(steerbench, folders, text, said):
+    Path("times.csv").write_text(text)
+    outcome = steerbench("score", "theirs", "--truth", "true", *QUICK, "--times", "times.csv")
+    assert outcome.status == 2
+    assert said in outcome.err
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

@@ -1,0 +1,237 @@
+"""Further metrics: FLIP of a picture; of a path, what its frames look like one after the other.
+
+Pictures are float [H, W, 3] in [0, 1], as they are scored. Those of a path need more: true pictures
+of consecutive frames, or where each pixel was some frames earlier. No method imports this module,
+so that a package installed for a metric leaves the keys of trainings alone.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bench.cameras import pixel_grid, project, unproject
+from bench.errors import Unavailable, install_command, unexpected
+from bench.metrics import as_bytes, check_pair, declare_torchvision, flicker, psnr_of_mse
+from bench.types import Camera, check_shape
+
+NEEDS = {
+    "tpsnr": "the true pictures of two consecutive frames",
+    "tlpips": "the true pictures of two consecutive frames, and LPIPS",
+    "warp": "a frame as many frames earlier, without a cut between, and the depth of both",
+    "jod": "the true pictures of consecutive frames",
+}
+"""The further metrics of a path, and what a figure of each needs."""
+
+OFFSETS = (1, 7)  # frames between the two of a warping error: what blinks, and what drifts
+SAME_SURFACE = 0.01
+"""Two z-depths are of one surface if they differ by no more than this share. Neighbouring pixels of
+a surface seen at 70 degrees do not, at 200 pixels across a field of view of 40 degrees."""
+
+
+def flip(image: Tensor, reference: Tensor) -> float:
+    """FLIP (Andersson et al. 2020), mean over the pixels: 0 for equal pictures, at most 1.
+
+    Seen as the package `flip-evaluator` assumes, at 67 pixels per degree: a 4K display 0.7 m wide,
+    0.7 m away. Raises Unavailable without that package.
+    """
+    check_pair(image, reference)
+    pair = (picture.float().cpu().numpy() for picture in (reference, image))
+    _, mean, _ = flip_package().evaluate(*pair, "LDR", applyMagma=False)
+    return float(mean)
+
+
+def flip_package() -> ModuleType:
+    """Import `flip_evaluator`; raises Unavailable without it."""
+    with extra("flip", of="flip"):
+        import flip_evaluator
+    return flip_evaluator
+
+
+@contextmanager
+def extra(name: str, of: str) -> Iterator[None]:
+    """Around the import of an optional package: without it, raises Unavailable, which says which
+    extra of this project installs what the metric `of` needs."""
+    try:
+        with warnings.catch_warnings():  # those of others about others
+            warnings.simplefilter("ignore")
+            yield
+    except ImportError as error:
+        how = f"{install_command(name)}, or take it out of protocol.columns"
+        raise Unavailable(f"{of} needs {error.name}: {how}") from error
+
+
+def tpsnr(flicker: float) -> float:
+    """tPSNR in dB, the PSNR of the change from frame to frame: `flicker` in another unit."""
+    return psnr_of_mse(flicker**2)
+
+
+def tlpips(
+    lpips: Callable[[Tensor, Tensor], float],
+    image: Tensor,
+    reference: Tensor,
+    previous_image: Tensor,
+    previous_reference: Tensor,
+) -> float:
+    """The difference of LPIPS steps: that of `image` from its predecessor, less the true one.
+
+    Absolute, as tLP of Chu et al. 2020 (TecoGAN), who print a hundred times as much.
+    """
+    return abs(lpips(previous_image, image) - lpips(previous_reference, reference))
+
+
+class View(NamedTuple):
+    """Where a frame was seen from, and the z-depth [H, W] of what it shows, +inf where empty."""
+
+    camera: Camera
+    depth: Tensor
+
+
+def warping_error(image: Tensor, view: View, earlier_image: Tensor, earlier: View) -> float:
+    """Mean squared error of `image` and the earlier one, warped to it: E_warp of Lai et al. 2018.
+
+    The depths give the flow of a still scene, and what was hidden: a pixel counts if all four
+    between which its earlier place lies show the same surface. The mean is over these pixels and
+    the channels; NaN without any. Also of true pictures it is not 0, because of highlights and
+    resampling.
+    """
+    height, width = view.depth.shape
+    check_shape("image", image, height, width, 3)
+    seen = torch.isfinite(view.depth).flatten()
+    pixels = pixel_grid(width, height)[seen]
+    points = unproject(view.camera, pixels, view.depth.flatten()[seen])
+    place, z = project(earlier.camera, points)  # [R, 2], [R]
+    size = place.new_tensor(earlier.depth.shape).flip(0)
+    low = (place - 0.5).floor()
+    inside = (z > 0) & (low >= 0).all(dim=1) & (low + 1 < size).all(dim=1)
+    place, z, (column, row) = place[inside], z[inside], low[inside].long().T
+    around = torch.stack([earlier.depth[row + v, column + u] for v in (0, 1) for u in (0, 1)])
+    same = ((around - z).abs() <= SAME_SURFACE * z).all(dim=0)
+    if not same.any():
+        return math.nan
+    grid = (2 * place[same] / size - 1)[None, None]
+    source = earlier_image.permute(2, 0, 1)[None].float()
+    warped = torch.nn.functional.grid_sample(source, grid, align_corners=False)[0, :, 0].T
+    kept = image.reshape(-1, 3)[seen][inside][same]
+    return (kept.double() - warped.double()).square().mean().item()
+
+
+def jod(film: Sequence[tuple[np.ndarray, np.ndarray]], fps: float, display: str) -> float:
+    """JOD of ColorVideoVDP (Mantiuk et al. 2024): 10 if nobody sees a difference.
+
+    `film` has each of consecutive frames and its truth, uint8 [H, W, 3]. Raises as
+    `color_video_vdp` does.
+    """
+    metric, videos = color_video_vdp(display), map(np.stack, zip(*film, strict=True))
+    with torch.inference_mode():
+        found, _ = metric.predict(*videos, dim_order="FHWC", frames_per_second=fps)
+    return float(found)
+
+
+def color_video_vdp(display: str) -> Any:
+    """The metric of the package `cvvdp` for a `display` that it knows, "standard_4k" for example.
+
+    Raises Unavailable without that package, SteerbenchError for an unknown display.
+    """
+    declare_torchvision()
+    with extra("cvvdp", of="jod"):
+        import pycvvdp
+    try:
+        return pycvvdp.cvvdp(display_name=display, quiet=True)
+    except pycvvdp.vq_exception as error:
+        known = "a display that `cvvdp --display ?` lists"
+        raise unexpected("protocol.display", known, repr(display)) from error
+
+
+class Shot(NamedTuple):
+    """A frame of a path: pictures [H, W, 3] as they are scored; None: not known."""
+
+    image: Tensor
+    truth: Tensor | None
+    view: View | None
+
+
+class PathScoring:
+    """Scores frames against the frames before them; keeps the last ones, for the JOD all.
+
+    `wanted` are of `NEEDS`, `nets` the backbones of LPIPS, of which `lpips` has those that could be
+    loaded. With `exact_flow` there are also the warping errors of the true pictures, `warp_1_true`
+    and `warp_7_true`, below which none is meant to be. Without, the views come from the method's
+    own depth, and the warping errors are named `warp_1_own` and `warp_7_own`.
+    """
+
+    def __init__(
+        self,
+        wanted: Collection[str],
+        nets: Collection[str],
+        lpips: Mapping[str, Callable[[Tensor, Tensor], float]],
+        exact_flow: bool,
+    ) -> None:
+        own = "" if exact_flow else "_own"
+        self.warps = {f"warp_{k}{own}": k for k in OFFSETS if "warp" in wanted}
+        steps = [f"tlpips_{net}" for net in nets if "tlpips" in wanted]
+        tpsnr_too = ["tpsnr"] if "tpsnr" in wanted else []
+        true = [f"{name}_true" for name in self.warps if exact_flow]
+        self.names = ("flicker", *tpsnr_too, *steps, *self.warps, *true)
+        self._wanted, self._lpips = wanted, lpips
+        self._last: deque[Shot] = deque(maxlen=1 + max(OFFSETS))
+        self._films: list[list[tuple[np.ndarray, np.ndarray]]] = []  # consecutive, with a truth
+
+    def add(self, shot: Shot, cut: bool, device: torch.device) -> dict[str, float]:
+        """The figures of the next frame, LPIPS computed on `device`.
+
+        Frames before a `cut`, or of another size, are not compared with.
+        """
+        figures: dict[str, float] = {}
+        if cut or (self._last and self._last[-1].image.shape != shot.image.shape):
+            self._last.clear()
+        before = self._last[-1] if self._last else None
+        self._last.append(shot)
+        if shot.truth is not None:
+            if before is None or before.truth is None:
+                self._films.append([])
+            else:
+                pictures = shot.image, shot.truth, before.image, before.truth
+                figures |= self._step([picture.to(device) for picture in pictures])
+            if "jod" in self._wanted:
+                self._films[-1].append((as_bytes(shot.image.clamp(0, 1)), as_bytes(shot.truth)))
+        for name, offset in self.warps.items():
+            then = self._last[-1 - offset] if len(self._last) > offset else None
+            if then is not None and then.view is not None and shot.view is not None:
+                figures[name] = warping_error(shot.image, shot.view, then.image, then.view)
+                true = f"{name}_true"
+                if true in self.names and shot.truth is not None and then.truth is not None:
+                    figures[true] = warping_error(shot.truth, shot.view, then.truth, then.view)
+        return figures
+
+    def _step(self, pictures: Sequence[Tensor]) -> dict[str, float]:
+        """The figures of a frame and its truth, and those of the frame before."""
+        figures = {"flicker": flicker(*pictures)}
+        if "tpsnr" in self._wanted:
+            figures["tpsnr"] = tpsnr(figures["flicker"])
+        for net, lpips in self._lpips.items() if "tlpips" in self._wanted else ():
+            figures[f"tlpips_{net}"] = tlpips(lpips, *pictures)
+        return figures
+
+    def whole(self, fps: float, display: str) -> dict[str, float]:
+        """The JOD of all frames: the mean over its films, weighted by their frames."""
+        if "jod" not in self._wanted:
+            return {}
+        films = [film for film in self._films if len(film) > 1]
+        found = [jod(film, fps, display) for film in films]
+        weights = [len(film) for film in films]
+        return {"jod": float(np.average(found, weights=weights)) if films else math.nan}
+
+    def missing(self, found: Collection[str]) -> dict[str, str]:
+        """What each wanted metric needs that is not among those `found`."""
+        names = [*self.names[1:], *(["jod"] if "jod" in self._wanted else [])]
+        return {name: f"needs {NEEDS[name.split('_')[0]]}" for name in names if name not in found}

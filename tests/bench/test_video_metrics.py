@@ -1,0 +1,258 @@
+"""Metrics of a path against closed forms, and against what their own programs print."""
+
+from __future__ import annotations
+
+import builtins
+import math
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from bench.cameras import cast, pixel_grid
+from bench.metrics import Lpips, _lpips_package, as_bytes, flicker, psnr
+from bench.protocol import EvaluationProtocol, Scoring
+from bench.scenes import analytic
+from bench.types import Camera, SteerbenchError, Unavailable, composite
+from bench.video_metrics import View, flip, jod, tlpips, tpsnr, warping_error
+from tests.bench.test_metrics import noise, waves
+
+ROOT = Path(__file__).parents[2]
+WHITE = torch.ones(3)
+
+
+def has(package: str, extra: str) -> pytest.MarkDecorator:
+    reason = f"needs {package}: pip install -e '.[{extra}]'"
+    return pytest.mark.skipif(find_spec(package) is None, reason=reason)
+
+
+def program(start: str, *words: object) -> str:
+    """What the program that `start` starts prints when called with `words`."""
+    before = "from bench.metrics import declare_torchvision; declare_torchvision(); "
+    command = [sys.executable, "-c", before + start, *map(str, words)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    return done.stdout
+
+
+def test_tpsnr_is_the_psnr_of_the_change_from_frame_to_frame():
+    now, true, before, true_before = (noise(9, 8, seed).double() for seed in range(4))
+    blink = flicker(now, true, before, true_before)
+    assert tpsnr(blink) == pytest.approx(psnr(now - before, true - true_before), rel=1e-12)
+    assert tpsnr(0.0) == math.inf
+
+
+@pytest.mark.parametrize("net", ["alex", "vgg"])
+@torch.no_grad()
+def test_tlpips_is_the_difference_of_the_steps_of_the_package(net, lpips_weights, quiet_log):
+    mine, package = Lpips(net, lpips_weights, quiet_log), _lpips_package()
+    with warnings.catch_warnings():  # torchvision deprecates how lpips calls it
+        warnings.simplefilter("ignore", UserWarning)
+        theirs = package.LPIPS(net=net, pnet_rand=True, verbose=False)
+    theirs.load_state_dict(mine._model.state_dict())
+    now, true = waves()
+    before, true_before = now.roll(2, 1), true.roll(1, 1)
+
+    def distance(one: Tensor, other: Tensor) -> float:
+        pair = (2 * picture.permute(2, 0, 1)[None] - 1 for picture in (one, other))
+        return theirs(*pair).item()
+
+    expected = abs(distance(before, now) - distance(true_before, true))
+    found = tlpips(mine, now, true, before, true_before)
+    assert f"{found:.6f}" == f"{expected:.6f}"
+    assert tlpips(mine, now, now, before, before) == 0
+
+
+@has("flip_evaluator", "flip")
+def test_flip_is_what_its_own_program_prints(tmp_path):
+    pictures = waves()
+    for name, picture in zip(("test", "true"), pictures, strict=True):
+        Image.fromarray(as_bytes(picture)).save(tmp_path / f"{name}.png")
+    files = "-r", tmp_path / "true.png", "-t", tmp_path / "test.png", "-nerm", "-nexm"
+    printed = program("from flip_evaluator.flip_python_api import main; main()", *files)
+    assert f"Mean: {flip(*pictures):.6f}\n" in printed
+    assert flip(pictures[0], pictures[0]) == 0
+
+
+@has("pycvvdp", "cvvdp")
+def test_the_jod_is_what_its_own_program_prints(tmp_path):
+    wrong, true = map(as_bytes, waves())
+    shown = [wrong if number % 3 == 0 else true for number in range(10)]
+    film = [(np.roll(frame, k, 1), np.roll(true, k, 1)) for k, frame in enumerate(shown)]
+    for number, pair in enumerate(film):
+        for name, frame in zip(("test", "true"), pair, strict=True):
+            Image.fromarray(frame).save(tmp_path / f"{name}{number:02}.bmp")
+    files = "-r", tmp_path / "true%02d.bmp", "-t", tmp_path / "test%02d.bmp"
+    how = "--fps", 24, "-d", "standard_fhd", "-q", "--device", "cpu"
+    printed = program("from pycvvdp.run_cvvdp import main; main()", *files, *how)
+    found = jod(film, 24.0, "standard_fhd")
+    assert printed.strip() == f"{found:.4f}"
+    assert 5 < found < 9.9
+
+
+@has("pycvvdp", "cvvdp")
+def test_a_display_that_nobody_sells_is_refused():
+    protocol = EvaluationProtocol(name="mine", columns=("jod",), lpips=(), display="oled_9000")
+    with pytest.raises(SteerbenchError, match=r"protocol\.display: expected .* got 'oled_9000'"):
+        protocol.load_lpips(None, None)
+
+
+@pytest.mark.parametrize(
+    ("column", "package", "extra"),
+    [("flip", "flip_evaluator", "flip"), ("jod", "pycvvdp", "cvvdp")],
+)
+def test_a_package_that_is_missing_is_named_before_anything_is_measured(
+    monkeypatch, column, package, extra
+):
+    usual = builtins.__import__
+
+    def without(name, *args, **kwargs):
+        if name == package:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+        return usual(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    protocol = EvaluationProtocol(name="mine", columns=(column,), lpips=())
+    with pytest.raises(Unavailable, match=rf"{column} needs {package}: pip install .*\[{extra}\]"):
+        protocol.load_lpips(None, None)
+
+
+def wall(shift: int, offset: float = 0.0) -> tuple[Tensor, View]:
+    """A picture, `offset` brighter, of a painted wall 2 units away, `shift` pixels to the left."""
+    pose = torch.eye(4)[:3].clone()
+    pose[0, 3] = -shift * 2 / 40
+    camera = Camera(pose, 40.0, 40.0, 12.0, 8.0, 24, 16)
+    rays = cast(camera, pixel_grid(24, 16))
+    x, y, _ = (rays.origins + 2 * rays.directions).T
+    rgb = 0.5 + 0.3 * torch.stack((x, y, torch.sin(9 * x)), dim=-1) + offset
+    return rgb.view(16, 24, 3), View(camera, torch.full((16, 24), 2.0))
+
+
+def test_a_still_scene_has_no_warping_error_and_a_blink_that_of_its_square():
+    assert warping_error(*wall(0), *wall(3)) == pytest.approx(0, abs=1e-12)
+    assert warping_error(*wall(0, 0.1), *wall(3)) == pytest.approx(0.01, rel=1e-5)
+    assert warping_error(*wall(0), *wall(3, 0.1)) == pytest.approx(0.01, rel=1e-5)
+
+
+def test_what_was_hidden_or_is_empty_or_out_of_the_picture_does_not_count():
+    (now, view), (then, earlier) = wall(0), wall(3)
+    hidden = earlier.depth.clone()
+    hidden[4:9, 5:12] = 1.5  # something in front of the wall
+    painted = then.clone()
+    painted[4:9, 5:12] = 9.0
+    assert warping_error(now, view, painted, View(earlier.camera, hidden)) < 1e-12
+    empty = view.depth.clone()
+    empty[:, :6] = math.inf
+    spoilt = now.clone()
+    spoilt[:, :6] = 9.0
+    assert warping_error(spoilt, View(view.camera, empty), then, earlier) < 1e-12
+    assert math.isnan(warping_error(now, view, *wall(24)))
+
+
+@pytest.fixture
+def ball(tmp_path, quiet_log):
+    """The scene `void`: a ball of radius 0.06 at (0.35, -0.2, 0.15) in its model's units."""
+    sizes = {"width": 60, "train": 2, "test": 9, "bounds": [[-1.2] * 3, [1.2] * 3]}
+    return analytic.load("void", **sizes, root=tmp_path, log=quiet_log)
+
+
+def test_the_surface_of_an_embedded_scene_is_exact(ball):
+    camera = ball.splits["test"].cameras[0]
+    depth = ball.surface(camera).flatten()
+    rays, seen = cast(camera), torch.isfinite(depth)
+    assert seen.sum() > 4
+    points = (rays.origins + depth[:, None] * rays.directions)[seen]
+    centre = (torch.tensor([0.35, -0.2, 0.15]) - ball.origin) / ball.unit_length
+    radii = (points - centre).norm(dim=1) * ball.unit_length
+    torch.testing.assert_close(radii, torch.full_like(radii, 0.06), atol=2e-5, rtol=0)
+
+
+def test_media_have_no_surface(tmp_path, quiet_log):
+    cloud = analytic.load("cloud", width=16, train=2, test=1, root=tmp_path, log=quiet_log)
+    assert cloud.surface is None
+
+
+def test_exact_flow_follows_the_true_pictures_of_a_path(tmp_path, quiet_log):
+    scene = analytic.load("totem", width=160, train=2, test=8, root=tmp_path, log=quiet_log)
+    test = scene.splits["test"]
+    (then, earlier), (now, view) = (
+        (composite(test.images[k], WHITE), View(test.cameras[k], scene.surface(test.cameras[k])))
+        for k in (0, 7)
+    )
+    still = (now - then).square()[view.depth < math.inf].mean()
+    assert warping_error(now, view, then, earlier) < 0.1 * still
+
+
+PATH = EvaluationProtocol(name="path", lpips=(), columns=("tpsnr", "warp"))
+
+
+def film(protocol, surface=None, cut: int | None = None, depth: bool = True) -> list[dict]:
+    """The figures of nine frames of the wall, seen from one place, the truth black."""
+    scoring = Scoring(protocol, {}, WHITE, (), surface)
+    picture, view = wall(0)
+    given = {"camera": view.camera, "depth": view.depth if depth else None}
+    truth = torch.zeros(16, 24, 3, dtype=torch.uint8)
+    return [scoring.score(k, picture, truth, cut=k == cut, **given) for k in range(9)]
+
+
+def test_the_metrics_of_a_path_start_when_enough_frames_precede():
+    found = film(PATH, cut=1)
+    assert [k for k, figures in enumerate(found) if "tpsnr" in figures] == list(range(2, 9))
+    assert [k for k, figures in enumerate(found) if "warp_1_own" in figures] == list(range(2, 9))
+    assert [k for k, figures in enumerate(found) if "warp_7_own" in figures] == [8]
+    assert found[8]["warp_7_own"] == pytest.approx(0, abs=1e-12)
+
+
+def test_the_flow_is_the_scenes_and_otherwise_named_as_the_methods_own():
+    exact = film(PATH, surface=lambda camera: torch.full((16, 24), 2.0), depth=False)
+    assert {"warp_1", "warp_7", "warp_1_true", "warp_7_true"} <= exact[8].keys()
+    assert exact[8]["warp_7_true"] == 0  # it is all black
+    assert "warp_1_own" not in exact[8]
+    assert not any(name.startswith("warp") for name in film(PATH, depth=False)[8])
+
+
+def test_the_flow_works_without_a_truth_and_a_gap_in_it_ends_a_film(monkeypatch):
+    seen = []
+    monkeypatch.setattr(
+        "bench.video_metrics.jod", lambda film, *_: seen.append(len(film)) or 10.0 - len(film)
+    )
+    protocol = replace(PATH, columns=("warp", "jod"), display="mine")
+    scoring = Scoring(protocol, {}, WHITE, ())
+    picture, view = wall(0)
+    truth = torch.zeros(16, 24, 3, dtype=torch.uint8)
+    for k in range(10):
+        known = None if k in (0, 4, 6) else truth
+        figures = scoring.score(k, picture, known, cut=False, camera=view.camera, depth=view.depth)
+        assert ("warp_1_own" in figures) == (k > 0)
+    assert scoring.whole() == {"jod": pytest.approx((3 * 7 + 3 * 7) / 6)}  # frames 1-3 and 7-9
+    assert seen == [3, 3]
+
+
+def test_what_is_missing_says_what_it_needs(run_of_path):
+    rows, record = run_of_path
+    missing = record["missing"]
+    assert set(missing) == {"tpsnr", "warp_1_own", "warp_7_own"}  # the depths are infinite
+    assert missing["tpsnr"] == "needs the true pictures of two consecutive frames"
+    assert rows.set_index("metric")["n"][["tpsnr", "warp_7_own"]].tolist() == [0, 0]
+
+
+@pytest.fixture
+def run_of_path(tiny_scene, offset_method, quiet_log):
+    """Rows and record of a run along two cameras with a truth and one without between them."""
+    from bench.run import Task, measure
+    from bench.trajectories import from_split
+    from bench.types import Budget
+
+    whole = from_split(tiny_scene)
+    steps = (whole.steps[0], replace(whole.steps[1], truth=None), whole.steps[2])
+    trajectory = replace(whole, steps=steps)
+    task = Task(tiny_scene, trajectory, PATH, Budget("tiny", steps=1, samples=1), seed=0)
+    (measured,) = measure([offset_method], task, quiet_log)
+    return measured.rows, measured.record
