@@ -131,7 +131,7 @@ class Job:
     state: the folder for the trained model; its place may change between `fit` and `load`
     background: [3] in [0, 1], onto which pictures with an alpha are composited
     bounds: [[x, y, z], [x, y, z]], the box of the content, in the units of the data set
-    steps, samples, renderer_steps: what the budget allows: docs/commands.md of steerbench
+    steps, samples, renderer_steps: the budget: of the optimiser, per step, of a second stage
     seed: of everything random
     """
 
@@ -196,8 +196,7 @@ def serve(kind):
     load(job): load from `job.state` what `fit` stored there. Without it every run trains again.
     reset(): a new sequence of frames begins
     sizes(): bytes of the model by component; without it, those of the files in `job.state`
-    name, device, precision, memory: attributes that rows show; `memory` is the number of preceding
-        frames that a frame depends on
+    name, device, precision, memory: attributes for rows; `memory`: preceding frames that are used
     knobs: a dict of settings that need no new training, each with a list of values to try
     files: those that the pictures depend on, beside the modules that are loaded
     """
@@ -229,7 +228,8 @@ def _converse(channel, kind):
         elif message in ("fit", "load"):
             job = Job(header, channel)
             getattr(renderer, message)(job)
-            stored = _bytes_below(job.state)
+            files = [path for path in job.state.rglob("*") if path.is_file()] if job.state else []
+            stored = {"model": sum(path.stat().st_size for path in files)} if files else {}
             _forget_peak()
         elif message == "reset":
             getattr(renderer, "reset", lambda: None)()
@@ -237,9 +237,12 @@ def _converse(channel, kind):
             camera = Camera(header)
             _frames[-1] = _Clock()
             picture = renderer.render(camera)
-            answer = {**_frames[-1].report(), "peak_bytes": _peak()}
             arrays = picture if isinstance(picture, dict) else {"rgb": picture}
-            arrays = {name: _numpy(array) for name, array in arrays.items()}
+            # `_now` waits only for torch: what else computes in the background is fetched before.
+            arrays = {k: x if hasattr(x, "detach") else np.asarray(x) for k, x in arrays.items()}
+            answer = {**_frames[-1].report(), "peak_bytes": _peak()}
+            of_torch = {k: x.detach().cpu() for k, x in arrays.items() if hasattr(x, "detach")}
+            arrays.update({k: x.numpy() for k, x in of_torch.items()})
         elif message == "sizes":
             answer = {"sizes": renderer.sizes() if hasattr(renderer, "sizes") else stored}
         else:
@@ -249,9 +252,10 @@ def _converse(channel, kind):
 
 def _about(renderer):
     """What rows and keys say about a renderer."""
-    torch = _torch_on_gpu()
-    usual = {"name": type(renderer).__name__, "device": "cuda" if torch else "cpu"}
-    usual.update(precision="unknown", memory=0, knobs={})
+    torch = sys.modules.get("torch")
+    device = "cuda" if torch and torch.cuda.is_available() else "cpu"
+    usual = {"name": type(renderer).__name__, "device": device, "precision": "unknown"}
+    usual.update(memory=0, knobs={})
     told = {name: getattr(renderer, name, value) for name, value in usual.items()}
     can = [message for message in ("fit", "load") if hasattr(renderer, message)]
     files = [*_files(), *map(str, getattr(renderer, "files", ()))]
@@ -279,46 +283,36 @@ def _packages():
     return {"python": sys.version.split()[0], **{str(k): str(v) for k, v in found.items()}}
 
 
-def _bytes_below(folder):
-    files = [path for path in folder.rglob("*") if path.is_file()] if folder else ()
-    return {"model": sum(path.stat().st_size for path in files)} if files else {}
-
-
-def _torch_on_gpu():
-    """The module torch, if it is loaded and sees a GPU; otherwise None."""
-    torch = sys.modules.get("torch")
-    return torch if torch is not None and torch.cuda.is_available() else None
-
-
 def _now():
-    """The time in nanoseconds, once the device has finished its work."""
-    torch = _torch_on_gpu()
-    if torch is not None and torch.cuda.is_initialized():
-        torch.cuda.synchronize()
+    """The time in nanoseconds, once a GPU has finished its work."""
+    cuda = _cuda()
+    if cuda:
+        cuda.synchronize()
     return time.perf_counter_ns()
 
 
-def _numpy(array):
-    return array.detach().cpu().numpy() if hasattr(array, "detach") else np.asarray(array)
+def _cuda():
+    """`torch.cuda`, if it is in use; otherwise None."""
+    torch = sys.modules.get("torch")
+    return torch.cuda if torch and torch.cuda.is_initialized() else None
 
 
 def _forget_peak():
-    torch = _torch_on_gpu()
-    if torch is not None:
-        torch.cuda.reset_peak_memory_stats()
+    cuda = _cuda()
+    if cuda:
+        cuda.reset_peak_memory_stats()
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
 
 
 def _peak():
     """Peak memory in bytes since `_forget_peak`: of the GPU, or of this process; None: unknown."""
-    torch = _torch_on_gpu()
-    if torch is not None and torch.cuda.is_initialized():
-        return torch.cuda.max_memory_allocated()
+    cuda, found = _cuda(), None
+    if cuda:
+        return cuda.max_memory_allocated()
     with suppress(OSError):
         found = re.search(r"VmHWM:\s*(\d+)", Path("/proc/self/status").read_text())
-        return int(found.group(1)) * 1024 if found else None
-    return None
+    return found and 1024 * int(found.group(1))
 
 
 _frames = [_Clock()]  # the clock of the present frame

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 import time
+from contextlib import suppress
 from typing import NamedTuple
 
 import psutil
@@ -40,9 +42,19 @@ class Watch:
 
 
 def _seconds() -> tuple[float, float, float]:
-    """Seconds: of a monotonic clock, of work on all cores, and of work of this process."""
+    """Seconds: of a monotonic clock, of work on all cores, and of work of this process and its
+    children."""
     spent = psutil.cpu_times()._asdict()
     # `user` and `nice` already include the time of guests.
     none = ("idle", "iowait", "guest", "guest_nice")
     busy = sum(seconds for name, seconds in spent.items() if name not in none)
-    return time.monotonic(), busy, time.process_time()
+    return time.monotonic(), busy, time.process_time() + _of_children()
+
+
+def _of_children() -> float:
+    """Seconds of work of the processes that this one has started, and of theirs, also if ended."""
+    seconds = sum(os.times()[2:4])
+    for process in psutil.Process().children(recursive=True):
+        with suppress(psutil.NoSuchProcess):  # one that has just ended
+            seconds += sum(process.cpu_times()[:4])
+    return seconds

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shlex
 import shutil
 import subprocess
@@ -30,6 +31,8 @@ from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.external.worker import Header, Worker
 
 WORKERS = Path(__file__).with_name("workers")  # those that come with steerbench
+
+LEFT_OUT = re.compile(r"(^|/)(\.[^/]|__pycache__)")
 
 UNTOLD: dict[str, Any] = {
     **{"device": "cpu", "precision": "unknown", "memory": 0},
@@ -166,12 +169,9 @@ class External:
 
     def _train(self, folder: Path, job: Mapping[str, object], log: Log) -> float:
         """Let it train on the scene as files, and put what it stores into `folder`; the seconds."""
-        cameras = [
-            data_camera(self._scene, camera) for camera in self._scene.splits["train"].cameras
-        ]
         pictures = [
-            {"file": picture_file("train", number), **_described(camera)}
-            for number, camera in enumerate(cameras)
+            {"file": picture_file("train", number), **self._described(camera)}
+            for number, camera in enumerate(self._scene.splits["train"].cameras)
         ]
         with explained(folder), tempfile.TemporaryDirectory(dir=folder) as temporary:
             place, state = Path(temporary) / "scene", Path(temporary) / "state"
@@ -199,14 +199,19 @@ class External:
             (folder / "output.txt").write_text(self._worker.output())
         return seconds
 
+    def _described(self, camera: Camera) -> dict[str, object]:
+        """A camera in scene units, as the protocol has it."""
+        names = ("width", "height", "fx", "fy", "cx", "cy")
+        pose = data_camera(self._scene, camera).c2w.tolist()
+        return {**{name: getattr(camera, name) for name in names}, "c2w": pose}
+
     def reset(self) -> None:
         """Begin a new sequence."""
         self._worker.ask("reset", self.frame_s)
 
     def render(self, camera: Camera, probe: Probe) -> Frame:
         """Let it render one frame; the times are its own."""
-        seen = data_camera(self._scene, camera)
-        told, arrays = self._worker.ask("render", self.frame_s, **_described(seen))
+        told, arrays = self._worker.ask("render", self.frame_s, **self._described(camera))
         ns, stages, counters = (told.get(name, {}) for name in ("ns", "stages", "counters"))
         peak = told.get("peak_bytes")
         self._expect(type(ns) is int and ns > 0, "ns above 0", f"ns {ns}")
@@ -247,11 +252,6 @@ class External:
         return sizes
 
 
-def _described(camera: Camera) -> dict[str, object]:
-    names = ("width", "height", "fx", "fy", "cx", "cy")
-    return {**{name: getattr(camera, name) for name in names}, "c2w": camera.c2w.tolist()}
-
-
 def _counts(told: object) -> bool:
     """Whether a worker has told whole numbers from 0 on, by name."""
     return isinstance(told, dict) and all(type(x) is int and x >= 0 for x in told.values())
@@ -261,17 +261,8 @@ def _files_at(path: Path) -> list[Path]:
     """A file, or the files below a folder, without hidden ones and what Python compiles."""
     if not path.exists():
         raise unexpected("method.files", "files and folders", f"{path}, which is not there")
-    left_out = (".", "__pycache__")
-    return (
-        [path]
-        if path.is_file()
-        else [
-            file
-            for file in path.rglob("*")
-            if file.is_file()
-            and not any(x.startswith(left_out) for x in file.relative_to(path).parts)
-        ]
-    )
+    below = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
+    return [file for file in below if not LEFT_OUT.search(str(file.relative_to(path)))]
 
 
 def _close(worker: Worker) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from typing import NamedTuple
 
@@ -60,3 +62,15 @@ def test_our_own_work_is_not_that_of_others():
         pass
     seen = watch.seen()
     assert 0 <= seen.busy < seen.cores
+
+
+def test_the_work_of_a_child_is_our_own_while_it_runs_and_afterwards():
+    lines = "import time\nwhile time.process_time() < 0.5: pass\nprint(flush=True)\ninput()"
+    before = neighbours._of_children()
+    command = [sys.executable, "-c", lines]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        child.stdout.readline()
+        running = neighbours._of_children() - before
+        child.stdin.close()
+    ended = neighbours._of_children() - before
+    assert 0.45 < running <= ended + 0.03 < 60  # the kernel counts in hundredths

@@ -1,6 +1,7 @@
 """A worker for a model of nerfstudio, run by the Python of an environment with that package.
 
-Options: `config`, the config.yml of a training on data in the coordinates of the cameras.
+Options: `config`, the config.yml of a training on data in the coordinates of the cameras; `output`,
+the picture among the outputs of the model.
 """
 
 import sys
@@ -17,7 +18,8 @@ from steerbench_worker import serve
 
 
 class Nerfstudio:
-    def __init__(self, config):
+    def __init__(self, config, output="rgb"):
+        self.output = output
         trained, self.pipeline, checkpoint, _ = eval_setup(Path(config), test_mode="inference")
         self.name, self.files = trained.method_name, [config, checkpoint]
         data = self.pipeline.datamanager.train_dataparser_outputs
@@ -31,7 +33,10 @@ class Nerfstudio:
         pose[:, 3] *= self.scale
         lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
         seen = Cameras(pose.float()[None], *lens).to(self.pipeline.device)
-        return self.pipeline.model.get_outputs_for_camera(seen)["rgb"]
+        pictures = self.pipeline.model.get_outputs_for_camera(seen)
+        if self.output not in pictures:
+            raise ValueError(f"output: expected one of {', '.join(pictures)}, got {self.output}")
+        return pictures[self.output]
 
     def sizes(self):
         parameters = self.pipeline.model.parameters()

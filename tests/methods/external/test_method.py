@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from textwrap import dedent
 
 import psutil
 import pytest
@@ -295,3 +296,63 @@ def test_a_ply_file_is_rendered_without_its_data_set(external, moved_scene, tmp_
     assert method.sizes() == {"gaussians": 50 * 59 * 4}
     assert path in method.reads
     assert not (tmp_path / "outputs").exists()  # nothing was trained, nothing was written
+
+
+STUDIO = """
+    from types import SimpleNamespace
+
+    import torch
+
+    class Cameras:
+        def __init__(self, c2w, *lens):
+            self.c2w, self.lens = c2w, lens
+
+        def to(self, device):
+            return self
+
+    class Model(torch.nn.Linear):
+        def get_outputs_for_camera(self, camera):
+            picture = torch.zeros(32, 40, 3)
+            picture[0, :18, 0] = torch.cat((camera.c2w.flatten(), torch.tensor(camera.lens)))
+            return {"picture": picture}
+
+    def eval_setup(config, test_mode):
+        turn = torch.tensor([[0.0, 1.0, 0.0, 5.0], [-1.0, 0.0, 0.0, 6.0], [0.0, 0.0, 1.0, 7.0]])
+        data = SimpleNamespace(dataparser_transform=turn, dataparser_scale=0.5)
+        manager, model = SimpleNamespace(train_dataparser_outputs=data), Model(2, 3)
+        pipeline = SimpleNamespace(datamanager=manager, model=model, device="cpu")
+        return SimpleNamespace(method_name="nerfacto"), pipeline, config.with_name("a.ckpt"), 9
+"""
+
+
+def test_a_nerfstudio_model_gets_the_camera_in_its_own_coordinates(
+    external, moved_scene, quiet_log, tmp_path, monkeypatch
+):
+    """With a stand-in for the package, whose picture holds the camera."""
+    for name, lines in (
+        ("__init__", ""),
+        ("cameras/__init__", ""),
+        ("cameras/cameras", STUDIO),
+        ("utils/__init__", ""),
+        ("utils/eval_utils", "from nerfstudio.cameras.cameras import eval_setup"),
+    ):
+        path = tmp_path / f"nerfstudio/{name}.py"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(dedent(lines))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    options = {"config": str(tmp_path / "config.yml"), "output": "picture"}
+    method = external("nerfstudio", options=options)
+    method.fit(moved_scene, BUDGET, quiet_log)
+    assert (method.name, method.sizes()) == ("nerfacto", {"model": 4 * (2 * 3 + 3)})
+    camera = moved_scene.splits["test"].cameras[1]
+    shown = method.render(camera, NullProbe()).rgb[0, :18, 0]
+    x, y, z = move_camera(camera, 3.0, moved_scene.origin).c2w * torch.tensor([1, -1, -1, 1])
+    # A quarter turn, a shift by (5, 6, 7), and half of it.
+    wanted = torch.stack((y, -x, z))
+    wanted[:, 3] = (wanted[:, 3] + torch.tensor([5.0, 6.0, 7.0])) / 2
+    lens = torch.tensor([60.0, 60.0, 20.0, 16.0, 40.0, 32.0])
+    torch.testing.assert_close(shown, torch.cat((wanted.flatten(), lens)), rtol=0, atol=1e-6)
+    method = external("nerfstudio", options={"config": "config.yml"})
+    with pytest.raises(SteerbenchError, match="output: expected one of picture, got rgb"):
+        method.fit(moved_scene, BUDGET, quiet_log)
+        method.render(camera, NullProbe())
