@@ -254,7 +254,7 @@ def distance_table(table: PaperTable, measured: Mapping[str, Repeated]) -> Table
 
     heads = (metric_format(metric)[0].rstrip(" ↑↓") for metric in metrics)
     cells = tuple((line.label, *(cell(line, metric) for metric in metrics)) for line in others)
-    return Table("Distances", (f"here / paper, from {reference.label}", *heads), cells)
+    return Table("Distances", (f"here / paper, against {reference.label}", *heads), cells)
 
 
 def _scenes(metrics: Sequence[str], lines: Sequence[Repeated]) -> Table:

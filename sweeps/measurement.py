@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -26,6 +26,8 @@ from reports.trackers import tracker
 from sweeps.configured import build, checked_settings, scene_folder, scene_of
 from sweeps.overrides import target_of
 from sweeps.processes import device_lock
+
+J = TypeVar("J", bound="Job")
 
 PLACES = ("outputs", "report", "tracker", "weights_dir")
 """Settings that are only locations and do not change a row."""
@@ -137,11 +139,17 @@ def obtain(jobs: Sequence[Job]) -> tuple[list[str], bool]:
     return _told(ready, measured, log), measured
 
 
-def stored(jobs: Sequence[Job]) -> list[str]:
-    """The keys that `obtain` would find in the store, if it has all; otherwise none."""
-    log = ConsoleLog(jobs[0].outputs)
-    ready = _ready(jobs, log)
-    return _told(ready, False, log) if _stored(ready) else []
+def stored(jobs: Sequence[J]) -> dict[str, J]:
+    """Those of `jobs` that can be used here, by the keys that `obtain` would find in the store, if
+    it has all of them; otherwise none."""
+    log, left = ConsoleLog(jobs[0].outputs), list(jobs)
+    while True:
+        try:
+            ready = _ready(left, log)
+        except JobFailed as failed:
+            left = [job for job in left if job is not failed.job]
+        else:
+            return dict(zip(_told(ready, False, log), left, strict=True)) if _stored(ready) else {}
 
 
 @dataclass(frozen=True, eq=False)

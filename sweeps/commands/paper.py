@@ -113,15 +113,15 @@ def _groups(jobs: Sequence[Planned], look_up: bool) -> tuple[list[Group], set[st
     groups: list[Group] = []
     measured: set[str] = set()
     for together in by_turns.values():
-        runs: list[str] = []
+        found: dict[str, Planned] = {}
         with suppress(SteerbenchError):  # a job that cannot start says so when it is measured
-            runs = stored(together) if look_up else []
-        if runs:
-            measured |= {job.key for job in together}
-            for job, run in zip(together, runs, strict=True):
-                say(job, run)
-        else:
-            groups.append(list(enumerate(together, sum(map(len, groups)))))
+            found = stored(together) if look_up else {}
+        for run, job in found.items():
+            say(job, run)
+        known = {job.key for job in found.values()}
+        if left := [job for job in together if job.key not in known]:
+            groups.append(list(enumerate(left, sum(map(len, groups)))))
+        measured |= known
     return groups, measured
 
 

@@ -129,7 +129,7 @@ def test_a_section_shows_both_blocks_and_distances_of_the_first(run, tmp_path):
     assert "(steernerf_lean)" not in paper
     assert "| with joint training (steernerf_lean) |" in beyond
     assert paper.count("| measured |") == beyond.count("| measured |") == 1
-    assert "| here / paper, from with joint training | PSNR, dB | SSIM | LPIPS vgg |" in paper
+    assert "| here / paper, against with joint training | PSNR, dB | SSIM | LPIPS vgg |" in paper
     assert "| without joint training | +0.00 / -1.07 |" in paper
     assert "here / paper" not in beyond
 
@@ -147,7 +147,7 @@ def test_a_cell_has_the_distance_to_the_reference_here_and_in_the_paper(run):
     assert line == ("elsewhere", "-1.46 / -1.00", "×0.50 / ×1.20", ABSENT)
     (line,) = distance_table(table, {}).lines
     assert line == ("elsewhere", f"{ABSENT} / -1.00", f"{ABSENT} / ×1.20", ABSENT)
-    heads = ("here / paper, from here", "PSNR, dB", "ms / frame", "model, MB")
+    heads = ("here / paper, against here", "PSNR, dB", "ms / frame", "model, MB")
     assert distance_table(table, {}).columns == heads
 
 

@@ -73,7 +73,7 @@ def test_lines_that_are_measured_in_turns_are_found_together_or_not_at_all(elsew
     """A table of times must not have one line of today beside one of last week."""
     assert measured(0.5, 0.75)
     assert len(stored(in_turns(0.5, 0.75))) == 2
-    assert stored(in_turns(0.5, 0.25)) == []
+    assert stored(in_turns(0.5, 0.25)) == {}
     assert measured(0.5, 0.25)
     assert not measured(0.75, 0.5)
 
@@ -84,10 +84,10 @@ def test_what_an_interruption_left_of_a_group_is_measured_again_with_the_rest(el
     mark = store.folder / first / "of yesterday"
     mark.touch()
     store.remove(second)
-    assert stored(in_turns(0.5, 0.75)) == []
+    assert stored(in_turns(0.5, 0.75)) == {}
     assert measured(0.5, 0.75)
     assert not mark.exists()
-    assert stored(in_turns(0.5, 0.75)) == [first, second]
+    assert list(stored(in_turns(0.5, 0.75))) == [first, second]
 
 
 @pytest.mark.parametrize("broken", ["method.level=7", "device=cuda:99"])
@@ -104,7 +104,9 @@ def test_a_job_that_fails_is_left_out_and_the_others_are_measured_in_turns(
     ended = read(tmp_path)
     assert [job.failure for job in ended] == [None, str(error), None]
     assert [job.measured for job in ended] == [False] * 3  # the second time
-    assert [job.run for job in ended if job.run] == stored([first, last])
+    assert {job.run for job in ended if job.run} == {*stored([first, last])}
+    if broken.startswith("device"):  # what cannot be used here is not looked for
+        assert stored(jobs) == stored([first, last])
     assert capsys.readouterr().err.count("failed: broken") == 2
 
 
