@@ -117,13 +117,17 @@ class StageClock:
         stages = dict(stages_ns) if self._stages else {}
         stages[OTHER] = ns - sum(stages.values())
         wall_ns = sum(self._ns.values())
-        self._told = {"stages_ns": stages, "wall_ns": wall_ns, "peak_bytes": peak_bytes}
+        self._told: dict[str, Any] = {
+            "stages_ns": stages,
+            "wall_ns": wall_ns,
+            "peak_bytes": peak_bytes,
+        }
 
     def _begin(self) -> None:
         self._ns: defaultdict[str, int] = defaultdict(int, {OTHER: 0})
         self._done: defaultdict[str, int | Tensor] = defaultdict(int)
         self._dense: defaultdict[str, int] = defaultdict(int)
-        self._told: dict[str, Any] = {}  # what another process has told of this frame
+        self._told = {}  # what another process has told of this frame
 
     def _now(self) -> int:
         if self._device.type == "cuda":

@@ -15,7 +15,6 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from operator import getitem
 from pathlib import Path
 from typing import NamedTuple
 
@@ -54,7 +53,7 @@ def export(scene: Scene, path: Trajectory, folder: Path, layout: str, log: Log) 
     if folder.exists() and any(folder.iterdir()):
         raise unexpected(folder, "a new or an empty folder", "one with files")
     train = scene.splits["train"]
-    learned = [partial(getitem, train.images, number) for number in range(len(train))]
+    learned = [partial(train.images.__getitem__, number) for number in range(len(train))]
     known = {
         "train": _shots(scene, train.cameras, learned),
         "test": _shots(scene, [step.camera for step in path.steps], _true(scene, path)),
@@ -72,7 +71,7 @@ def _true(scene: Scene, path: Trajectory) -> list[Callable[[], Tensor]]:
     pictures: list[Callable[[], Tensor]] = []
     for step in path.steps:
         if step.truth is not None:
-            pictures.append(partial(getitem, images, step.truth))
+            pictures.append(partial(images.__getitem__, step.truth))
         elif scene.exact is not None:
             pictures.append(partial(scene.exact, step.camera))
         else:

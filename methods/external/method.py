@@ -130,7 +130,7 @@ class External:
         """Let it train and store the result, load what it stored before, or get ready."""
         self._scene, can = scene, self._about["can"]
         corners = scene.origin.double() + scene.unit_length * scene.bounds.double()
-        job = {
+        job: dict[str, Any] = {
             "background": scene.background.tolist(),
             "bounds": corners.tolist(),
             "steps": budget.steps,
@@ -167,7 +167,7 @@ class External:
             **computed_by(write_blender),
         }
 
-    def _train(self, folder: Path, job: Mapping[str, object], log: Log) -> float:
+    def _train(self, folder: Path, job: Mapping[str, Any], log: Log) -> float:
         """Let it train on the scene as files, and put what it stores into `folder`; the seconds."""
         pictures = [
             {"file": picture_file("train", number), **self._described(camera)}
@@ -199,7 +199,7 @@ class External:
             (folder / "output.txt").write_text(self._worker.output())
         return seconds
 
-    def _described(self, camera: Camera) -> dict[str, object]:
+    def _described(self, camera: Camera) -> dict[str, Any]:
         """A camera in scene units, as the protocol has it."""
         names = ("width", "height", "fx", "fy", "cx", "cy")
         pose = data_camera(self._scene, camera).c2w.tolist()
@@ -247,7 +247,7 @@ class External:
     def sizes(self) -> dict[str, int]:
         """Bytes by component, as the worker tells."""
         told, _ = self._worker.ask("sizes", self.frame_s)
-        sizes = told.get("sizes")
+        sizes: Any = told.get("sizes")
         self._worker.expect(_counts(sizes), "sizes", "sizes in bytes", told)
         return sizes
 

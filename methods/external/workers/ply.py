@@ -5,6 +5,7 @@ Options: `file`, in the coordinates of the cameras; `stop`, the transmittance at
 
 import sys
 from pathlib import Path
+from typing import Any
 
 sys.path.pop(0)  # this folder: its names are those of packages
 sys.path.append(str(Path(__file__).parents[3]))
@@ -15,7 +16,7 @@ from bench.cameras import place_camera
 from bench.types import Camera, NullProbe, Scene
 from methods.gaussians import ply
 from methods.rendering.frame import FeatureFrame
-from steerbench_worker import Job, serve
+from steerbench_worker import serve
 
 
 class Ply:
@@ -26,7 +27,7 @@ class Ply:
         self.files, self.stop, self.knobs = [file], stop, {"stop": [1e-1, 1e-2, 1e-3]}
         self.device = "cuda" if torch.cuda.is_available() else "cpu"
 
-    def load(self, job: Job) -> None:
+    def load(self, job: Any) -> None:
         everywhere = torch.tensor([[-torch.inf] * 3, [torch.inf] * 3])
         self.background = torch.tensor(job.background).to(self.device)
         scene = Scene("", {}, self.background, everywhere, unit_length=1.0, digest="")
