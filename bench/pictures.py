@@ -108,7 +108,7 @@ def reported_times(file: Path, pairs: Sequence[Pair]) -> list[float]:
         table.index = table.index.map(lambda name: Path(name).stem)
         names = [Path(pair.name).stem for pair in pairs]
         counts = table.index.value_counts().reindex(names, fill_value=0)
-        if wrong := [str(name) for name, count in counts.items() if count != 1]:
+        if wrong := [name for name in names if counts[name] != 1]:
             raise unexpected(
                 file, "one line for each picture", f"none or several of {_some(wrong)}"
             )

@@ -165,8 +165,8 @@ class PathScoring:
 
     `wanted` are of `NEEDS`, `nets` the backbones of LPIPS, of which `lpips` has those that could be
     loaded. With `exact_flow` there are also the warping errors of the true pictures, `warp_1_true`
-    and `warp_7_true`, below which none is meant to be. Without, the views come from the method's
-    own depth, and the warping errors are named `warp_1_own` and `warp_7_own`.
+    and `warp_7_true`. Without, the views come from the method's own depth, and the warping errors
+    are named `warp_1_own` and `warp_7_own`.
     """
 
     def __init__(

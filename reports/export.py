@@ -13,7 +13,16 @@ from reports.paper_tables import Lines, PaperTable
 from reports.runs import Repeated
 from reports.tables import decimal
 
-DECIMALS = {"psnr": 2, "ssim": 3, "lpips": 3, "fps": 2, "frame": 2, "stage": 2, "size": 1}
+DECIMALS = {
+    "psnr": 2,
+    "ssim": 3,
+    "lpips": 3,
+    "flicker": 4,
+    "fps": 2,
+    "frame": 2,
+    "stage": 2,
+    "size": 1,
+}
 """Decimals with which the paper prints a metric, by the first part of its name."""
 
 ESCAPES = str.maketrans(

@@ -6,7 +6,7 @@ The pictures to learn from are those of the training split, the frames of the pa
 - `colmap`: `images` and `sparse/0`, only of the training pictures: programs that hold out every
   eighth picture themselves would train on the others of a path. The path is a capture of its own,
   in `test`. The points are random ones in the scene's bounds.
-- `nerfbaselines`: as `blender`, with `nb-info.json`, and the path as `trajectory.json`.
+- `nerfbaselines`: as `blender`, with `nb-info.json`, and the path as `path.json`.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def export(scene: Scene, path: Trajectory, folder: Path, layout: str, log: Log) 
     if folder.exists() and any(folder.iterdir()):
         raise unexpected(folder, "a new or an empty folder", "one with files")
     train = scene.splits["train"]
-    learned = [partial(train.images.__getitem__, number) for number in range(len(train))]
+    learned = [partial(_read, train.images, number) for number in range(len(train))]
     known = {
         "train": _shots(scene, train.cameras, learned),
         "test": _shots(scene, [step.camera for step in path.steps], _true(scene, path)),
@@ -62,7 +62,11 @@ def export(scene: Scene, path: Trajectory, folder: Path, layout: str, log: Log) 
         LAYOUTS[layout](scene, known, folder, log)
         if layout == "nerfbaselines":
             cameras = [step.camera for step in path.steps]
-            write_path(folder / "trajectory.json", cameras, scene, form="nerfbaselines")
+            write_path(folder / "path.json", cameras, scene, form="nerfbaselines")
+
+
+def _read(images: Sequence[Tensor], index: int) -> Tensor:
+    return images[index]
 
 
 def _true(scene: Scene, path: Trajectory) -> list[Callable[[], Tensor]]:
@@ -71,7 +75,7 @@ def _true(scene: Scene, path: Trajectory) -> list[Callable[[], Tensor]]:
     pictures: list[Callable[[], Tensor]] = []
     for step in path.steps:
         if step.truth is not None:
-            pictures.append(partial(images.__getitem__, step.truth))
+            pictures.append(partial(_read, images, step.truth))
         elif scene.exact is not None:
             pictures.append(partial(scene.exact, step.camera))
         else:

@@ -97,7 +97,7 @@ def test_nerfbaselines_gets_its_description_and_the_path(scene, path, tmp_path, 
     export(scene, path, tmp_path / "out", "nerfbaselines", quiet_log)
     about = json.loads((tmp_path / "out/nb-info.json").read_text())
     assert (about["id"], about["scene"]) == ("steerbench", "totem")
-    found = follow(scene, str(tmp_path / "out/trajectory.json"))
+    found = follow(scene, str(tmp_path / "out/path.json"))
     for step, other in zip(found.steps, path.steps, strict=True):
         torch.testing.assert_close(step.camera.c2w, other.camera.c2w, atol=2e-6, rtol=0)
 

@@ -1,0 +1,99 @@
+"""`steerbench export nerfbaselines` and `import nerfbaselines`: results to and from others."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import shlex
+from collections import Counter
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any
+
+from bench.cameras import move_camera
+from bench.errors import unexpected
+from bench.nerfbaselines import METRICS, Prediction, read_results, write_results
+from bench.provenance import digest
+from bench.results import RECORD, Store
+from reports.comparison import comparison
+from reports.runs import load
+from sweeps.commands.render import words_of_run
+from sweeps.configured import build, scene_of
+from sweeps.overrides import composed, setting
+from sweeps.terminal import console, show
+
+
+def main(options: argparse.Namespace) -> int:
+    """Export a run, or import a file and print its figures beside those of other runs."""
+    return (_export if options.command == "export" else _import)(options)
+
+
+def _export(options: argparse.Namespace) -> int:
+    store = Store(options.outputs)
+    key = store.whole_key(options.run)
+    (run,), place = load(store, {key: key}), setting("outputs", str(options.outputs))
+    config = composed([*words_of_run(key, [place]), place])
+    scene = scene_of(config)
+    if scene.digest != run.record["scene"]["digest"]:
+        raise unexpected(f"run {key}", "the scene that it was measured on", "one that has changed")
+    steps = build(config, "trajectory", scene).steps
+    frames = run.frames.dropna(subset="psnr")
+    if twice := [name for name, count in Counter(frames["name"]).items() if count > 1]:
+        raise unexpected(f"run {key}", "a path that shows each view once", f"{twice[0]} again")
+    predictions = []
+    for _, row in frames.iterrows():
+        index = int(row["frame"])
+        picture, truth = (run.pictures / f"{index:04}-{x}.png" for x in ("rendered", "truth"))
+        camera = move_camera(steps[index].camera, scene.unit_length, scene.origin)
+        figures = {ours: float(row[ours]) for ours in METRICS.values() if ours in row}
+        predictions.append(Prediction(str(row["name"]), picture, truth, camera, figures))
+    if absent := sum(not one.picture.is_file() for one in predictions):
+        expected = f"all {len(predictions)} scored frames as pictures"
+        again = f"{len(predictions) - absent}; measure it with pictures={len(predictions)}"
+        raise unexpected(f"run {key}", expected, again)
+    if options.to.exists() and any(options.to.iterdir()):
+        raise unexpected(options.to, "a new or an empty folder", "one with files")
+    budget: Any = run.record["budget"]
+    about = {
+        "method": str(run.facts["method"]),
+        "num_iterations": budget["steps"],
+        "total_train_time": run.values["train_s"],
+        "config_overrides": run.settings,
+        "steerbench": {
+            name: run.record[name] for name in ("run", "commit", "command", "protocol", "machine")
+        },
+    }
+    blender = config.scene["_target_"] == "bench.scenes.blender.load"
+    data = {
+        "id": "blender" if blender else "steerbench",
+        "scene": scene.name,
+        "color_space": "srgb",
+        "background_color": [round(255 * value) for value in scene.background.tolist()],
+        "evaluation_protocol": "nerf" if blender else "default",
+    }
+    when = datetime.fromtimestamp((store.folder / key / RECORD).stat().st_mtime, UTC)
+    write_results(options.to, predictions, about, data, when)
+    console().print(f"{options.to}: {len(predictions)} predictions of {run.facts['method']}")
+    return 0
+
+
+def _import(options: argparse.Namespace) -> int:
+    store, file = Store(options.outputs), options.file
+    measurement, facts = read_results(file)
+    parts = {
+        "import": digest(read_results),
+        "file": hashlib.sha256(file.read_bytes()).hexdigest(),
+        "facts": facts,
+    }
+    key = store.key(parts)
+    if store.find(key) is None:
+        command = shlex.join(["steerbench", "import", options.form, str(file)])
+        record = {**measurement.record, "command": command}
+        store.save(parts, replace(measurement, record=record))
+    others = [store.whole_key(run) for run in options.beside]
+    imported, *runs = load(store, dict.fromkeys([key, *others], ""))
+    labelled = [replace(run, label=f"{run.facts['method']}, run {run.key[:8]}") for run in runs]
+    table = comparison([replace(imported, label=f"{facts['method']}, imported"), *labelled], {})
+    show(table)
+    console().print(f"run {key}", markup=False)
+    return 0
