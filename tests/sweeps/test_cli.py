@@ -30,7 +30,7 @@ def test_help_of_run_lists_choices_settings_and_examples(run):
     assert outcome.status == 0
     for text in (
         "steerbench run -m seed=0,1,2",
-        "method: dark, diver, gaussians, grey, kilonerf",
+        "method: dark, diver, external, gaussians, grey, kilonerf",
         "totem",
         "seed: 0",
         "-sc install",

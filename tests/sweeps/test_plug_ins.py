@@ -83,7 +83,7 @@ def test_a_change_in_a_module_is_a_new_run_of_a_new_process(call, folder, tmp_pa
         assert len(keys(tmp_path)) == number
 
 
-THERE = "There are: diver, gaussians, kilonerf, mine, nerf, ngp, nsvf, plenoctree"
+THERE = "There are: diver, external, gaussians, kilonerf, mine, nerf, nerfbaselines, nerfstudio"
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import select
 from pathlib import Path
 
 import psutil
@@ -112,8 +114,15 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[psutil.Process]:
 
 
 def gone(process: psutil.Process) -> bool:
-    """Whether a process has ended; a zombie is one that nobody has asked how."""
-    return not process.is_running() or process.status() == psutil.STATUS_ZOMBIE
+    """Whether a process that was killed has ended, also if nobody has asked how; waits for it."""
+    try:
+        ended = os.pidfd_open(process.pid)
+    except ProcessLookupError:
+        return True
+    try:
+        return bool(select.select([ended], [], [], 10)[0])
+    finally:
+        os.close(ended)
 
 
 @pytest.mark.parametrize(("place", "lines", "said"), FAULTS.values(), ids=FAULTS)
