@@ -116,8 +116,7 @@ class StageClock:
         self._charge()
         stages = dict(stages_ns) if self._stages else {}
         stages[OTHER] = ns - sum(stages.values())
-        wall_ns = sum(self._ns.values())
-        self._told = {"stages_ns": stages, "wall_ns": wall_ns, "peak_bytes": peak_bytes}
+        self._told.update(stages_ns=stages, wall_ns=sum(self._ns.values()), peak_bytes=peak_bytes)
 
     def _begin(self) -> None:
         self._ns: defaultdict[str, int] = defaultdict(int, {OTHER: 0})

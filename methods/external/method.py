@@ -76,7 +76,7 @@ class External:
     def _about(self) -> Header:
         """What the worker tells about itself, made with the options."""
         worker = self._worker
-        told, _ = worker.ask("settings", self.start_s, options=self.options)
+        told, _ = worker.ask("settings", self.start_s, {"options": self.options})
         about = {"name": worker.name, **UNTOLD, **told}
         for name, usual in UNTOLD.items():
             kind = type(usual)
@@ -140,7 +140,7 @@ class External:
         }
         if "fit" not in can:
             if "load" in can:
-                self._worker.ask("load", self.start_s, state=None, **job)
+                self._worker.ask("load", self.start_s, {**job, "state": None})
             return
         folder = log.stage_dir("external", self._key(job))
         finished = folder / "trained.json"
@@ -151,7 +151,8 @@ class External:
                     new.write_text(json.dumps({"train_s": self.train_s}) + "\n")
             else:
                 log.info(f"{self.name}: found in {folder}")
-                self._worker.ask("load", self.start_s, state=str(folder / "state"), **job)
+                stored = {**job, "state": str(folder / "state")}
+                self._worker.ask("load", self.start_s, stored)
                 self.train_s = json.loads(finished.read_text())["train_s"]
 
     def _key(self, job: Mapping[str, object]) -> dict[str, object]:
@@ -192,7 +193,7 @@ class External:
 
                 begun = time.monotonic()
                 where = {"scene": str(place), "pictures": pictures, "state": str(state)}
-                self._worker.ask("fit", self.fit_s, progress, **where, **job)
+                self._worker.ask("fit", self.fit_s, {**job, **where}, progress)
                 seconds = time.monotonic() - begun
             shutil.rmtree(folder / "state", ignore_errors=True)
             state.rename(folder / "state")
@@ -207,11 +208,11 @@ class External:
 
     def reset(self) -> None:
         """Begin a new sequence."""
-        self._worker.ask("reset", self.frame_s)
+        self._worker.ask("reset", self.frame_s, {})
 
     def render(self, camera: Camera, probe: Probe) -> Frame:
         """Let it render one frame; the times are its own."""
-        told, arrays = self._worker.ask("render", self.frame_s, **self._described(camera))
+        told, arrays = self._worker.ask("render", self.frame_s, self._described(camera))
         ns, stages, counters = (told.get(name, {}) for name in ("ns", "stages", "counters"))
         peak = told.get("peak_bytes")
         self._expect(type(ns) is int and ns > 0, "ns above 0", f"ns {ns}")
@@ -246,8 +247,8 @@ class External:
 
     def sizes(self) -> dict[str, int]:
         """Bytes by component, as the worker tells."""
-        told, _ = self._worker.ask("sizes", self.frame_s)
-        sizes = told.get("sizes")
+        told, _ = self._worker.ask("sizes", self.frame_s, {})
+        sizes: Any = told.get("sizes")
         self._worker.expect(_counts(sizes), "sizes", "sizes in bytes", told)
         return sizes
 

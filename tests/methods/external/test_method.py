@@ -353,6 +353,6 @@ def test_a_nerfstudio_model_gets_the_camera_in_its_own_coordinates(
     lens = torch.tensor([60.0, 60.0, 20.0, 16.0, 40.0, 32.0])
     torch.testing.assert_close(shown, torch.cat((wanted.flatten(), lens)), rtol=0, atol=1e-6)
     method = external("nerfstudio", options={"config": "config.yml"})
+    method.fit(moved_scene, BUDGET, quiet_log)
     with pytest.raises(SteerbenchError, match="output: expected one of picture, got rgb"):
-        method.fit(moved_scene, BUDGET, quiet_log)
         method.render(camera, NullProbe())
