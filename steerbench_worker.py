@@ -91,7 +91,7 @@ class Channel:
 
     def _read(self, size, where="in the middle of a message"):
         buffer = np.empty(size, np.uint8)
-        left = memoryview(buffer)
+        left = buffer.data
         self._arm()
         while left:
             got = self._connection.recv_into(left)
@@ -124,16 +124,17 @@ class Camera:
 
 
 class Job:
-    """What a renderer is to learn.
+    """What a renderer is to learn."""
 
-    scene: the folder with the pictures, in NeRF-Synthetic's layout; gone when `fit` returns
-    pictures: a list of (file, Camera), the same as in the folder, of training pictures alone
-    state: the folder for the trained model; its place may change between `fit` and `load`
-    background: [3] in [0, 1], onto which pictures with an alpha are composited
-    bounds: [[x, y, z], [x, y, z]], the box of the content, in the units of the data set
-    steps, samples, renderer_steps: the budget: of the optimiser, per step, of a second stage
-    seed: of everything random
-    """
+    scene: Path  # the folder with the pictures, in NeRF-Synthetic's layout; gone after `fit`
+    pictures: list  # of (file, Camera), the same as in the folder: training pictures alone
+    state: Path  # the folder for the trained model; another after `fit`; None without `fit`
+    background: list  # [3] in [0, 1], onto which pictures with an alpha are composited
+    bounds: list  # lower and upper corner of the content, in the units of the data set
+    steps: int  # of the optimiser; the other two: samples a step, steps of a second stage
+    samples: int
+    renderer_steps: int
+    seed: int  # of everything random
 
     def __init__(self, header, channel):
         self.__dict__.update(header)
@@ -216,10 +217,11 @@ def serve(kind):
 
 
 def _converse(channel, kind):
-    renderer, stored = None, {}
+    renderer, stored = kind, {}
     while True:
         header, _ = channel.receive()
-        message, answer, arrays = header["message"], {}, {}
+        message, answer = header["message"], {}
+        arrays: dict = {}
         if message == "close":
             return
         if message == "settings":
@@ -254,7 +256,7 @@ def _about(renderer):
     """What rows and keys say about a renderer."""
     torch = sys.modules.get("torch")
     device = "cuda" if torch and torch.cuda.is_available() else "cpu"
-    usual = {"name": type(renderer).__name__, "device": device, "precision": "unknown"}
+    usual: dict = {"name": type(renderer).__name__, "device": device, "precision": "unknown"}
     usual.update(memory=0, knobs={})
     told = {name: getattr(renderer, name, value) for name, value in usual.items()}
     can = [message for message in ("fit", "load") if hasattr(renderer, message)]

@@ -116,18 +116,13 @@ class StageClock:
         self._charge()
         stages = dict(stages_ns) if self._stages else {}
         stages[OTHER] = ns - sum(stages.values())
-        wall_ns = sum(self._ns.values())
-        self._told: dict[str, Any] = {
-            "stages_ns": stages,
-            "wall_ns": wall_ns,
-            "peak_bytes": peak_bytes,
-        }
+        self._told.update(stages_ns=stages, wall_ns=sum(self._ns.values()), peak_bytes=peak_bytes)
 
     def _begin(self) -> None:
         self._ns: defaultdict[str, int] = defaultdict(int, {OTHER: 0})
         self._done: defaultdict[str, int | Tensor] = defaultdict(int)
         self._dense: defaultdict[str, int] = defaultdict(int)
-        self._told = {}  # what another process has told of this frame
+        self._told: dict[str, Any] = {}  # what another process has told of this frame
 
     def _now(self) -> int:
         if self._device.type == "cuda":

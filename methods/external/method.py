@@ -76,7 +76,7 @@ class External:
     def _about(self) -> Header:
         """What the worker tells about itself, made with the options."""
         worker = self._worker
-        told, _ = worker.ask("settings", self.start_s, options=self.options)
+        told, _ = worker.ask("settings", self.start_s, {"options": self.options})
         about = {"name": worker.name, **UNTOLD, **told}
         for name, usual in UNTOLD.items():
             kind = type(usual)
@@ -130,7 +130,7 @@ class External:
         """Let it train and store the result, load what it stored before, or get ready."""
         self._scene, can = scene, self._about["can"]
         corners = scene.origin.double() + scene.unit_length * scene.bounds.double()
-        job: dict[str, Any] = {
+        job = {
             "background": scene.background.tolist(),
             "bounds": corners.tolist(),
             "steps": budget.steps,
@@ -140,7 +140,7 @@ class External:
         }
         if "fit" not in can:
             if "load" in can:
-                self._worker.ask("load", self.start_s, state=None, **job)
+                self._worker.ask("load", self.start_s, {**job, "state": None})
             return
         folder = log.stage_dir("external", self._key(job))
         finished = folder / "trained.json"
@@ -151,7 +151,8 @@ class External:
                     new.write_text(json.dumps({"train_s": self.train_s}) + "\n")
             else:
                 log.info(f"{self.name}: found in {folder}")
-                self._worker.ask("load", self.start_s, state=str(folder / "state"), **job)
+                stored = {**job, "state": str(folder / "state")}
+                self._worker.ask("load", self.start_s, stored)
                 self.train_s = json.loads(finished.read_text())["train_s"]
 
     def _key(self, job: Mapping[str, object]) -> dict[str, object]:
@@ -167,7 +168,7 @@ class External:
             **computed_by(write_blender),
         }
 
-    def _train(self, folder: Path, job: Mapping[str, Any], log: Log) -> float:
+    def _train(self, folder: Path, job: Mapping[str, object], log: Log) -> float:
         """Let it train on the scene as files, and put what it stores into `folder`; the seconds."""
         pictures = [
             {"file": picture_file("train", number), **self._described(camera)}
@@ -192,14 +193,14 @@ class External:
 
                 begun = time.monotonic()
                 where = {"scene": str(place), "pictures": pictures, "state": str(state)}
-                self._worker.ask("fit", self.fit_s, progress, **where, **job)
+                self._worker.ask("fit", self.fit_s, {**job, **where}, progress)
                 seconds = time.monotonic() - begun
             shutil.rmtree(folder / "state", ignore_errors=True)
             state.rename(folder / "state")
             (folder / "output.txt").write_text(self._worker.output())
         return seconds
 
-    def _described(self, camera: Camera) -> dict[str, Any]:
+    def _described(self, camera: Camera) -> dict[str, object]:
         """A camera in scene units, as the protocol has it."""
         names = ("width", "height", "fx", "fy", "cx", "cy")
         pose = data_camera(self._scene, camera).c2w.tolist()
@@ -207,11 +208,11 @@ class External:
 
     def reset(self) -> None:
         """Begin a new sequence."""
-        self._worker.ask("reset", self.frame_s)
+        self._worker.ask("reset", self.frame_s, {})
 
     def render(self, camera: Camera, probe: Probe) -> Frame:
         """Let it render one frame; the times are its own."""
-        told, arrays = self._worker.ask("render", self.frame_s, **self._described(camera))
+        told, arrays = self._worker.ask("render", self.frame_s, self._described(camera))
         ns, stages, counters = (told.get(name, {}) for name in ("ns", "stages", "counters"))
         peak = told.get("peak_bytes")
         self._expect(type(ns) is int and ns > 0, "ns above 0", f"ns {ns}")
@@ -246,7 +247,7 @@ class External:
 
     def sizes(self) -> dict[str, int]:
         """Bytes by component, as the worker tells."""
-        told, _ = self._worker.ask("sizes", self.frame_s)
+        told, _ = self._worker.ask("sizes", self.frame_s, {})
         sizes: Any = told.get("sizes")
         self._worker.expect(_counts(sizes), "sizes", "sizes in bytes", told)
         return sizes

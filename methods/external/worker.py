@@ -8,7 +8,7 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -57,7 +57,7 @@ class Worker:
             self._output.close()
             why = f"cannot start {command[0]!r}: {error.strerror}"
             raise Unavailable(f"method.command: {why}; expected a program") from error
-        hello, _ = self._heard("hello", limit_s)
+        hello, _ = self.ask("hello", limit_s)
         self.expect(hello.get("version") == VERSION, "hello", f"version {VERSION}", hello)
         self.expect(isinstance(hello.get("name"), str), "hello", "a name", hello)
         self.name = hello["name"]
@@ -66,27 +66,17 @@ class Worker:
         self,
         message: str,
         limit_s: float,
+        fields: Mapping[str, object] | None = None,
         progress: Callable[[Header], object] | None = None,
-        **fields: object,
     ) -> tuple[Header, dict[str, np.ndarray]]:
-        """Send a message with `fields`; the header of its answer, and arrays by name.
+        """Send a message, unless `fields` are None; the header and the arrays of its answer.
 
         Before an answer, and before each message to `progress`, it may be silent for `limit_s`.
         """
-        return self._heard(
-            message, limit_s, progress, lambda: self._channel.send(message, **fields)
-        )
-
-    def _heard(
-        self,
-        message: str,
-        limit_s: float,
-        progress: Callable[[Header], object] | None = None,
-        ask: Callable[[], None] = lambda: None,
-    ) -> tuple[Header, dict[str, np.ndarray]]:
         try:
             self._channel.until = time.monotonic() + limit_s
-            ask()
+            if fields is not None:
+                self._channel.send(message, **fields)
             header, arrays = self._channel.receive()
             while progress and header["message"] == "progress":
                 progress(header)
