@@ -20,7 +20,7 @@ AS, LARGER, SMALLER = "as in the paper", "larger than in the paper", "smaller th
 AT_MOST = "smaller than in the paper, if there is one"
 AGREES = "same direction"
 """Of a difference whose size the paper does not give."""
-OPPOSITE, OPEN = "opposite", "cannot be told"
+OPPOSITE, OPEN, UNKNOWN = "opposite", "cannot be told", "not measured"
 BY_ONE = ", by one seed"
 """Ends a verdict from the frames of one training, which another training may reverse."""
 
@@ -60,6 +60,9 @@ class Gap:
     proves: bool
 
 
+NOT_MEASURED = Gap(math.nan, math.nan, "", False)
+
+
 @dataclass(frozen=True)
 class Comparison:
     """A claim about two lines: their gap in the `paper`, nan if it gives none, and `here`."""
@@ -74,12 +77,14 @@ class Comparison:
     @property
     def verdict(self) -> str:
         """Whether the gap is here as it is in the paper; it tells the sign and the size apart."""
-        if (word := self._verdict) == OPEN or self.here.proves:
+        if (word := self._verdict) in (OPEN, UNKNOWN) or self.here.proves:
             return word
         return word + BY_ONE
 
     @property
     def _verdict(self) -> str:
+        if self.here is NOT_MEASURED:
+            return UNKNOWN
         low, high = self.here.by - self.here.half, self.here.by + self.here.half
         margin = math.log(self.claim.margin) if _by_ratio(self.claim.metric) else self.claim.margin
         if self.claim.alike:
@@ -100,7 +105,7 @@ class Comparison:
 def compare(
     claim: Claim, lines: Mapping[str, Repeated], published: Mapping[str, float]
 ) -> Iterator[Comparison]:
-    """A claim between all of its neighbours that were measured; `published` is the paper's metric.
+    """A claim between all of its neighbours among `lines`; `published` is the paper's metric.
 
     Where the paper has the opposite order, on another data set, the claim is turned round. Where it
     gives the metric, but not of both lines, it claims nothing about them.
@@ -111,8 +116,8 @@ def compare(
             continue
         if paper < 0:
             smaller, larger, paper = larger, smaller, -paper
-        here = gap(claim.metric, lines.get(smaller), lines.get(larger))
-        if here is not None:
+        if smaller in lines and larger in lines:
+            here = gap(claim.metric, lines[smaller], lines[larger])
             yield Comparison(claim, smaller, larger, paper, here)
 
 
@@ -123,21 +128,21 @@ def apart(metric: str, one: float, other: float) -> float:
     return math.log(other / one) if one > 0 and other > 0 else math.nan
 
 
-def gap(metric: str, one: Repeated | None, other: Repeated | None) -> Gap | None:
-    """How far `other` is above `one` here: the mean over pairs; None if there are no pairs.
+def gap(metric: str, one: Repeated, other: Repeated) -> Gap:
+    """How far `other` is above `one` here: the mean over pairs; NOT_MEASURED if there are none.
 
     A pair has the same scene and the same seed. If there is only one, the frames are compared.
     """
     pairs = [
         (run, twin, apart(metric, low, high))
-        for run in (one.measured if one else ())
-        for twin in (other.measured if other else ())
+        for run in one.measured
+        for twin in other.measured
         if _identity(run, metric) == _identity(twin, metric)
         and (low := run.figure(metric)) is not None
         and (high := twin.figure(metric)) is not None
     ]
     if not pairs:
-        return None
+        return NOT_MEASURED
     by_pair = np.array([by for *_, by in pairs])
     by = float(by_pair.mean())
     if metric.startswith("size_bytes"):

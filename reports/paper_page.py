@@ -14,7 +14,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from reports import figures
-from reports.claims import claim_table, tally
+from reports.claims import NOT_MEASURED, claim_table, tally
 from reports.images import Part, Picture, frame_section, kept_frames
 from reports.outliers import Outlier, outlier_table
 from reports.paper_tables import METHOD, SHARES, Lines, PaperTable, comparisons, section
@@ -63,7 +63,7 @@ def _conclusions(tables: Sequence[PaperTable], lines: Lines) -> Iterator[Part]:
     sampled = sum(each.here.half > 0 for each in found)
     words = {"count": len(found), "tally": tally(found), "sampled": sampled}
     chances = {"missed": f"{sampled / 20:.1f}", "all_hold": f"{100 * 0.95**sampled:.0f} %"}
-    if found:
+    if any(each.here is not NOT_MEASURED for each in found):
         yield f"## {PAGE['conclusions']}\n\n{PAGE['tally'].format(**words).strip()}"
         yield from (claim_table(found), PAGE["verdicts"].format(**words, **chances).strip())
 

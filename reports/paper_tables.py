@@ -185,7 +185,7 @@ def comparisons(table: PaperTable, lines: Sequence[Repeated]) -> list[Comparison
         mark = "" if block is table else f" ({block.title})"  # of its labels
         where = table.number if block is table else f"{table.number}, {block.title}"
         own = {line.label.removesuffix(mark): line for line in block.lines}
-        known = {label: measured[x.label] for label, x in own.items() if x.label in measured}
+        known = dict(zip(own, block.measured(measured), strict=True))
         for claim in block.claims:
             paper = ((label, line.published.get(claim.metric)) for label, line in own.items())
             figures = {label: figure for label, figure in paper if figure is not None}
@@ -245,11 +245,12 @@ def distance_table(table: PaperTable, measured: Mapping[str, Repeated]) -> Table
     reference = known[table.reference or table.lines[0].label]
     others = [line for line in table.lines if line is not reference]
     metrics = [x for x in table.metrics if any(x in line.published for line in others)]
+    runs = dict(zip(known, table.measured(measured), strict=True))
 
     def cell(line: Line, metric: str) -> str:
-        here = gap(metric, measured.get(reference.label), measured.get(line.label))
+        here = gap(metric, runs[reference.label], runs[line.label])
         figures = (each.published.get(metric, math.nan) for each in (reference, line))
-        texts = told(metric, here.by if here else math.nan), told(metric, apart(metric, *figures))
+        texts = told(metric, here.by), told(metric, apart(metric, *figures))
         return " / ".join(texts) if {*texts} != {ABSENT} else ABSENT
 
     heads = (metric_format(metric)[0].rstrip(" ↑↓") for metric in metrics)

@@ -17,9 +17,11 @@ from reports.claims import (
     AT_MOST,
     BY_ONE,
     LARGER,
+    NOT_MEASURED,
     OPEN,
     OPPOSITE,
     SMALLER,
+    UNKNOWN,
     Claim,
     Comparison,
     Gap,
@@ -37,8 +39,8 @@ RISING = Claim("psnr", ["one", "two"], 0.1)
 ALIKE = replace(RISING, alike=True)
 
 
-def between(one: list[Run], two: list[Run], metric: str = "psnr") -> Gap | None:
-    """The gap between two lines, if there is one."""
+def between(one: list[Run], two: list[Run], metric: str = "psnr") -> Gap:
+    """The gap between two lines."""
     return gap(metric, Repeated("one", one), Repeated("two", two))
 
 
@@ -158,8 +160,8 @@ def test_a_stage_includes_the_stages_inside_it(run):
 
 
 def test_a_line_not_measured_has_no_gap_nor_have_times_of_different_machines(run):
-    assert between([run], []) is between([run], [elsewhere(run)], "frame_ms") is None
-    assert between([run], [elsewhere(run)])
+    assert between([run], []) is between([run], [elsewhere(run)], "frame_ms") is NOT_MEASURED
+    assert between([run], [elsewhere(run)]) is not NOT_MEASURED
 
 
 def compared(
@@ -180,6 +182,13 @@ def test_neighbours_are_compared_if_both_were_measured_and_the_paper_gives_both_
     assert len(unknown) == 2
     assert all(math.isnan(x.paper) for x in unknown)
     assert compared(run, {}, {"one": 0.0, "three": 1.0}) == []
+
+
+def test_a_line_without_runs_is_not_measured(run):
+    lines = {"one": Repeated("one", [run]), "two": Repeated("two", [])}
+    (found,) = compare(RISING, lines, {})
+    assert found.verdict == UNKNOWN
+    assert claim_table([found]).lines[0][2:4] == (ABSENT, "")
 
 
 def test_a_claim_is_turned_round_where_the_paper_has_the_opposite_order(run):
