@@ -110,15 +110,20 @@ class _Take:
         counts = warm or not self.meter.peak_bytes if self.meter.of_process else not warm
         return self.meter if counts else nullcontext()
 
+    @property
+    def timed_here(self) -> bool:
+        """Whether no other process has told the times of frames."""
+        return all(frame.wall_ns is None for frame in self.clock.frames)
+
     def peak(self, in_turns: int) -> tuple[float, str]:
         """Peak memory in bytes, NaN if it is not known, and what was read; `in_turns` methods were
         measured together."""
-        frames = self.clock.frames
-        if all(frame.wall_ns is None for frame in frames):
+        if self.timed_here:
             source = self.meter.source + ", before its frames were scored" * self.meter.of_process
             source += f", of {in_turns} methods in turns" * (in_turns > 1)
             return self.meter.peak_bytes, source
-        told = [frame.peak_bytes for frame in frames if frame.peak_bytes is not None]
+        peaks = (frame.peak_bytes for frame in self.clock.frames)
+        told = [peak for peak in peaks if peak is not None]
         if not told:
             return math.nan, "not told by the process that rendered"
         return max(told), "as the process that rendered has told"
@@ -126,7 +131,7 @@ class _Take:
     @property
     def times(self) -> str:
         """Whose times those of the frames are."""
-        if all(frame.wall_ns is None for frame in self.clock.frames):
+        if self.timed_here:
             return "read here, after the device has finished its work"
         return "read by the process that rendered; wall_ms: read here, with the way there and back"
 

@@ -183,7 +183,7 @@ class PathScoring:
         true = [f"{name}_true" for name in self.warps if exact_flow]
         self.names = ("flicker", *tpsnr_too, *steps, *self.warps, *true)
         self._wanted, self._lpips = wanted, lpips
-        self._last: deque[Shot] = deque(maxlen=1 + max(OFFSETS))
+        self._last: deque[Shot] = deque(maxlen=1 + max([1, *self.warps.values()]))
         self._films: list[list[tuple[np.ndarray, np.ndarray]]] = []  # consecutive, with a truth
 
     def add(self, shot: Shot, cut: bool, device: torch.device) -> dict[str, float]:

@@ -142,9 +142,11 @@ class SteerNerf:
             key = {"trained": trained, "engine": engine, "recorded": digest(type(self))}
             return log.stage_dir("network", key)
 
+        inputs = cache(views.inputs)  # engines that need as many share them
+
         @cache  # what was measured is not built again
         def build(engine: Engine) -> Built:
-            samples = partial(views.inputs, engine.samples(renderer.network))
+            samples = partial(inputs, engine.samples(renderer.network))
             return engine.build(renderer.network, samples, lambda: folder(engine.key()), log)
 
         def measure(engines: Sequence[Engine]) -> Sequence[Figures]:

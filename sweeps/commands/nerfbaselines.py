@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 import shlex
 from collections import Counter
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
-from bench.cameras import move_camera
 from bench.errors import unexpected
 from bench.nerfbaselines import METRICS, Prediction, read_results, write_results
-from bench.provenance import digest
+from bench.provenance import digest, sha256
 from bench.results import RECORD, Store
+from bench.scenes.export import check_empty, data_camera
 from reports.comparison import comparison
 from reports.runs import load
 from sweeps.commands.render import words_of_run
@@ -44,15 +43,14 @@ def _export(options: argparse.Namespace) -> int:
     for _, row in frames.iterrows():
         index = int(row["frame"])
         picture, truth = (run.pictures / f"{index:04}-{x}.png" for x in ("rendered", "truth"))
-        camera = move_camera(steps[index].camera, scene.unit_length, scene.origin)
+        camera = data_camera(scene, steps[index].camera)
         figures = {ours: float(row[ours]) for ours in METRICS.values() if ours in row}
         predictions.append(Prediction(str(row["name"]), picture, truth, camera, figures))
     if absent := sum(not one.picture.is_file() for one in predictions):
         expected = f"all {len(predictions)} scored frames as pictures"
         again = f"{len(predictions) - absent}; measure it with pictures={len(predictions)}"
         raise unexpected(f"run {key}", expected, again)
-    if options.to.exists() and any(options.to.iterdir()):
-        raise unexpected(options.to, "a new or an empty folder", "one with files")
+    check_empty(options.to)
     budget: Any = run.record["budget"]
     about = {
         "method": str(run.facts["method"]),
@@ -82,7 +80,7 @@ def _import(options: argparse.Namespace) -> int:
     measurement, facts = read_results(file)
     parts = {
         "import": digest(read_results),
-        "file": hashlib.sha256(file.read_bytes()).hexdigest(),
+        "file": sha256(file),
         "facts": facts,
     }
     key = store.key(parts)
