@@ -190,12 +190,12 @@ def attempt(numbered: Sequence[tuple[int, Job]], total: int, folder: Path) -> li
                     with _printed():
                         end(number, job, failure=reason(cause))
             left = [each for each in left if alone and each[1] is not alone]
-            continue
-        for (number, job), run in zip(left, runs, strict=True):
-            end(number, job, run=run, measured=measured)
-        for (_, job), run in zip(left, runs, strict=True):
-            say(job, run, _progress(folder, total))
-        break
+        else:
+            for (number, job), run in zip(left, runs, strict=True):
+                end(number, job, run=run, measured=measured)
+            for (_, job), run in zip(left, runs, strict=True):
+                say(job, run, _progress(folder, total))
+            return errors
     return errors
 
 
