@@ -15,7 +15,7 @@ BIN := $(VENV)/bin
 PYTHON ?=
 PIP_ARGS ?=
 DEMO_ARGS ?=
-PAPER_ARGS ?= budget=paper scene=totem scene.downscale=2
+PAPER_ARGS ?= budget=paper protocol=paper-1 scene=totem,mill
 
 # A complete interpreter is one that is new enough and can make environments with pip in them.
 SUITS := import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))

@@ -64,6 +64,7 @@ class EvaluationProtocol:
     rounding: str = "8bit"
     ssim: str = "gaussian"  # the window, see `bench.metrics.ssim`
     lpips: tuple[str, ...] = ("alex", "vgg")  # backbones, each with a metric `lpips_<net>`
+    lpips_every: int = 1  # frames of which the last one is scored with them; they take most time
     background: str = "white"  # onto which pictures with an opacity channel are composited
     warmup: int = 3  # frames before the timed sequence, spread over the trajectory
     memory: str = "steady"
@@ -78,10 +79,11 @@ class EvaluationProtocol:
             object.__setattr__(self, option, tuple(getattr(self, option)))
         for option, allowed in CHOICES.items():
             if getattr(self, option) not in allowed:
-                got = repr(getattr(self, option))
-                raise unexpected(f"protocol.{option}", " or ".join(allowed), got)
-        if self.warmup < 0:
-            raise unexpected("protocol.warmup", "0 or more", self.warmup)
+                value = repr(getattr(self, option))
+                raise unexpected(f"protocol.{option}", " or ".join(allowed), value)
+        for option, least in (("warmup", 0), ("lpips_every", 1)):
+            if (got := getattr(self, option)) < least:
+                raise unexpected(f"protocol.{option}", f"{least} or more", got)
         if not set(self.columns) <= set(COLUMNS):
             raise unexpected("protocol.columns", f"some of {', '.join(COLUMNS)}", [*self.columns])
         if not 0 < self.fps < math.inf:
@@ -227,7 +229,8 @@ class Scoring:
         figures: dict[str, float] = {}
         true = None if truth is None else composite(truth.to(rgb.device), self._background)
         if truth is not None and true is not None and scored:
-            figures |= self._protocol.score(rgb, truth, self._background, self._lpips)
+            nets = {} if (index + 1) % self._protocol.lpips_every else self._lpips
+            figures |= self._protocol.score(rgb, truth, self._background, nets)
             if index in self._shown:
                 self.images |= _pictures(index, rgb, true)
         view = None

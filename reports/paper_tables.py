@@ -51,7 +51,8 @@ class PaperTable:
 
     `published_on` has scenes, size and machine of the paper's figures; they are those of a
     `data_set`, "" for scenes of which the paper has none. `notes` are what a reader should know
-    before comparing, `claims` what the paper concludes. Distances are those to the line
+    before comparing, `claims` what the paper concludes. In these a line that was not measured is
+    replaced by the one that `instead` has for its label. Distances are those to the line
     `reference`, by default the first. `beside` has the figures of further data sets, `beyond` is a
     method beyond the paper, shown with the same lines as the paper's method and notes of its own.
     The metrics `scenes` are also shown for every scene of a data set. Where a table compares times,
@@ -72,6 +73,7 @@ class PaperTable:
     in_turns: bool = False
     curve: bool = False
     reference: str = ""
+    instead: Mapping[str, str] = field(default_factory=dict)
     data_set: str = FIRST
     beside: Sequence[PaperTable] = ()
 
@@ -186,7 +188,11 @@ def comparisons(table: PaperTable, lines: Sequence[Repeated]) -> list[Comparison
         where = table.number if block is table else f"{table.number}, {block.title}"
         own = {line.label.removesuffix(mark): line for line in block.lines}
         known = dict(zip(own, block.measured(measured), strict=True))
+        there = {label for label, line in known.items() if line.measured}
+        known_as = {x: y for x, y in table.instead.items() if x in {*known} - there and y in there}
+        own |= {y: replace(own[y], published=own[x].published) for x, y in known_as.items()}
         for claim in block.claims:
+            claim = replace(claim, lines=[known_as.get(label, label) for label in claim.lines])
             paper = ((label, line.published.get(claim.metric)) for label, line in own.items())
             figures = {label: figure for label, figure in paper if figure is not None}
             found += [replace(x, table=where) for x in compare(claim, known, figures)]

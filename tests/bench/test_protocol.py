@@ -34,7 +34,9 @@ def test_the_configuration_of_steerbench_1_is_the_default_and_a_change_may_not_k
 CHOICES = {"rounding": "floor", "ssim": "ms", "background": "grey", "memory": "warm"}
 
 
-@pytest.mark.parametrize(("option", "value"), [*CHOICES.items(), ("flicker", "no"), ("warmup", -1)])
+@pytest.mark.parametrize(
+    ("option", "value"), [*CHOICES.items(), ("flicker", "no"), ("warmup", -1), ("lpips_every", 0)]
+)
 def test_an_unknown_choice_names_the_option_and_what_is_allowed(option, value):
     with pytest.raises(SteerbenchError, match=f"protocol.{option}: expected .* got '?{value}"):
         EvaluationProtocol(**{"name": "mine", option: value})
@@ -133,3 +135,13 @@ def test_a_cut_a_frame_without_truth_or_of_another_size_leaves_no_pair(tiny_scen
     assert "psnr" in found[5]
     found = scored([images[0], images[1][:, :20], images[2]])
     assert not any("flicker" in figures for figures in found)
+
+
+def test_the_last_of_so_many_frames_is_scored_with_lpips():
+    protocol = EvaluationProtocol(name="some", lpips=("alex",), lpips_every=2)
+    scoring = Scoring(protocol, {"alex": lambda *_: 0.5}, WHITE, shown=())
+    picture = torch.zeros(16, 16, 3)
+    scores = [
+        scoring.score(index, picture, picture.byte(), cut=False)["lpips_alex"] for index in range(4)
+    ]
+    assert scores == [pytest.approx(value, nan_ok=True) for value in (math.nan, 0.5, math.nan, 0.5)]

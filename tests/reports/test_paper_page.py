@@ -57,7 +57,7 @@ def test_a_method_has_one_mark_at_its_first_measured_line_and_an_added_one_too(
     run, tmp_path, monkeypatch
 ):
     table = replace(TABLES["table1"], lines=[*TABLES["table1"].lines, Line("x", {"method": "x"})])
-    labels = [line.label for line in table.lines if line.label != "SteerNeRF, bf16 for FP16"]
+    labels = [line.label for line in table.lines if line.label != "SteerNeRF, half precision"]
     drawn: list[list[str]] = []
     real = figures.quality_plot
 

@@ -217,7 +217,7 @@ def test_a_scene_is_compared_with_the_figures_of_its_data_set(monkeypatch):
     assert {scene for scene, _ in (*first, *beyond)} == {"totem"}
     assert {scene for scene, _ in second} == {"wires"}
     assert {line for _, line in second} == {line.label for line in tables["table1"].beside[0].lines}
-    assert len(second) == 3
+    assert len(second) == 4
     assert {job.scene for job in plan(replace(tables["table5"], curve=False), words)} == {"totem"}
 
 
