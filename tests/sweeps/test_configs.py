@@ -19,7 +19,10 @@ from sweeps.variants import declared
 GROUPS = ("method", "scene", "trajectory", "protocol", "budget")
 CHOICES = [f"{group}={name}" for group in GROUPS for name in choices(group)]
 SIZES = sorted((CONFIGS / "size").glob("*/*.yaml"))
-USERS = {"field": "method=ngp", "unet": "method=steernerf", "tables": "method=ngp"}
+USERS = {
+    **{"field": "method=ngp", "unet": "method=steernerf", "tables": "method=ngp"},
+    **{"totem": "scene=totem", "mill": "scene=mill"},
+}
 """Of sizes that are not of one method: a word that chooses what takes them in."""
 
 
@@ -99,10 +102,9 @@ def test_options_stand_there_with_all_their_fields_and_no_other_default(choice):
 def test_a_size_changes_settings_that_are_there(path):
     owner, budget = path.parent.name, f"budget={path.stem}"
     assert path.stem in choices("budget")
-    of_scene = owner in choices("scene")
-    word = f"scene={owner}" if of_scene else USERS.get(owner, f"method={owner}")
+    word = USERS.get(owner, f"method={owner}")
     before, after = (composed([word, of]) for of in ("budget=pretrain", budget))
-    group = "scene" if of_scene else "tables" if owner == "tables" else "method"
+    group = "tables" if owner == "tables" else word.partition("=")[0]
     assert set(leaves(before[group])) == set(leaves(after[group]))
     assert before[group] != after[group]
 
