@@ -33,8 +33,13 @@ def console() -> Console:
     return _Output(width=None if sys.stdout.isatty() else 200, highlight=False)
 
 
+shown: list[Table] = []
+"""The tables that this process has printed, for documents."""
+
+
 def show(table: Table) -> None:
     """Print `table`."""
+    shown.append(table)
     console().print(rich_table(table))
 
 

@@ -1,0 +1,221 @@
+"""`steerbench figures`: measures what the documents of a checkout show, and puts it into them.
+
+docs/figures.toml names the commands. A document shows a part of what one of them wrote between two
+comments, `<!-- figures NAME | HEADING | WHAT -->` and `<!-- end of figures -->`: of the section of
+its page whose heading begins so (none: the first), the first `table`, the first `picture`, or
+`all`. Whatever is between the comments is replaced.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import re
+import shlex
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+
+from PIL import Image
+
+from bench import provenance
+from bench.console import ConsoleLog
+from bench.errors import SteerbenchError, unknown
+from bench.results import content_key
+from bench.sharing import whole
+from sweeps import cli, terminal
+
+LIST = Path("docs/figures.toml")
+RESULTS = Path("docs/results")
+CODE = ("bench", "methods", "sweeps")  # what figures depend on
+FOLDER = Path("outputs/figures")
+PAGE = "report.md"
+MADE = "made.json"  # beside a page: what made it
+
+REGION = re.compile(
+    r"<!-- figures (?P<name>[\w-]+) \| (?P<heading>[^|\n]*?) \| (?P<what>all|table|picture)"
+    r"[^\n]*-->\n.*?<!-- end of figures -->",
+    re.DOTALL,
+)
+HEADING = re.compile(r"^#{1,2} (.*)$", re.MULTILINE)
+PICTURE = re.compile(r"^!\[(.*)\]\((.+)\)$", re.MULTILINE)
+TABLE = re.compile(r"(?:^\|.*\|\n?)+", re.MULTILINE)
+
+LONGEST = 40  # lines of a table that a document shows; longer ones are in the CSV file alone
+COLOURS = 256  # of a picture in the documents, so that a checkout stays small
+
+
+@dataclass(frozen=True)
+class Made:
+    """What made a page: the `command`, at which commit, from which `code`, on which machine."""
+
+    command: str
+    commit: str
+    code: str  # digest of all that computes figures
+    machine: str
+
+    @property
+    def told(self) -> str:
+        """As a line above the figures."""
+        return f"`{self.command}`, at {self.commit}, on {self.machine}:"
+
+
+def main(options: argparse.Namespace) -> int:
+    """Measure what is missing or of other code, fill the documents; return 1 if anything failed.
+
+    With `check`, name what is missing or of other code instead, and return 1 if anything is.
+    """
+    if not LIST.is_file():
+        raise SteerbenchError(f"{LIST}: no such file; expected to be in a checkout of steerbench")
+    wanted = tomllib.loads(LIST.read_text(encoding="utf-8"))
+    for name in options.only:
+        if name not in wanted:
+            raise unknown("--only", name, wanted)
+    log, failed = ConsoleLog(Path()), 0
+    for name in options.only or wanted:
+        command, folder = f"steerbench {wanted[name]['command']}", FOLDER / name
+        before, code = _read(folder), _code()
+        if before and (before.command, before.code) == (command, code):
+            log.info(f"{name}: made at {before.commit}")
+        elif options.check:
+            found = f"made at {before.commit}, of other code" if before else "missing"
+            log.info(f"{name}: {found}")
+            failed += 1
+        elif "{data}" in command and options.data is None:
+            log.info(f"{name}: left out, it needs --data DIR")
+        else:
+            words = shlex.split(command.format(folder=folder, data=options.data))[1:]
+            log.info(f"{name}: steerbench {shlex.join(words)}")
+            failed += not _measure(words, folder, Made(command, _commit(), code, _machine()))
+    if not options.check:
+        _fill({name: FOLDER / name for name in wanted if _read(FOLDER / name)})
+    return int(failed > 0)
+
+
+def _measure(words: Sequence[str], folder: Path, made: Made) -> bool:
+    """Run a command and keep its page in `folder`; whether it succeeded."""
+    folder.mkdir(parents=True, exist_ok=True)
+    terminal.shown.clear()
+    if cli.guard(cli.dispatch, words):
+        return False
+    if "{folder}" not in made.command:
+        parts = (f"## {table.title}\n\n{table.markdown()}\n" for table in terminal.shown)
+        (folder / PAGE).write_text("\n".join(parts), encoding="utf-8")
+    with whole(folder / MADE) as new:
+        new.write_text(json.dumps(asdict(made), indent=1) + "\n", encoding="utf-8")
+    return True
+
+
+def _read(folder: Path) -> Made | None:
+    file = folder / MADE
+    return Made(**json.loads(file.read_text(encoding="utf-8"))) if file.is_file() else None
+
+
+def _code() -> str:
+    """A digest of all files below `CODE`."""
+    files = sorted(path for top in CODE for path in Path(top).rglob("*") if path.is_file())
+    kept = (path for path in files if "__pycache__" not in path.parts)
+    return content_key({str(path): provenance.sha256(path) for path in kept})[:16]
+
+
+def _commit() -> str:
+    """The commit that last changed the code, marked if it was changed since."""
+    names = [["log", "-1", "--format=%h", "--abbrev=12"], ["status", "--porcelain"]]
+    commit, changed = (provenance.git(*words, "--", *CODE) for words in names)
+    return f"{commit}-dirty" if changed else commit
+
+
+def _machine() -> str:
+    machine = provenance.machine()
+    return f"{machine['threads']} threads of {machine['cpu']}"
+
+
+# Documents
+
+
+def _fill(pages: Mapping[str, Path]) -> None:
+    """Put what `pages` show into the regions of all documents, and their tables into CSV files."""
+    RESULTS.mkdir(exist_ok=True)
+    for name, folder in pages.items():
+        text = (folder / PAGE).read_text(encoding="utf-8")
+        with (RESULTS / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows(_rows(text))
+    documents = sorted([*Path().glob("*.md"), *Path("docs").glob("*.md")])
+    texts = {}
+    for document in documents:
+        before = document.read_text(encoding="utf-8")
+        texts[document] = REGION.sub(partial(_region, document=document, pages=pages), before)
+        if texts[document] != before:
+            document.write_text(texts[document], encoding="utf-8")
+    for picture in RESULTS.glob("*.png"):
+        if not any(picture.name in text for text in texts.values()):
+            picture.unlink()
+
+
+def _region(region: re.Match[str], document: Path, pages: Mapping[str, Path]) -> str:
+    """A region of `document`, filled anew if its page is there."""
+    name, heading, what = region["name"], region["heading"], region["what"]
+    if name not in pages:
+        return region[0]
+    folder, made = pages[name], _read(pages[name])
+    assert made is not None
+    text = _section((folder / PAGE).read_text(encoding="utf-8"), heading, name)
+    if what != "all":
+        found = (TABLE if what == "table" else PICTURE).search(text)
+        if not found:
+            raise SteerbenchError(f"{document}: figures {name} | {heading}: it has no {what}")
+        text = found[0].strip()
+    to_results = RESULTS if document.parent == Path() else RESULTS.relative_to(document.parent)
+
+    def shorter(table: re.Match[str]) -> str:
+        lines = len(table[0].strip().splitlines()) - 2
+        link = f"[{name}.csv]({to_results / name}.csv)"
+        return table[0] if lines <= LONGEST else f"{lines} lines, in {link}\n"
+
+    def copied(picture: re.Match[str]) -> str:
+        return f"![{picture[1]}]({to_results / _copy(folder / picture[2], name)})"
+
+    text = PICTURE.sub(copied, TABLE.sub(shorter, text))
+    told = "" if what == "picture" else f"{made.told}\n\n"
+    start = f"<!-- figures {name} | {heading} | {what} | {made.commit} -->"
+    return f"{start}\n{told}{text}\n<!-- end of figures -->"
+
+
+def _section(text: str, heading: str, name: str) -> str:
+    """The section of a page, without its heading, that begins with `heading`."""
+    found = [*HEADING.finditer(text)]
+    ends = [*(each.start() for each in found[1:]), len(text)]
+    for each, end in zip(found, ends, strict=True):
+        if each[1].startswith(heading):
+            return text[each.end() : end].strip()
+    there = ", ".join(repr(each[1]) for each in found)
+    raise SteerbenchError(
+        f"figures {name}: expected a heading that begins {heading!r}, got {there}"
+    )
+
+
+def _copy(picture: Path, name: str) -> str:
+    """Copy a picture with few colours into the results; the name that it has there."""
+    stem = picture.stem.rpartition("-")[0]  # without the digest
+    with Image.open(picture) as image:
+        few = image.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+        few.save(RESULTS / f"{name}-{stem}.png", optimize=True)
+    return f"{name}-{stem}.png"
+
+
+def _rows(text: str) -> Iterator[list[str]]:
+    """The cells of all tables of a page, below the heading of each, an empty line between them."""
+    for line in text.splitlines():
+        if line.startswith("#"):
+            heading = line.lstrip("# ")
+        elif line.startswith("| ---"):
+            continue
+        elif line.startswith("| "):
+            cells = re.split(r" (?<!\\)\| ?", line[2:])[:-1]
+            if heading:
+                yield from ([], [heading])
+                heading = ""
+            yield [cell.replace("\\|", "|").strip("*") for cell in cells]

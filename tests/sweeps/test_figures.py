@@ -1,0 +1,122 @@
+"""The documents show what the commands of docs/figures.toml wrote, all from one commit."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from sweeps.commands import figures
+from tests.sweeps.conftest import CONFIGS, QUICK
+
+ROOT = Path(__file__).parents[2]
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+RUN = f"run {CONFIGS} {' '.join(QUICK)} report={{folder}}"
+END = "<!-- end of figures -->"
+
+
+def region(name: str, heading: str, what: str, content: str = "old") -> str:
+    return f"<!-- figures {name} | {heading} | {what} -->\n{content}\n{END}"
+
+
+@pytest.fixture
+def checkout(elsewhere, tmp_path):
+    """A folder with a list of figures, code, and a document outside and one inside of docs/."""
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "bench").mkdir()
+    (tmp_path / "bench" / "code.py").write_text("one = 1\n")
+    listed = {"run": RUN, "list": "results", "real": "run scene.path={data}/mic"}
+    lines = (f"[{name}]\ncommand = {json.dumps(command)}\n" for name, command in listed.items())
+    (tmp_path / figures.LIST).write_text("\n".join(lines))
+    text = f"before\n\n{region('run', '', 'table')}\n\n{region('run', 'Pictures', 'picture')}\n"
+    (tmp_path / "README.md").write_text(f"{text}\nafter\n")
+    (tmp_path / "docs" / "more.md").write_text(region("run", "Pictures", "picture"))
+    return tmp_path
+
+
+def test_documents_get_tables_pictures_and_where_they_are_from(steerbench, checkout):
+    outcome = steerbench("figures")
+    assert outcome.status == 0, outcome.err
+    assert "real: left out, it needs --data DIR" in outcome.err
+    readme, more = (checkout / "README.md").read_text(), (checkout / "docs/more.md").read_text()
+    assert readme.startswith("before\n\n")
+    assert readme.endswith("\n\nafter\n")
+    assert f"`steerbench {RUN}`, at " in readme
+    assert "| run | PSNR, dB ↑ |" in readme
+    (shown,) = re.findall(r"\((docs/results/run-\S+\.png)\)", readme)
+    assert f"({shown.removeprefix('docs/')})" in more
+    with Image.open(checkout / shown) as picture:
+        assert picture.mode == "P"
+    rows, listed = (
+        [*csv.reader((checkout / "docs/results" / name).read_text().splitlines())]
+        for name in ("run.csv", "list.csv")
+    )
+    assert next(row for row in rows if row[:1] == ["run"])[1] == "PSNR, dB ↑"
+    assert ["grey" in row for row in listed].count(True) > 1
+
+
+def test_what_is_of_the_same_code_is_used_again_and_named_otherwise(steerbench, checkout):
+    assert "run: missing" in steerbench("figures", "--only", "run", "--check").err
+    assert "run: steerbench run" in steerbench("figures", "--only", "run").err
+    first = (checkout / "README.md").read_text()
+    again = steerbench("figures", "--only", "run")
+    assert "run: made at" in again.err
+    assert "run: steerbench run" not in again.err
+    assert (checkout / "README.md").read_text() == first
+    (checkout / "bench" / "code.py").write_text("one = 2\n")
+    later = steerbench("figures", "--only", "run", "--check")
+    assert later.status == 1
+    assert "of other code" in later.err
+
+
+def test_a_command_that_fails_leaves_its_region_and_the_others_are_measured(steerbench, checkout):
+    text = (checkout / figures.LIST).read_text()
+    (checkout / figures.LIST).write_text(f'[wrong]\ncommand = "run scene=nowhere"\n{text}')
+    (checkout / "docs" / "wrong.md").write_text(region("wrong", "", "all"))
+    outcome = steerbench("figures")
+    assert outcome.status == 1
+    assert "nowhere" in outcome.err
+    assert (checkout / "docs" / "wrong.md").read_text() == region("wrong", "", "all")
+    assert "| run | PSNR, dB ↑ |" in (checkout / "README.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("wanted", "error"),
+    [
+        (("Nothing", "all"), "expected a heading that begins 'Nothing', got 'grey on white'"),
+        (("Provenance", "picture"), "README.md: figures run | Provenance: it has no picture"),
+    ],
+)
+def test_a_region_that_cannot_be_filled_is_named(steerbench, checkout, wanted, error):
+    (checkout / "README.md").write_text(region("run", *wanted))
+    outcome = steerbench("figures", "--only", "run")
+    assert outcome.status == 2
+    assert error in outcome.err
+
+
+def test_a_long_table_is_in_the_csv_file_alone(steerbench, checkout, monkeypatch):
+    monkeypatch.setattr(figures, "LONGEST", 0)
+    steerbench("figures", "--only", "run")
+    assert "1 lines, in [run.csv](docs/results/run.csv)" in (checkout / "README.md").read_text()
+
+
+# The documents of this checkout
+
+
+def regions() -> list[tuple[Path, re.Match[str]]]:
+    return [(path, x) for path in DOCUMENTS for x in figures.REGION.finditer(path.read_text())]
+
+
+def test_all_figures_of_the_documents_are_of_one_commit():
+    commits = {re.search(r"\| ([0-9a-f]{12}) -->", found[0])[1] for _, found in regions()}
+    assert len(commits) == 1
+
+
+def test_every_region_is_of_a_listed_command_and_every_command_has_one():
+    listed = tomllib.loads((ROOT / figures.LIST).read_text())
+    assert {found["name"] for _, found in regions()} == set(listed)
