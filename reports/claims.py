@@ -37,13 +37,15 @@ class Claim:
     """`metric` grows from each of the `lines` (labels) to the next or, if `alike`, hardly changes.
 
     Differences that are apart by no more than `margin` count as equal: in the unit of the metric,
-    or as a factor where figures are compared by their ratio.
+    or as a factor where figures are compared by their ratio. What is a main finding of the paper
+    `says` so in words.
     """
 
     metric: str
     lines: Sequence[str]
     margin: float
     alike: bool = False
+    says: str = ""
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,7 @@ class Comparison:
     paper: float
     here: Gap
     table: str = ""  # where the claim is made
+    where: str = ""  # on which further data set, as it is added to what the claim says
 
     @property
     def verdict(self) -> str:
@@ -195,21 +198,38 @@ def told(metric: str, by: float) -> str:
     return f"×{decimal(factor, 2 if factor < 10 else 1 if factor < 100 else 0)}"
 
 
+def finding_table(comparisons: Sequence[Comparison]) -> Table:
+    """A table of the main findings of the paper among `comparisons`, one line each, in words."""
+    lines = (
+        (each.claim.says + each.where, *_figures(each), each.verdict)
+        for each in comparisons
+        if each.claim.says
+    )
+    columns = ("what the paper says", "paper", "here", "95 % interval", "verdict")
+    return Table("What the paper says, and what was found", columns, tuple(lines))
+
+
+def _figures(each: Comparison) -> tuple[str, str, str]:
+    """The gap in the paper and here, and its interval."""
+    metric, here = each.claim.metric, each.here
+    ends = (told(metric, here.by + side * here.half) for side in (-1, 1))
+    interval = " – ".join(ends) if here.half > 0 else ""
+    return told(metric, each.paper), told(metric, here.by), interval
+
+
 def claim_table(comparisons: Sequence[Comparison]) -> Table:
     """A table of `comparisons`, one line each."""
     lines = []
     for each in comparisons:
-        metric, here = each.claim.metric, each.here
+        metric = each.claim.metric
         label = metric_format(metric)[0].rstrip(" ↑↓")
         sign = "≈" if each.claim.alike else "<"
         name = f"{each.table}, {label}: {each.smaller} {sign} {each.larger}"
-        ends = (told(metric, here.by + side * here.half) for side in (-1, 1))
-        interval = " – ".join(ends) if here.half > 0 else ""
         margin = f"×{each.claim.margin:g}" if _by_ratio(metric) else f"{each.claim.margin:g}"
-        figures = (told(metric, each.paper), told(metric, here.by), interval, here.over, margin)
+        figures = (*_figures(each), each.here.over, margin)
         lines.append((name, *figures, each.verdict))
     columns = ("claim", "paper", "here", "95 % interval", "over", "margin", "verdict")
-    return Table("What the paper concludes", columns, tuple(lines))
+    return Table("All comparisons", columns, tuple(lines))
 
 
 def tally(comparisons: Sequence[Comparison]) -> str:

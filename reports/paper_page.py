@@ -14,7 +14,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from reports import figures
-from reports.claims import NOT_MEASURED, claim_table, tally
+from reports.claims import NOT_MEASURED, Comparison, claim_table, finding_table, tally
 from reports.images import Part, Picture, frame_section, kept_frames
 from reports.outliers import Outlier, outlier_table
 from reports.paper_tables import METHOD, SHARES, Lines, PaperTable, comparisons, section
@@ -43,29 +43,36 @@ def write_paper_page(
     listed = outlier_table(found, runs)
     flagged: list[Part] = [f"## {listed.title}", listed] if listed.lines else []
     sources = "\n".join(f"{run.key}  {run.record['command']}" for run in runs)
+    compared = [x for table in tables for x in comparisons(table, lines.get(table.name, ()))]
+    if all(each.here is NOT_MEASURED for each in compared):
+        compared = []
     parts: list[Part] = [
         f"# {PAGE['title']}",
-        *_conclusions(tables, lines),
+        *_conclusions(compared),
         *([f"## Scenes that are left out\n\n{left_out}"] if left_out else []),
         *flagged,
         f"## The tables\n\n{PAGE['reading'].strip()}",
         *(part for table in tables for part in section(table, lines.get(table.name, ()))),
         *(part for plot in PAGE["plots"] for part in _plot(plot, tables, lines)),
         *(part for images in PAGE["images"] for part in _images(images, lines)),
+        *_every_comparison(compared),
         f"## Runs\n\nTheir keys in the store, and the commands:\n\n```\n{sources}\n```",
     ]
     return publish(parts, folder, runs)
 
 
-def _conclusions(tables: Sequence[PaperTable], lines: Lines) -> Iterator[Part]:
-    """All that the paper concludes from the tables beside what was measured here."""
-    found = [each for table in tables for each in comparisons(table, lines.get(table.name, ()))]
+def _conclusions(found: Sequence[Comparison]) -> Iterator[Part]:
+    """The main findings of the paper beside what was measured here, and how to read verdicts."""
     sampled = sum(each.here.half > 0 for each in found)
     words = {"count": len(found), "tally": tally(found), "sampled": sampled}
-    chances = {"missed": f"{sampled / 20:.1f}", "all_hold": f"{100 * 0.95**sampled:.0f} %"}
-    if any(each.here is not NOT_MEASURED for each in found):
-        yield f"## {PAGE['conclusions']}\n\n{PAGE['tally'].format(**words).strip()}"
-        yield from (claim_table(found), PAGE["verdicts"].format(**words, **chances).strip())
+    if found:
+        yield from (f"## {PAGE['conclusions']}", finding_table(found))
+        yield PAGE["verdicts"].format(**words, missed=f"{sampled / 20:.0f}").strip()
+
+
+def _every_comparison(found: Sequence[Comparison]) -> Iterator[Part]:
+    if found:
+        yield from (f"## {PAGE['comparisons']}", claim_table(found))
 
 
 def _plot(plot: Mapping[str, Any], tables: Sequence[PaperTable], lines: Lines) -> Iterator[Part]:

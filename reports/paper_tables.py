@@ -162,7 +162,9 @@ def _table(path: Path, data_sets: Sequence[str]) -> PaperTable:
         name = line.get("label") or label.format(*job.values())
         lines.append(Line(name, job, figures, line.get("every_seed", False)))
     claims = [
-        Claim(x["metric"], x.get("alike") or x["rising"], x["margin"], "alike" in x)
+        Claim(
+            x["metric"], x.get("alike") or x["rising"], x["margin"], "alike" in x, x.get("says", "")
+        )
         for x in content.pop("claims")
     ]
     only = content.pop("beside", [line.label for line in lines])
@@ -195,7 +197,10 @@ def comparisons(table: PaperTable, lines: Sequence[Repeated]) -> list[Comparison
             claim = replace(claim, lines=[known_as.get(label, label) for label in claim.lines])
             paper = ((label, line.published.get(claim.metric)) for label, line in own.items())
             figures = {label: figure for label, figure in paper if figure is not None}
-            found += [replace(x, table=where) for x in compare(claim, known, figures)]
+            further = "" if block is table else f", {block.title}"
+            found += [
+                replace(x, table=where, where=further) for x in compare(claim, known, figures)
+            ]
     return found
 
 
