@@ -17,7 +17,7 @@ from reports import figures
 from reports.claims import NOT_MEASURED, Comparison, claim_table, finding_table, tally
 from reports.images import Part, Picture, frame_section, kept_frames
 from reports.outliers import Outlier, outlier_table
-from reports.paper_tables import METHOD, SHARES, Lines, PaperTable, comparisons, section
+from reports.paper_tables import METHOD, SHARES, Lines, PaperTable, comparisons, conditions, section
 from reports.publish import publish
 from reports.runs import Repeated, Run
 
@@ -46,13 +46,16 @@ def write_paper_page(
     compared = [x for table in tables for x in comparisons(table, lines.get(table.name, ()))]
     if all(each.here is NOT_MEASURED for each in compared):
         compared = []
+    facts = conditions(runs).items() if runs else ()
+    said = {name: value for name, value in facts if " / " not in value}  # once for all tables
     parts: list[Part] = [
         f"# {PAGE['title']}",
         *_conclusions(compared),
         *([f"## Scenes that are left out\n\n{left_out}"] if left_out else []),
         *flagged,
         f"## The tables\n\n{PAGE['reading'].strip()}",
-        *(part for table in tables for part in section(table, lines.get(table.name, ()))),
+        *([f"Measured: {', '.join(map(' '.join, said.items()))}."] if said else []),
+        *(part for table in tables for part in section(table, lines.get(table.name, ()), said)),
         *(part for plot in PAGE["plots"] for part in _plot(plot, tables, lines)),
         *(part for images in PAGE["images"] for part in _images(images, lines)),
         *_every_comparison(compared),

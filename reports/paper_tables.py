@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Collection, Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,9 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from reports.claims import ABSENT, Claim, Comparison, apart, compare, gap, told
-from reports.comparison import COMMON, conditions_of, marked, metric_format, written
+from reports.comparison import COMMON, marked, metric_format, written
 from reports.outliers import REFERENCES
-from reports.runs import Repeated, missing_figures
+from reports.runs import Repeated, Run, missing_figures
 from reports.tables import NOT_AVAILABLE, Table
 
 METHOD = "method"
@@ -204,14 +204,27 @@ def comparisons(table: PaperTable, lines: Sequence[Repeated]) -> list[Comparison
     return found
 
 
-def section(table: PaperTable, lines: Sequence[Repeated]) -> list[str | Table]:
-    """A table as parts of a page: the paper's lines, those of other blocks, each scene."""
+def conditions(runs: Sequence[Run]) -> dict[str, str]:
+    """Under which conditions, and where, `runs` were measured: by fact, all values of it."""
+    facts = {name: [str(run.facts[name]) for run in runs] for name in (*COMMON, "seed", "commit")}
+    machines = [run.record["machine"] for run in runs]
+    facts["machine"] = [f"{each['cpu']} with {each['threads']} threads" for each in machines]
+    return {name: " / ".join(dict.fromkeys(values)) for name, values in facts.items()}
+
+
+def section(
+    table: PaperTable, lines: Sequence[Repeated], said: Collection[str] = ()
+) -> list[str | Table]:
+    """A table as parts of a page: the paper's lines, those of other blocks, each scene.
+
+    The page has `said` some of the `conditions` already.
+    """
     measured = {line.label: line for line in lines}
     parts: list[str | Table] = []
     for block in table.shown(measured):
         first = block is table
         parts.append(f"## {table.number}: {table.title}" if first else f"### {block.title}")
-        parts += _block(block, measured)
+        parts += _block(block, measured, said)
     elsewhere = {line.label for block in table.beside for line in block.lines}
     own = [line for line in lines if line.label not in elsewhere]
     if table.scenes and len({scene for line in own for scene in line.by_scene}) > 1:
@@ -219,14 +232,14 @@ def section(table: PaperTable, lines: Sequence[Repeated]) -> list[str | Table]:
     return parts
 
 
-def _block(table: PaperTable, measured: Mapping[str, Repeated]) -> list[str | Table]:
+def _block(
+    table: PaperTable, measured: Mapping[str, Repeated], said: Collection[str]
+) -> list[str | Table]:
     """What was measured, under which conditions; distances, here and in the paper; notes."""
     runs = [run for line in table.measured(measured) for run in line.runs]
-    machines = [run.record["machine"] for run in runs]
-    on = dict.fromkeys(f"{each['cpu']} with {each['threads']} threads" for each in machines)
-    facts = conditions_of(runs, (*COMMON, "method", "seed", "commit"))
-    where = f"Measured: {facts}, on {' / '.join(on)}." if runs else ""
-    parts: list[str | Table] = [where, figure_table(table, measured)]
+    facts = {name: value for name, value in conditions(runs).items() if name not in said}
+    where = ", ".join(f"{name} {value}" for name, value in facts.items()) if runs else ""
+    parts: list[str | Table] = [where and f"Measured: {where}.", figure_table(table, measured)]
     if any(line.published for line in table.lines):
         parts += [f"Paper: {table.published_on}.", distance_table(table, measured)]
     notes = dict.fromkeys((*table.notes, *missing_figures(runs)))
