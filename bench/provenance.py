@@ -35,8 +35,8 @@ def commit() -> str:
     """The commit of a git checkout, with `-dirty` if changed; otherwise the installed version."""
     try:
         # An installed copy may lie inside a repository that has nothing to do with it.
-        git("ls-files", "--error-unmatch", __file__)
-        return git("describe", "--always", "--dirty", "--abbrev=12", "--exclude=*")
+        _git("ls-files", "--error-unmatch", __file__)
+        return _git("describe", "--always", "--dirty", "--abbrev=12", "--exclude=*")
     except (OSError, subprocess.CalledProcessError):
         return metadata.version("steerbench")
 
@@ -223,7 +223,7 @@ def _version(distribution: str) -> str | None:
 _distributions = cache(metadata.packages_distributions)  # that provide each top-level package
 
 
-def git(*arguments: str) -> str:
+def _git(*arguments: str) -> str:
     command = ["git", "-C", str(ROOT), *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 

@@ -42,6 +42,9 @@ PLACES = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
 RELEASE_STEPS = 300_000  # of stage 2
 STEP_TICKS = (10, 100, 1000, 10_000, RELEASE_STEPS)
 
+OF_FIELD = ("rays", "march", "field", "composite")
+"""Stages of methods that are nothing but volume rendering, of which others have one stage."""
+
 MARK = "mark-{}"  # the `gid` of the mark of the line with this number
 
 NAME_SIZE = (160, 13)  # width and height in pixels of the name of a setting on a plot
@@ -50,20 +53,25 @@ NAME_SIZE = (160, 13)  # width and height in pixels of the name of a setting on 
 def stage_bars(runs: Sequence[Run], path: Path) -> None:
     """Write a PNG: one bar per run, its mean frame time in ms split into stages.
 
-    A stage includes its nested stages. Time outside all stages is grey and comes last.
+    A stage includes its nested stages, and `field` all of volume rendering. Time outside all stages
+    is grey and comes last.
     """
     names = (name for run in runs for name in run.values if name.startswith(STAGE))
-    stages = list(dict.fromkeys(name.partition("/")[0] for name in names))
+    parts: dict[str, list[str]] = {}
+    for stage in dict.fromkeys(name.partition("/")[0] for name in names):
+        own = stage.removeprefix(STAGE)
+        parts.setdefault("field" if own in OF_FIELD else own, []).append(stage)
+    stages = sorted(parts, key=lambda stage: STAGE + stage == OTHER)
     stages.sort(key=lambda stage: stage == OTHER)
     legend_lines = -(-len(stages) // LEGEND_COLUMNS)
     figure = Figure(figsize=(8, 0.7 + 0.25 * legend_lines + 0.5 * len(runs)), layout="constrained")
     axes = figure.subplots()
     ends = np.zeros(len(runs))
     for number, stage in enumerate(stages):
-        widths = np.array([Repeated(run.label, [run]).mean(stage) or 0.0 for run in runs])
-        colour = "lightgrey" if stage == OTHER else COLOURS[number % len(COLOURS)]
-        name = stage.removeprefix(STAGE)
-        axes.barh(range(len(runs)), widths, left=ends, height=0.6, label=name, color=colour)
+        lines = [Repeated(run.label, [run]) for run in runs]
+        widths = np.array([sum(line.mean(x) or 0.0 for x in parts[stage]) for line in lines])
+        colour = "lightgrey" if STAGE + stage == OTHER else COLOURS[number % len(COLOURS)]
+        axes.barh(range(len(runs)), widths, left=ends, height=0.6, label=stage, color=colour)
         ends = ends + widths
     for line, end in enumerate(ends):
         axes.text(end, line, f" {end:.1f}", va="center")

@@ -13,6 +13,7 @@ import csv
 import json
 import re
 import shlex
+import subprocess
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -123,9 +124,15 @@ def _code() -> str:
 
 def _commit() -> str:
     """The commit that last changed the code, marked if it was changed since."""
-    names = [["log", "-1", "--format=%h", "--abbrev=12"], ["status", "--porcelain"]]
-    commit, changed = (provenance.git(*words, "--", *CODE) for words in names)
-    return f"{commit}-dirty" if changed else commit
+    commit = _git("log", "-1", "--format=%h", "--abbrev=12")
+    return f"{commit}-dirty" if _git("status", "--porcelain") else commit
+
+
+def _git(*words: str) -> str:
+    ended = subprocess.run(["git", *words, "--", *CODE], capture_output=True, text=True)
+    if ended.returncode:
+        raise SteerbenchError(f"git: {ended.stderr.strip()}; expected to be in a git checkout")
+    return ended.stdout.strip()
 
 
 def _machine() -> str:
