@@ -21,7 +21,7 @@ AT_MOST = "smaller than in the paper, if there is one"
 AGREES = "same direction"
 """Of a difference whose size the paper does not give."""
 OPPOSITE, OPEN, UNKNOWN = "opposite", "cannot be told", "not measured"
-BY_ONE = ", by one seed"
+BY_ONE = " (one seed)"
 """Ends a verdict from the frames of one training, which another training may reverse."""
 
 TIMES = ("frame_ms", "fps", "stage_ms")
@@ -29,7 +29,7 @@ RATIOS = (*TIMES, "work", "size_bytes")
 """Metrics, by name up to the first dot, whose figures are compared by their ratio: a difference
 would depend on machine and scene. `TIMES` can be compared on one machine only."""
 
-ABSENT = "–"  # stands for a figure that the paper does not give or that cannot be measured here
+ABSENT = "–"  # of a figure that the paper does not give or that cannot be measured here
 
 
 @dataclass(frozen=True)

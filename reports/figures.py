@@ -37,7 +37,7 @@ COSTS = {
 """What quality is plotted against: prefix of the file name, unit and label of the axis."""
 
 PLACES = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
-"""Where the name of a point may stand, across and up: right of it at best."""
+"""Where the name of a point may be, across and up: right of it at best."""
 
 RELEASE_STEPS = 300_000  # of stage 2
 STEP_TICKS = (10, 100, 1000, 10_000, RELEASE_STEPS)

@@ -219,7 +219,7 @@ def over_common_frames(runs: Sequence[Run]) -> list[Run]:
 
     "All" are those of the same views. A method with memory has fewer steady frames, and the first
     frames of a path are not typical: means over different frames would mislead. Runs without steady
-    frames, or without a common one, stay unchanged.
+    frames, or without a common one, are unchanged.
     """
     steady = [set(run.frames.loc[run.frames["phase"] == STEADY, "frame"]) for run in runs]
     common: dict[tuple[object, ...], set[int]] = {}

@@ -93,7 +93,7 @@ def phases(rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
 def run_tables(rows: pd.DataFrame) -> list[Table]:
     """The tables of one run: quality, time by stage and work for each phase; memory.
 
-    For pictures that were only scored, there is only quality. That of a whole path, the JOD, stands
+    For pictures that were only scored, there is only quality. The JOD, of a whole path, is shown
     with the first phase.
     """
     whole = rows[rows["phase"] == WHOLE]

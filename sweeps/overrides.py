@@ -121,7 +121,7 @@ def explain(error: Exception, words: Sequence[str]) -> SteerbenchError:
         return SteerbenchError(
             f"cannot read '{error.override}': settings are written key=value, "
             "for example seed=1 or scene=wires; a value with other signs than letters, digits and "
-            "_/.+- stands in quotes inside quotes, as in \"scene.path='~/my data'\" "
+            "_/.+- is written in quotes inside quotes, as in \"scene.path='~/my data'\" "
             f"({error.message.splitlines()[0]})"
         )
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:

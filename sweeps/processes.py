@@ -28,8 +28,8 @@ def set_up() -> None:
 
     Two thread pools take turns here, torch's and numba's. A pool that spins while idle blocks cores
     that the other needs; one that sleeps at once must be woken a thousand times per step. So let it
-    spin for some ten microseconds. Large tensors lie on pages of 2 MB: fewer pages to map, and
-    fewer addresses to look up.
+    spin for some ten microseconds. Large tensors get pages of 2 MB: fewer pages to map, and fewer
+    addresses to look up.
     """
     os.environ.setdefault("GOMP_SPINCOUNT", "20000")
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")

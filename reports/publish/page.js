@@ -179,7 +179,7 @@ function makeComparison(frame) {
     });
     return button;
   };
-  const two = figures.length > 2; // with one rendering, it stands beside the ground truth
+  const two = figures.length > 2; // one rendering is shown beside the ground truth
   const [left, leftLabel] = choose("left", two ? 1 : 0);
   const [right, rightLabel] = choose("right", two ? 2 : 1);
   const errors = press("error maps", update);
@@ -217,7 +217,7 @@ function makeComparison(frame) {
   function divide() {
     stage.style.setProperty("--split", `${slider.value}%`);
   }
-  /** Enlarge what lies around a place, in shares of the picture, or show the whole again. */
+  /** Enlarge what is around a place, in shares of the picture, or show the whole again. */
   function enlarge(across, down) {
     const origin = (centre) => Math.min(1, Math.max(0, (centre * zoom - 0.5) / (zoom - 1)));
     stage.style.setProperty("--x", `${100 * origin(across)}%`);

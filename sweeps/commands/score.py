@@ -25,7 +25,7 @@ from sweeps.measurement import send
 from sweeps.overrides import composed
 from sweeps.terminal import show_run
 
-NOTHING = "-"  # stands for facts of a row that do not apply to given pictures
+NOTHING = "-"  # in place of facts of a row that do not apply to given pictures
 
 
 def main(options: argparse.Namespace) -> int:
