@@ -8,7 +8,7 @@
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
-.PHONY: help install demo paper test test-all fuzz lint format clean
+.PHONY: help install demo paper figures test test-all fuzz lint format clean
 
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -39,6 +39,9 @@ test: lint ## lint, then all tests that take no more than a few seconds
 
 test-all: lint ## lint, then all tests: what continuous integration runs
 	$(PYTEST)
+
+figures: install ## measure all that the documents show, and put it there; for hours
+	@$(BIN)/steerbench figures
 
 fuzz: install ## loaders and settings on whatever comes, for some minutes
 	$(BIN)/python -m pytest --hypothesis-profile=fuzz tests/bench/scenes/test_fuzz.py tests/sweeps/test_fuzz.py

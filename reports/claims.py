@@ -199,11 +199,11 @@ def told(metric: str, by: float) -> str:
 
 
 def finding_table(comparisons: Sequence[Comparison]) -> Table:
-    """A table of the main findings of the paper among `comparisons`, one line each, in words."""
+    """The main findings of the paper among `comparisons`, those that were measured, in words."""
     lines = (
         (each.claim.says + each.where, *_figures(each), each.verdict)
         for each in comparisons
-        if each.claim.says
+        if each.claim.says and each.here is not NOT_MEASURED
     )
     columns = ("what the paper says", "paper", "here", "95 % interval", "verdict")
     return Table("What the paper says, and what was found", columns, tuple(lines))

@@ -61,7 +61,8 @@ class Made:
     @property
     def told(self) -> str:
         """As a line above the figures."""
-        return f"`{self.command}`, at {self.commit}, on {self.machine}:"
+        command = re.sub(r" (--)?report[ =]\{folder\}", "", self.command)
+        return f"`{command}`, at {self.commit}, on {self.machine}:"
 
 
 def main(options: argparse.Namespace) -> int:
@@ -154,16 +155,23 @@ def _fill(pages: Mapping[str, Path]) -> None:
     texts = {}
     for document in documents:
         before = document.read_text(encoding="utf-8")
-        texts[document] = REGION.sub(partial(_region, document=document, pages=pages), before)
+        told: set[str] = set()
+        region = partial(_region, document=document, pages=pages, told=told)
+        texts[document] = REGION.sub(region, before)
         if texts[document] != before:
             document.write_text(texts[document], encoding="utf-8")
     for picture in RESULTS.glob("*.png"):
-        if not any(picture.name in text for text in texts.values()):
+        if not any(f"/{picture.name})" in text for text in texts.values()):
             picture.unlink()
 
 
-def _region(region: re.Match[str], document: Path, pages: Mapping[str, Path]) -> str:
-    """A region of `document`, filled anew if its page is there."""
+def _region(
+    region: re.Match[str], document: Path, pages: Mapping[str, Path], told: set[str]
+) -> str:
+    """A region of `document`, filled anew if its page is there.
+
+    The first one of a page tells what made it; `told` are the names of pages that have.
+    """
     name, heading, what = region["name"], region["heading"], region["what"]
     if name not in pages:
         return region[0]
@@ -186,18 +194,23 @@ def _region(region: re.Match[str], document: Path, pages: Mapping[str, Path]) ->
         return f"![{picture[1]}]({to_results / _copy(folder / picture[2], name)})"
 
     text = PICTURE.sub(copied, TABLE.sub(shorter, text))
-    told = "" if what == "picture" else f"{made.told}\n\n"
+    first = name not in told
+    told.add(name)
     start = f"<!-- figures {name} | {heading} | {what} | {made.commit} -->"
-    return f"{start}\n{told}{text}\n<!-- end of figures -->"
+    made_by = f"{made.told}\n\n" if first else ""
+    return f"{start}\n{made_by}{text}\n<!-- end of figures -->"
 
 
 def _section(text: str, heading: str, name: str) -> str:
     """The section of a page, without its heading, that begins with `heading`."""
     found = [*HEADING.finditer(text)]
     ends = [*(each.start() for each in found[1:]), len(text)]
-    for each, end in zip(found, ends, strict=True):
-        if each[1].startswith(heading):
-            return text[each.end() : end].strip()
+    sections = {
+        each[1]: text[each.end() : end].strip() for each, end in zip(found, ends, strict=True)
+    }
+    for title in (heading, *(x for x in sections if x.startswith(heading))):
+        if title in sections:
+            return sections[title]
     there = ", ".join(repr(each[1]) for each in found)
     raise SteerbenchError(
         f"figures {name}: expected a heading that begins {heading!r}, got {there}"

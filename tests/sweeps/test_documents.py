@@ -33,7 +33,7 @@ SHOWN = re.compile(
 """A paragraph that begins with the name of a file, and the block below it."""
 
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *DOCS.glob("*.md")])
-OLD = {"CHANGELOG.md", "RESULTS.md", "RESULTS-mic.md", "log.md"}
+OLD = {"CHANGELOG.md", "RESULTS.md", "log.md"}
 """Documents that keep the names of their time."""
 
 PRESENT = [path for path in DOCUMENTS if path.name not in OLD]
