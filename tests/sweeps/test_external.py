@@ -14,10 +14,13 @@ import pandas as pd
 import psutil
 import pytest
 
-from tests.sweeps.conftest import STAND_INS
+from tests.sweeps.conftest import CONFIGS, HERE, QUICK
 from tests.sweeps.test_documents import DOCS, ROOT, write_files
+from tests.sweeps.test_render import pictures
 
 EXTERNAL = ["method=external", "method.command=worker.py"]
+WHITE = [CONFIGS, *QUICK[1:]]
+"""The stand-ins but for their method."""
 
 GREY = """
     import numpy as np
@@ -49,12 +52,26 @@ def rows(tmp_path: Path) -> pd.DataFrame:
     return pd.concat(map(pd.read_csv, tmp_path.glob("outputs/runs/*/rows.csv")))
 
 
-def test_the_worker_of_the_document_is_a_row(steerbench, tmp_path):
-    assert "mean_worker.py" in write_files("external.md", tmp_path)
+@pytest.fixture
+def documented(elsewhere, tmp_path: Path) -> list[str]:
+    """The files of external.md are in the working directory; the words that choose its method."""
     shutil.copy(ROOT / "steerbench_worker.py", tmp_path)
-    text = (DOCS / "external.md").read_text()
-    (command,) = re.findall(r"steerbench (run method=external method.command=mean.*)", text)
-    done = steerbench(*command.split()[:-2], *STAND_INS[:1], *STAND_INS[2:])
+    shutil.copytree(HERE / "configs", tmp_path / "configs")  # Hydra takes one folder
+    names = {"mean_worker.py", "configs/method/mine.yaml"}
+    assert names < write_files("external.md", tmp_path)
+    return ["--config-dir", "configs", "method=mine"]
+
+
+def typed(begin: str) -> list[str]:
+    """The words of the one command in external.md that begins so, without scene and budget."""
+    (line,) = re.findall(rf"steerbench ({begin}.*)", (DOCS / "external.md").read_text())
+    return [word for word in line.split() if not word.startswith(("scene=", "budget="))]
+
+
+def test_the_worker_of_the_document_is_a_row_of_ten_lines(steerbench, documented, tmp_path):
+    lines = (tmp_path / "mean_worker.py").read_text().splitlines()
+    assert len([line for line in lines if line.strip()]) <= 10
+    done = steerbench(*typed("run method=external method.command=mean"), *WHITE)
     assert done.status == 0, done.err
     assert "frame, with the pipe" in done.out
     table = rows(tmp_path).set_index("metric")
@@ -86,13 +103,46 @@ def test_another_worker_or_another_option_is_another_run(run, write, tmp_path):
     assert counts == [1, 2, 3, 3]
 
 
-def test_accuracy_turns_the_knobs_that_it_declares(steerbench, write, monkeypatch):
-    write()
+def test_the_worker_of_the_document_takes_turns_with_ours(steerbench, documented, tmp_path):
+    words = typed("run --config-dir")
+    done = steerbench(*(word.replace("ngp", "grey") for word in words), *QUICK[1:])
+    assert done.status == 0, done.err
+    assert set(rows(tmp_path)["method"]) == {"Mean", "grey"}
+    records = [json.loads(x.read_text()) for x in tmp_path.glob("outputs/runs/*/record.json")]
+    first, second = (record["made_of"] for record in records)
+    assert first["beside"] == second["beside"]
+
+
+def test_the_worker_of_the_document_has_a_line_in_a_table(steerbench, documented, monkeypatch):
+    monkeypatch.setattr("sweeps.plan.TABLES", HERE / "configs/experiment")
+    words = typed("paper --config-dir")
+    done = steerbench(*(word.replace("table1", "table9") for word in words), *WHITE, "seed=0")
+    assert done.status == 0, done.err
+    assert "| mine |" in Path("outputs/paper/report.md").read_text()
+
+
+def test_the_worker_of_the_document_is_drawn_along_a_path(steerbench, documented):
+    done = steerbench("render", *documented, *WHITE, "--beside", "grey", "--output", "there")
+    assert done.status == 0, done.err
+    for picture in pictures("there"):  # white as the scene, and beside it the grey
+        assert (picture[:, :40] == 255).all()
+        assert (picture[:, 40:] == 128).all()
+
+
+def test_accuracy_turns_the_knobs_that_it_declares_and_trains_once(steerbench, write, monkeypatch):
+    write("""
+    def fit(self, job):
+        with open("trainings", "a") as file:
+            file.write("one ")
+
+    Grey.fit, Grey.load = fit, lambda self, job: None
+    """)
     monkeypatch.setattr("methods.checks.found", lambda name: [])  # no kernels
-    done = steerbench("accuracy", *STAND_INS[:1], *STAND_INS[2:], *EXTERNAL, "--repeats", "1")
+    done = steerbench("accuracy", *WHITE, *EXTERNAL, "--repeats", "1")
     assert done.status == 0, done.err
     assert "level 0.25" in done.out
     assert "level 1.0" in done.out
+    assert Path("trainings").read_text() == "one "
 
 
 def test_when_steerbench_is_killed_the_worker_ends(spawn, write, tmp_path):

@@ -6,7 +6,6 @@ import base64
 import json
 import os
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -84,21 +83,6 @@ def test_what_cannot_be_exported_or_imported_is_named(run, steerbench, exported)
         file.write_text(json.dumps(whole | changes))
         outcome = steerbench("import", "nerfbaselines", str(file))
         assert (outcome.status, said in outcome.err) == (2, True), outcome.err
-
-
-@pytest.fixture(scope="session")
-def nerfbaselines(tmp_path_factory) -> str:
-    """A Python that has NerfBaselines: $NERFBASELINES_PYTHON, or a new environment, because it
-    needs an older numpy than ours."""
-    if given := os.environ.get("NERFBASELINES_PYTHON"):
-        return given
-    folder = tmp_path_factory.mktemp("nerfbaselines")
-    subprocess.run([sys.executable, "-m", "venv", folder], check=True)
-    install = [folder / "bin" / "pip", "install", "-q", "nerfbaselines==1.2.12"]
-    done = subprocess.run(install, capture_output=True, text=True, check=False)
-    if done.returncode:
-        pytest.skip(f"NerfBaselines cannot be installed here: {done.stderr[-200:]}")
-    return str(folder / "bin" / "python")
 
 
 THEIRS = """

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
+from bench.nerfbaselines import VERSION
 from bench.types import Budget, NullProbe, Scene, composite
-
-VERSION = "1.2.12"
 
 METHOD = '''
 """The mean colour of the training pictures, a share of it at each step."""
@@ -61,23 +57,9 @@ register({"id": "mean", "method_class": "mean_method:Mean"})
 """
 
 
-@pytest.fixture(scope="module")
-def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The interpreter of an environment with NerfBaselines; skips where pip cannot install it."""
-    folder = tmp_path_factory.mktemp("environment")
-    subprocess.run([sys.executable, "-m", "venv", folder], check=True)
-    install = ["-m", "pip", "install", "--quiet", f"nerfbaselines=={VERSION}"]
-    done = subprocess.run(
-        [folder / "bin/python", *install], capture_output=True, text=True, check=False
-    )
-    if done.returncode:
-        pytest.skip(f"pip cannot install NerfBaselines here: {done.stderr.strip()[-200:]}")
-    return folder / "bin/python"
-
-
 @pytest.mark.slow
 def test_a_registered_method_trains_renders_and_is_loaded(
-    python, external, tiny_scene: Scene, quiet_log, tmp_path, monkeypatch
+    nerfbaselines, external, tiny_scene: Scene, quiet_log, tmp_path, monkeypatch
 ):
     (tmp_path / "mean_method.py").write_text(METHOD)
     (tmp_path / "mean_spec.py").write_text(SPEC)
@@ -89,7 +71,7 @@ def test_a_registered_method_trains_renders_and_is_loaded(
     pictures, seconds = [], []
     for _ in range(2):
         options = {"id": "mean", "overrides": {"steps": 5}}
-        method = external("nerfbaselines", python=str(python), options=options)
+        method = external("nerfbaselines", python=nerfbaselines, options=options)
         method.fit(scene, Budget("test", steps=1, samples=1), quiet_log)
         pictures.append(method.render(scene.splits["test"].cameras[0], NullProbe()).rgb)
         seconds.append(method.train_s)
