@@ -74,8 +74,7 @@ class Comparison:
     larger: str
     paper: float
     here: Gap
-    table: str = ""  # where the claim is made
-    where: str = ""  # on which further data set, as it is added to what the claim says
+    table: str = ""  # where the claim is made; of a further block, also its title after a comma
 
     @property
     def verdict(self) -> str:
@@ -201,7 +200,7 @@ def told(metric: str, by: float) -> str:
 def finding_table(comparisons: Sequence[Comparison]) -> Table:
     """The main findings of the paper among `comparisons`, those that were measured, in words."""
     lines = (
-        (each.claim.says + each.where, *_figures(each), each.verdict)
+        (each.claim.says + "".join(each.table.partition(",")[1:]), *_figures(each), each.verdict)
         for each in comparisons
         if each.claim.says and each.here is not NOT_MEASURED
     )

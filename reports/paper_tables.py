@@ -197,10 +197,7 @@ def comparisons(table: PaperTable, lines: Sequence[Repeated]) -> list[Comparison
             claim = replace(claim, lines=[known_as.get(label, label) for label in claim.lines])
             paper = ((label, line.published.get(claim.metric)) for label, line in own.items())
             figures = {label: figure for label, figure in paper if figure is not None}
-            further = "" if block is table else f", {block.title}"
-            found += [
-                replace(x, table=where, where=further) for x in compare(claim, known, figures)
-            ]
+            found += [replace(x, table=where) for x in compare(claim, known, figures)]
     return found
 
 

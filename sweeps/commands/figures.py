@@ -168,7 +168,7 @@ def _fill(pages: Mapping[str, Path]) -> None:
 def _region(
     region: re.Match[str], document: Path, pages: Mapping[str, Path], told: set[str]
 ) -> str:
-    """A region of `document`, filled anew if its page is there.
+    """A region of `document` with the present figures of its page; as it was without the page.
 
     The first one of a page tells what made it; `told` are the names of pages that have.
     """
