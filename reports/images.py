@@ -104,17 +104,17 @@ def frame_section(runs: Sequence[Run], frame: str, stem: str) -> Iterator[str | 
     yield f"### {name}"
     yield Frame(name, f"{stem}-{frame}", truth, views, box, where, errors)
     yield (
-        f"PSNR and time of a picture are of this frame alone. The framed part, where {where}, can"
-        f" be seen {ZOOM} times enlarged. Error maps show the {errors}."
+        f"PSNR is that of this frame, the time the mean of all steady ones. The framed part, where"
+        f" {where}, can be seen {ZOOM} times enlarged. Error maps show the {errors}."
     )
 
 
 def _view(run: Run, frame: str) -> View:
-    """A kept frame of a run, with its own PSNR and time in the title."""
+    """A kept frame of a run, with its PSNR and the time of a steady frame, or its own, if cold."""
     figures = run.frames.set_index("frame").loc[int(frame)]
-    title = f"PSNR {figures['psnr']:.2f} dB, {figures['frame_ms']:.1f} ms"
-    if figures["phase"] == COLD:
-        title += ", cold"
+    cold = figures["phase"] == COLD
+    ms = figures["frame_ms"] if cold else run.values["frame_ms"]
+    title = f"PSNR {figures['psnr']:.2f} dB, {ms:,.1f} ms{', cold' if cold else ''}"
     pictures = [_read(run.pictures / f"{frame}-{kind}.png") for kind in ("rendered", "error")]
     return View((run.label, title), *pictures)
 

@@ -55,7 +55,8 @@ def main(options: argparse.Namespace) -> int:
         experiments = experiment_rows(checks.found("experiments"), options.repeats, log)
     show(experiment_table(experiments))
     command = shlex.join(["steerbench", *sys.argv[1:]])
-    page = write_tradeoff(experiments, rows, launcher.outputs / "accuracy", command)
+    folder = options.report or launcher.outputs / "accuracy"
+    page = write_tradeoff(experiments, rows, folder, command)
     log.info(f"report: {page}")
     if rows and limit is not None:
         print(_recommended(rows, limit))

@@ -2,8 +2,8 @@
 
 docs/figures.toml names the commands. A document shows a part of what one of them wrote between two
 comments, `<!-- figures NAME | HEADING | WHAT -->` and `<!-- end of figures -->`: of the section of
-its page whose heading begins so (none: the first), the first `table`, the first `picture`, or
-`all`. Whatever is between the comments is replaced.
+its page whose heading begins so (none: the first), the first `table`, the `bold` lines of it, the
+first `picture`, or `all`. Whatever is between the comments is replaced.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ PAGE = "report.md"
 MADE = "made.json"  # beside a page: what made it
 
 REGION = re.compile(
-    r"<!-- figures (?P<name>[\w-]+) \| (?P<heading>[^|\n]*?) \| (?P<what>all|table|picture)"
+    r"<!-- figures (?P<name>[\w-]+) \| (?P<heading>[^|\n]*?) \| (?P<what>all|table|bold|picture)"
     r"[^\n]*-->\n.*?<!-- end of figures -->",
     re.DOTALL,
 )
@@ -45,8 +45,9 @@ HEADING = re.compile(r"^#{1,2} (.*)$", re.MULTILINE)
 PICTURE = re.compile(r"^!\[(.*)\]\((.+)\)$", re.MULTILINE)
 TABLE = re.compile(r"(?:^\|.*\|\n?)+", re.MULTILINE)
 
-LONGEST = 40  # lines of a table that a document shows; longer ones are in the CSV file alone
-COLOURS = 256  # of a picture in the documents, so that a checkout stays small
+LONGEST = 15  # lines of a table that a document shows; more are in the CSV file
+COLOURS_OF_A_PLOT = 2**14  # at most; a picture with more shows renderings
+QUALITY = 90  # of WebP
 
 
 @dataclass(frozen=True)
@@ -160,9 +161,9 @@ def _fill(pages: Mapping[str, Path]) -> None:
         texts[document] = REGION.sub(region, before)
         if texts[document] != before:
             document.write_text(texts[document], encoding="utf-8")
-    for picture in RESULTS.glob("*.png"):
-        if not any(f"/{picture.name})" in text for text in texts.values()):
-            picture.unlink()
+    for file in RESULTS.iterdir():
+        if not any(f"/{file.name})" in text for text in texts.values()):
+            file.unlink()
 
 
 def _region(
@@ -179,16 +180,19 @@ def _region(
     assert made is not None
     text = _section((folder / PAGE).read_text(encoding="utf-8"), heading, name)
     if what != "all":
-        found = (TABLE if what == "table" else PICTURE).search(text)
+        found = (PICTURE if what == "picture" else TABLE).search(text)
         if not found:
             raise SteerbenchError(f"{document}: figures {name} | {heading}: it has no {what}")
         text = found[0].strip()
     to_results = RESULTS if document.parent == Path() else RESULTS.relative_to(document.parent)
 
     def shorter(table: re.Match[str]) -> str:
-        lines = len(table[0].strip().splitlines()) - 2
+        head, rule, *lines = table[0].strip().splitlines()
+        kept = [x for x in lines if what != "bold" or x.startswith("| **")][:LONGEST]
+        if len(kept) == len(lines):
+            return table[0]
         link = f"[{name}.csv]({to_results / name}.csv)"
-        return table[0] if lines <= LONGEST else f"{lines} lines, in {link}\n"
+        return "\n".join([head, rule, *kept, "", f"{len(kept)} of {len(lines)} lines of {link}."])
 
     def copied(picture: re.Match[str]) -> str:
         return f"![{picture[1]}]({to_results / _copy(folder / picture[2], name)})"
@@ -218,12 +222,17 @@ def _section(text: str, heading: str, name: str) -> str:
 
 
 def _copy(picture: Path, name: str) -> str:
-    """Copy a picture with few colours into the results; the name that it has there."""
+    """Copy a picture into the results, with few colours or, of a rendering, with little loss; the
+    name that it has there."""
     stem = picture.stem.rpartition("-")[0]  # without the digest
     with Image.open(picture) as image:
-        few = image.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+        pixels = image.convert("RGB")
+    if pixels.getcolors(COLOURS_OF_A_PLOT):
+        few = pixels.quantize(dither=Image.Dither.NONE)
         few.save(RESULTS / f"{name}-{stem}.png", optimize=True)
-    return f"{name}-{stem}.png"
+        return f"{name}-{stem}.png"
+    pixels.save(RESULTS / f"{name}-{stem}.webp", quality=QUALITY, method=6)
+    return f"{name}-{stem}.webp"
 
 
 def _rows(text: str) -> Iterator[list[str]]:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -18,16 +17,13 @@ from methods import checks
 from reports.tables import Table
 from sweeps.commands.kernels import errors
 from sweeps.terminal import print_rows, show
+from sweeps.variants import Row
 
 COLUMNS = (
     *("subject", "case", "what must hold", "by", "on", "precision"),
     *("worst", "at most", "status"),
 )
-CASE_COLUMNS = (
-    *("subject", "case", "what must hold", "cells", "backend, precision"),
-    *("worst", "at most", "status", "the tolerance"),
-)
-"""Columns with one line per case, which shows the cell nearest to its tolerance."""
+NEAREST = 5  # cases that are also shown by themselves
 
 
 def main(options: argparse.Namespace) -> int:
@@ -39,33 +35,28 @@ def main(options: argparse.Namespace) -> int:
     rows = list(run_cases(cases, devices, ConsoleLog(Path())))
     wrong = sum(failed(row) for row in rows)
     title = f"Stress: {len(cases)} cases, {len(rows)} cells, {wrong} failed"
-    if options.format == "markdown":
-        print(Table(title, CASE_COLUMNS, tuple(_case_lines(rows)), figures=False).markdown())
-    else:
-        labels = ("subject", "case", "holds", "backend", "device", "precision")
-        lines = tuple((*(row[name] for name in labels), *_end(row)) for row in rows)
-        show(Table(title, COLUMNS, lines, figures=False))
+    show(Table(title, COLUMNS, tuple(map(_line, rows)), figures=False))
+    nearest = sorted(_worst_of_cases(rows), key=_nearness, reverse=True)[:NEAREST]
+    title = "Nearest to their tolerances"
+    show(Table(title, COLUMNS, tuple(map(_line, nearest)), figures=False))
     print_rows(rows)
     return int(wrong > 0)
 
 
-def _end(row: Mapping[str, Any]) -> tuple[str, str, str]:
-    """The cells of the columns "worst", "at most" and "status"."""
+def _line(row: Row) -> tuple[str, ...]:
+    labels = ("subject", "case", "holds", "backend", "device", "precision")
     seen, at_most = errors(row)
-    return "" if row["status"].startswith("unavailable") else seen, at_most, row["status"]
+    worst = "" if row["status"].startswith("unavailable") else seen
+    return (*(row[name] for name in labels), worst, at_most, row["status"])
 
 
-def _case_lines(rows: Iterable[Mapping[str, Any]]) -> Iterator[tuple[str, ...]]:
-    """One line per case, with the cell that is nearest to its tolerance or exceeds it."""
-    for (subject, case), cells in groupby(rows, key=lambda row: (row["subject"], row["case"])):
-        those = list(cells)
-        worst = max(those, key=_nearness)
-        by = f"{worst['backend']} {worst['precision']}"
-        labels = (subject, case, worst["holds"], str(len(those)), by)
-        yield (*labels, *_end(worst), worst["derivation"])
+def _worst_of_cases(rows: Iterable[Row]) -> Iterator[Row]:
+    """Of each case the cell that is nearest to its tolerance or exceeds it."""
+    for _, cells in groupby(rows, key=lambda row: (row["subject"], row["case"])):
+        yield max(cells, key=_nearness)
 
 
-def _nearness(row: Mapping[str, Any]) -> float:
+def _nearness(row: Row) -> float:
     if row["status"].startswith("unavailable"):
         return -1.0
     if failed(row):

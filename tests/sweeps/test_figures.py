@@ -58,12 +58,6 @@ def test_documents_get_tables_pictures_and_where_they_are_from(steerbench, check
     assert f"({shown.removeprefix('docs/')})" in more
     with Image.open(checkout / shown) as picture:
         assert picture.mode == "P"
-    rows, listed = (
-        [*csv.reader((checkout / "docs/results" / name).read_text().splitlines())]
-        for name in ("run.csv", "list.csv")
-    )
-    assert next(row for row in rows if row[:1] == ["run"])[1] == "PSNR, dB ↑"
-    assert ["grey" in row for row in listed].count(True) > 1
 
 
 def test_what_is_of_the_same_code_is_used_again_and_named_otherwise(steerbench, checkout):
@@ -105,10 +99,18 @@ def test_a_region_that_cannot_be_filled_is_named(steerbench, checkout, wanted, e
     assert error in outcome.err
 
 
-def test_a_long_table_is_in_the_csv_file_alone(steerbench, checkout, monkeypatch):
-    monkeypatch.setattr(figures, "LONGEST", 0)
-    steerbench("figures", "--only", "run")
-    assert "1 lines, in [run.csv](docs/results/run.csv)" in (checkout / "README.md").read_text()
+@pytest.mark.parametrize(("what", "longest"), [("table", 0), ("bold", 15)])
+def test_a_document_shows_few_lines_of_a_long_table(
+    steerbench, checkout, monkeypatch, what, longest
+):
+    """All are in the CSV file, which stays while a document names it."""
+    monkeypatch.setattr(figures, "LONGEST", longest)
+    (checkout / "README.md").write_text(region("run", "", what))
+    steerbench("figures")
+    assert "0 of 1 lines of [run.csv](docs/results/run.csv)" in (checkout / "README.md").read_text()
+    (file,) = (checkout / "docs/results").glob("*.csv")
+    rows = [*csv.reader(file.read_text().splitlines())]
+    assert next(row for row in rows if row[:1] == ["run"])[1] == "PSNR, dB ↑"
 
 
 # The documents of this checkout

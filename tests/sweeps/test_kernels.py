@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import json
 import sys
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -12,6 +13,7 @@ import pytest
 from bench.case import Case
 from bench.errors import Unavailable
 from bench.types import Log
+from sweeps import terminal
 from sweeps.commands.kernels import wrong_of
 from sweeps.processes import lock_file
 
@@ -19,6 +21,8 @@ RIGHT = {
     "kernel": "encode", "case": "view", "backend": "cpu", "dtype": "float32", "error": 1e-7,
     "tolerance": 1e-6, "status": "ok", "ms": 12.5, "mitems_s": 10.4, "ratio": 31.0,
 }  # fmt: skip
+REFERENCE = {**RIGHT, "backend": "reference", "error": 0.0, "ms": 387.5, "ratio": 1.0}
+SMALL = {**RIGHT, "case": "few", "ms": 2.5}
 WRONG = {
     "kernel": "march", "case": "empty", "backend": "cpu", "dtype": "float32", "error": 0.5,
     "tolerance": 1e-6, "status": "wrong",
@@ -27,7 +31,7 @@ WRONG = {
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], int]]:
-    """The subjects that were timed, and how often; the rows are `RIGHT` and `WRONG`, by subject."""
+    """The subjects that were timed, and how often; the rows are those above, by subject."""
     calls = []
 
     def timed_rows(cases, device, backends, repeats: int, log: Log) -> list[dict]:
@@ -35,7 +39,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], int]]:
         assert {"reference", "cpu"} & set(backends)
         with lock_file("auto").open() as file, pytest.raises(BlockingIOError):  # it is its turn
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return [row for row in (RIGHT, WRONG) if row["kernel"] in calls[-1][0]]
+        return [row for row in (SMALL, REFERENCE, RIGHT, WRONG) if row["kernel"] in calls[-1][0]]
 
     def case(subject: str) -> Case:
         return Case(subject, "view", "", "", {}, lambda *cell: 0.0)
@@ -45,17 +49,26 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], int]]:
     return calls
 
 
-def test_the_last_line_is_json_of_what_the_table_shows_and_a_wrong_kernel_fails(steerbench, asked):
+def test_the_last_line_is_json_and_a_wrong_kernel_fails(steerbench, asked):
     outcome = steerbench("kernels", "--filter", "enc", "--repeats", "3")
     assert asked == [(["encode"], 3)]
     assert outcome.status == 0
-    for text in ("encode", "1.0e-07", "1.0e-06", "12.50", "10.40", "31.0x"):
-        assert text in outcome.out
-    assert json.loads(outcome.out.splitlines()[-1]) == [RIGHT]
+    assert json.loads(outcome.out.splitlines()[-1]) == [SMALL, REFERENCE, RIGHT]
     outcome = steerbench("kernels")
     assert outcome.status == 1
     assert "wrong" in outcome.out  # instead of a time
-    assert json.loads(outcome.out.splitlines()[-1]) == [RIGHT, WRONG]
+    assert json.loads(outcome.out.splitlines()[-1])[-1] == WRONG
+
+
+def test_a_fast_version_has_a_line_with_the_time_of_its_reference(steerbench, asked):
+    terminal.shown.clear()
+    steerbench("kernels")
+    (table,) = terminal.shown
+    wrong, right, small = (dict(zip(table.columns, line, strict=True)) for line in table.lines)
+    assert wrong["kernel"] == "march"  # first, then those that save most
+    assert [right[x] for x in ("error", "tolerance")] == ["1.0e-07", "1.0e-06"]
+    assert [right[x] for x in ("ms", "by its reference", "ratio")] == ["12.50", "387.50", "31.0x"]
+    assert small["by its reference"] == "n/a"
 
 
 @pytest.mark.parametrize(
@@ -144,17 +157,22 @@ def test_the_last_line_of_stress_is_json_and_a_case_that_fails_fails_it(steerben
     assert [r["status"] for r in json.loads(outcome.out.splitlines()[-1])] == ["ok", "failed"]
 
 
-def test_on_a_page_the_cell_nearest_to_its_tolerance_stands_for_a_case(steerbench, monkeypatch):
+def test_cases_nearest_to_their_tolerances_are_shown_again(steerbench, monkeypatch):
     seen = {"cpu": 5e-7, "reference": 4e-7, "gpu": Unavailable("no GPU")}
     cells = {("cpu", "fp32"): 1e-6, ("reference", "fp32"): 5e-7, ("gpu", "fp32"): 1e-6}
 
-    def worst(backend: str, device: str, precision: str) -> float:
+    def worst(backend: str, device: str, precision: str, share: float) -> float:
         if isinstance(seen[backend], Unavailable):
             raise seen[backend]
-        return seen[backend]
+        return share * seen[backend]
 
-    case = Case("sum", "long", "all is there", "of rounding", cells, worst)
-    monkeypatch.setattr("methods.checks.found", lambda name: [case])
-    lines = steerbench("stress", "--format", "markdown").out.splitlines()
-    figures = "3 | reference fp32 | 4.0e-07 | 5.0e-07 | ok | of rounding"
-    assert lines[2] == f"| sum | long | all is there | {figures} |"
+    cases = [
+        Case("sum", str(number), "all is there", "u", cells, partial(worst, share=number / 9))
+        for number in range(10)
+    ]
+    monkeypatch.setattr("methods.checks.found", lambda name: cases)
+    terminal.shown.clear()
+    steerbench("stress")
+    nearest = terminal.shown[-1].lines
+    assert [line[1] for line in nearest] == ["9", "8", "7", "6", "5"]
+    assert nearest[0][3:] == ("reference", "cpu", "fp32", "4.0e-07", "5.0e-07", "ok")
