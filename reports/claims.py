@@ -199,11 +199,13 @@ def told(metric: str, by: float) -> str:
 
 def finding_table(comparisons: Sequence[Comparison]) -> Table:
     """The main findings of the paper among `comparisons`, those that were measured, in words."""
-    lines = (
-        (each.claim.says + "".join(each.table.partition(",")[1:]), *_figures(each), each.verdict)
-        for each in comparisons
-        if each.claim.says and each.here is not NOT_MEASURED
-    )
+    lines = []
+    for each in comparisons:
+        if each.claim.says and each.here is not NOT_MEASURED:
+            data_set = "".join(each.table.partition(",")[1:])
+            unit = " (dB)" if each.claim.metric == "psnr" else ""
+            figures = (*_figures(each), each.verdict)
+            lines.append((f"{each.claim.says}{data_set}{unit}", *figures))
     columns = ("what the paper says", "paper", "here", "95 % interval", "verdict")
     return Table("What the paper says, and what was found", columns, tuple(lines))
 

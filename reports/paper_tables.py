@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Container, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -51,13 +51,13 @@ class PaperTable:
 
     `published_on` has scenes, size and machine of the paper's figures; they are those of a
     `data_set`, "" for scenes of which the paper has none. `notes` are what a reader should know
-    before comparing, `claims` what the paper concludes. In these a line that was not measured is
-    replaced by the one that `instead` has for its label. Distances are those to the line
-    `reference`, by default the first. `beside` has the figures of further data sets, `beyond` is a
-    method beyond the paper, shown with the same lines as the paper's method and notes of its own.
-    The metrics `scenes` are also shown for every scene of a data set. Where a table compares times,
-    its lines are measured `in_turns`, frame by frame. With `curve`, the lines of the paper's method
-    are also shown as curves over the training.
+    before comparing, `claims` what the paper concludes. For a line that was not measured stands the
+    one that `instead` has for its label. Labels end with `mark`, but not in `claims` and `instead`.
+    Distances are those to the line `reference`, by default the first. `beside` has the figures of
+    further data sets, `beyond` is a method beyond the paper, shown with the same lines as the
+    paper's method and notes of its own. The metrics `scenes` are also shown for every scene of a
+    data set. Where a table compares times, its lines are measured `in_turns`, frame by frame. With
+    `curve`, the lines of the paper's method are also shown as curves over the training.
     """
 
     name: str
@@ -74,6 +74,7 @@ class PaperTable:
     curve: bool = False
     reference: str = ""
     instead: Mapping[str, str] = field(default_factory=dict)
+    mark: str = ""
     data_set: str = FIRST
     beside: Sequence[PaperTable] = ()
 
@@ -109,15 +110,33 @@ class PaperTable:
 
     def block(self, title: str, lines: Sequence[Line], mark: str) -> PaperTable:
         """A further block with this title and these `lines`, whose labels then have this mark."""
-        marked_lines = [replace(line, label=f"{line.label} ({mark})") for line in lines]
+        mark = f" ({mark})"
+        marked_lines = [replace(line, label=f"{line.label}{mark}") for line in lines]
         names = {line.label: new.label for line, new in zip(lines, marked_lines, strict=True)}
         block = replace(self, title=title, lines=marked_lines, notes=(), curve=False, beyond=None)
-        return replace(block, reference=names.get(self.reference, ""), beside=())
+        return replace(block, reference=names.get(self.reference, ""), beside=(), mark=mark)
 
-    def shown(self, measured: Container[str]) -> list[PaperTable]:
-        """The table, and those further blocks of which any line is in `measured` (labels)."""
+    def shown(self, measured: Mapping[str, Repeated]) -> list[PaperTable]:
+        """The table, and those further blocks of which any line is in `measured` (by label); in
+        each, what stands for a line has its published figures."""
         first, *further = self.blocks
-        return [first, *(x for x in further if any(line.label in measured for line in x.lines))]
+        there = (x for x in further if any(line.label in measured for line in x.lines))
+        return [block._with_what_stands(measured) for block in (first, *there)]
+
+    def _with_what_stands(self, measured: Mapping[str, Repeated]) -> PaperTable:
+        lines = {line.label.removesuffix(self.mark): line for line in self.lines}
+        known = dict(zip(lines, self.measured(measured), strict=True))
+        there = {label for label, line in known.items() if line.runs}
+        notes, standing = list(self.notes), {}
+        for missing, other in self.instead.items():
+            if missing in known.keys() - there and other in there:
+                published = lines.pop(missing).published
+                lines[other] = replace(lines[other], published=published)
+                standing[missing] = other
+                why = ": ".join(("not measured", *known[missing].gaps))
+                notes += [] if self.mark else [f"{other}, stands for {missing}: {why}."]
+        claims = [replace(x, lines=[standing.get(y, y) for y in x.lines]) for x in self.claims]
+        return replace(self, lines=[*lines.values()], notes=notes, claims=claims)
 
     def measured(self, known: Mapping[str, Repeated]) -> list[Repeated]:
         """Its lines of `known`, by label; those that are not there have no runs."""
@@ -186,15 +205,10 @@ def comparisons(table: PaperTable, lines: Sequence[Repeated]) -> list[Comparison
     measured = {line.label: line for line in lines}
     found = []
     for block in table.shown(measured):
-        mark = "" if block is table else f" ({block.title})"  # of its labels
-        where = table.number if block is table else f"{table.number}, {block.title}"
-        own = {line.label.removesuffix(mark): line for line in block.lines}
+        where = f"{table.number}, {block.title}" if block.mark else table.number
+        own = {line.label.removesuffix(block.mark): line for line in block.lines}
         known = dict(zip(own, block.measured(measured), strict=True))
-        there = {label for label, line in known.items() if line.measured}
-        known_as = {x: y for x, y in table.instead.items() if x in {*known} - there and y in there}
-        own |= {y: replace(own[y], published=own[x].published) for x, y in known_as.items()}
         for claim in block.claims:
-            claim = replace(claim, lines=[known_as.get(label, label) for label in claim.lines])
             paper = ((label, line.published.get(claim.metric)) for label, line in own.items())
             figures = {label: figure for label, figure in paper if figure is not None}
             found += [replace(x, table=where) for x in compare(claim, known, figures)]
@@ -219,8 +233,7 @@ def section(
     measured = {line.label: line for line in lines}
     parts: list[str | Table] = []
     for block in table.shown(measured):
-        first = block is table
-        parts.append(f"## {table.number}: {table.title}" if first else f"### {block.title}")
+        parts.append(f"### {block.title}" if block.mark else f"## {table.number}: {table.title}")
         parts += _block(block, measured, said)
     elsewhere = {line.label for block in table.beside for line in block.lines}
     own = [line for line in lines if line.label not in elsewhere]

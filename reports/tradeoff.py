@@ -31,16 +31,17 @@ ON_FRONTIER = "— (frontier)"
 
 
 def experiment_table(rows: Sequence[Row]) -> Table:
-    """A table of all settings of all experiments; first lines show the observed order."""
-    lines: list[tuple[str, ...]] = []
+    """One line per experiment: its first and last setting, and the observed order."""
+    lines = []
     for subject, some in groupby(rows, lambda row: row["subject"]):
         first, *others = some
+        ends = [first, *others[-1:]]
         order = ""
         if first["order"] is not None:
-            ends = f"{_setting(first['order_from'])} to {_setting(first['order_to'])}"
-            order = f"{first['order']:.2f} ({ends})"
-        lines.append((subject, first["knob"], *_trial(first), order))
-        lines += [("", "", *_trial(row), "") for row in others]
+            span = f"{_setting(first['order_from'])} to {_setting(first['order_to'])}"
+            order = f"{first['order']:.2f} ({span})"
+        figures = zip(*map(_trial, ends), strict=True)
+        lines.append((subject, first["knob"], *map(" to ".join, figures), order))
     title = "Kernels: run time against error, where the exact answer is known"
     return Table(title, EXPERIMENTS, tuple(lines))
 

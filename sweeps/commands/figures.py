@@ -45,7 +45,7 @@ HEADING = re.compile(r"^#{1,2} (.*)$", re.MULTILINE)
 PICTURE = re.compile(r"^!\[(.*)\]\((.+)\)$", re.MULTILINE)
 TABLE = re.compile(r"(?:^\|.*\|\n?)+", re.MULTILINE)
 
-LONGEST = 15  # lines of a table that a document shows; more are in the CSV file
+LONGEST = 16  # lines of a table that a document shows; more are in the CSV file
 COLOURS_OF_A_PLOT = 2**14  # at most; a picture with more shows renderings
 QUALITY = 90  # of WebP
 
@@ -161,9 +161,9 @@ def _fill(pages: Mapping[str, Path]) -> None:
         texts[document] = REGION.sub(region, before)
         if texts[document] != before:
             document.write_text(texts[document], encoding="utf-8")
-    for file in RESULTS.iterdir():
-        if not any(f"/{file.name})" in text for text in texts.values()):
-            file.unlink()
+    for shown in RESULTS.iterdir():
+        if not any(f"/{shown.name})" in text for text in texts.values()):
+            shown.unlink()
 
 
 def _region(

@@ -83,7 +83,7 @@ def test_findings_come_first_all_comparisons_last(run, tmp_path):
     text = write_paper_page([table], {"table6": lines}, [], tmp_path).read_text()
     before, after = text.split("## The tables")
     says = "a hash table of an eighth of the length is as good"
-    assert f"| {says} | +0.02 | +0.11 | " in before
+    assert f"| {says} (dB) | +0.02 | +0.11 | " in before
     assert "2 of the 4 have an interval" in before  # sizes are computed
     found = after.split("## All comparisons")[1]
     assert "| Table 6, PSNR, dB: T = 2^14 < T = 2^16 | +0.33 | +0.11 |" in found

@@ -124,6 +124,19 @@ def test_what_stands_for_a_line_that_was_not_measured_is_compared_with_its_figur
     assert one.paper == pytest.approx(32.79 - 31.60)
 
 
+def test_a_table_says_for_which_line_another_stands_and_why(run, tmp_path):
+    lines = [
+        Repeated("SteerNeRF, half precision", [], ["failed: no bfloat16"]),
+        Repeated("SteerNeRF, fp32", [run]),
+        Repeated("Instant-NGP", [run]),
+    ]
+    text = markdown(section(TABLES["table1"], lines), tmp_path)
+    assert "| SteerNeRF, half precision" not in text
+    assert "| SteerNeRF, fp32 | +0.00 / -1.19 |" in text
+    why = "not measured: failed: no bfloat16."
+    assert f"- SteerNeRF, fp32, stands for SteerNeRF, half precision: {why}" in text
+
+
 @pytest.mark.parametrize("name", TABLES)
 def test_the_lines_of_a_table_take_every_value_of_its_grid_and_no_other(name):
     experiment = OmegaConf.load(CONFIGS / "experiment" / f"{name}.yaml")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from matplotlib.figure import Figure
 from PIL import Image
 
 from reports.figures import frontier_plot
@@ -37,9 +38,11 @@ SETTINGS = [
 
 def test_an_experiment_is_named_once_with_its_order_and_where_that_was_fitted():
     lines = experiment_table(EXPERIMENTS).lines
-    assert lines[0] == ("ramp: depth", "step", "1/4", "3.8e-03", "0.39", "2.00 (1/64 to 1/4)")
-    assert lines[1] == ("", "", "1/64", "1.5e-05", "0.60", "")
-    assert lines[2] == ("encoding", "table", "packed bf16", "3.7e-03", "6.00", "")
+    assert lines[0] == (
+        *("ramp: depth", "step", "1/4 to 1/64", "3.8e-03 to 1.5e-05", "0.39 to 0.60"),
+        "2.00 (1/64 to 1/4)",
+    )
+    assert lines[1] == ("encoding", "table", "packed bf16", "3.7e-03", "6.00", "")
 
 
 def test_settings_are_sorted_by_time_and_the_frontier_is_bold():
@@ -74,3 +77,11 @@ def test_the_plot_of_a_single_setting_is_a_picture(tmp_path):
     frontier_plot(SETTINGS[:1], tmp_path / "plot.png")
     with Image.open(tmp_path / "plot.png") as picture:
         assert min(picture.size) > 500
+
+
+def test_a_setting_far_slower_than_the_frontier_is_only_named(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path, dpi: drawn.append(figure))
+    frontier_plot([*SETTINGS, setting("empty space", 801.0, 20.0, "refined 0")], tmp_path)
+    frontier_plot([*SETTINGS, setting("empty space", 799.0, 20.0, "refined 0")], tmp_path)
+    assert [figure.get_suptitle() for figure in drawn] == ["not shown: empty space, 801 ms", ""]

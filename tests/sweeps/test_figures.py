@@ -99,7 +99,7 @@ def test_a_region_that_cannot_be_filled_is_named(steerbench, checkout, wanted, e
     assert error in outcome.err
 
 
-@pytest.mark.parametrize(("what", "longest"), [("table", 0), ("bold", 15)])
+@pytest.mark.parametrize(("what", "longest"), [("table", 0), ("bold", 16)])
 def test_a_document_shows_few_lines_of_a_long_table(
     steerbench, checkout, monkeypatch, what, longest
 ):
