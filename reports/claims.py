@@ -198,16 +198,20 @@ def told(metric: str, by: float) -> str:
 
 
 def finding_table(comparisons: Sequence[Comparison]) -> Table:
-    """The main findings of the paper among `comparisons`, those that were measured, in words."""
-    lines = []
+    """The main findings of the paper among `comparisons`, those that were measured, in words.
+
+    Where a further data set has the same figures, as sizes have, the first line is enough.
+    """
+    names: dict[tuple[str, ...], str] = {}
     for each in comparisons:
         if each.claim.says and each.here is not NOT_MEASURED:
             data_set = "".join(each.table.partition(",")[1:])
             unit = " (dB)" if each.claim.metric == "psnr" else ""
-            figures = (*_figures(each), each.verdict)
-            lines.append((f"{each.claim.says}{data_set}{unit}", *figures))
+            found = (each.claim.says, *_figures(each), each.verdict)
+            names.setdefault(found, f"{each.claim.says}{data_set}{unit}")
     columns = ("what the paper says", "paper", "here", "95 % interval", "verdict")
-    return Table("What the paper says, and what was found", columns, tuple(lines))
+    lines = tuple((name, *figures) for (_, *figures), name in names.items())
+    return Table("What the paper says, and what was found", columns, lines)
 
 
 def _figures(each: Comparison) -> tuple[str, str, str]:

@@ -2,8 +2,8 @@
 
 docs/figures.toml names the commands. A document shows a part of what one of them wrote between two
 comments, `<!-- figures NAME | HEADING | WHAT -->` and `<!-- end of figures -->`: of the section of
-its page whose heading begins so (none: the first), the first `table`, the `bold` lines of it, the
-first `picture`, or `all`. Whatever is between the comments is replaced.
+its page whose heading begins so (none: the first), the first `table` (`table 8`: its first lines),
+the `bold` lines of it, the first `picture`, or `all`. What is between the comments is replaced.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ PAGE = "report.md"
 MADE = "made.json"  # beside a page: what made it
 
 REGION = re.compile(
-    r"<!-- figures (?P<name>[\w-]+) \| (?P<heading>[^|\n]*?) \| (?P<what>all|table|bold|picture)"
+    r"<!-- figures (?P<name>[\w-]+) \| (?P<heading>[^|\n]*?) \| "
+    r"(?P<what>all|table|bold|picture)(?: (?P<most>\d+))?"
     r"[^\n]*-->\n.*?<!-- end of figures -->",
     re.DOTALL,
 )
@@ -45,7 +46,6 @@ HEADING = re.compile(r"^#{1,2} (.*)$", re.MULTILINE)
 PICTURE = re.compile(r"^!\[(.*)\]\((.+)\)$", re.MULTILINE)
 TABLE = re.compile(r"(?:^\|.*\|\n?)+", re.MULTILINE)
 
-LONGEST = 16  # lines of a table that a document shows; more are in the CSV file
 COLOURS_OF_A_PLOT = 2**14  # at most; a picture with more shows renderings
 QUALITY = 90  # of WebP
 
@@ -174,6 +174,7 @@ def _region(
     The first one of a page tells what made it; `told` are the names of pages that have.
     """
     name, heading, what = region["name"], region["heading"], region["what"]
+    most = int(region["most"]) if region["most"] else None
     if name not in pages:
         return region[0]
     folder, made = pages[name], _read(pages[name])
@@ -188,7 +189,7 @@ def _region(
 
     def shorter(table: re.Match[str]) -> str:
         head, rule, *lines = table[0].strip().splitlines()
-        kept = [x for x in lines if what != "bold" or x.startswith("| **")][:LONGEST]
+        kept = [x for x in lines if what != "bold" or x.startswith("| **")][:most]
         if len(kept) == len(lines):
             return table[0]
         link = f"[{name}.csv]({to_results / name}.csv)"
@@ -200,7 +201,8 @@ def _region(
     text = PICTURE.sub(copied, TABLE.sub(shorter, text))
     first = name not in told
     told.add(name)
-    start = f"<!-- figures {name} | {heading} | {what} | {made.commit} -->"
+    shown = what if most is None else f"{what} {most}"
+    start = f"<!-- figures {name} | {heading} | {shown} | {made.commit} -->"
     made_by = f"{made.told}\n\n" if first else ""
     return f"{start}\n{made_by}{text}\n<!-- end of figures -->"
 
