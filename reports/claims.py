@@ -37,8 +37,8 @@ class Claim:
     """`metric` grows from each of the `lines` (labels) to the next or, if `alike`, hardly changes.
 
     Differences that are apart by no more than `margin` count as equal: in the unit of the metric,
-    or as a factor where figures are compared by their ratio. What is a main finding of the paper
-    `says` so in words.
+    or as a factor where figures are compared by their ratio. A main finding of the paper `says` in
+    words which quantity it is about.
     """
 
     metric: str
@@ -198,7 +198,7 @@ def told(metric: str, by: float) -> str:
 
 
 def finding_table(comparisons: Sequence[Comparison]) -> Table:
-    """The main findings of the paper among `comparisons`, those that were measured, in words.
+    """The main findings of the paper among `comparisons`, those that were measured.
 
     Where a further data set has the same figures, as sizes have, the first line is enough.
     """
@@ -209,7 +209,7 @@ def finding_table(comparisons: Sequence[Comparison]) -> Table:
             unit = " (dB)" if each.claim.metric == "psnr" else ""
             found = (each.claim.says, *_figures(each), each.verdict)
             names.setdefault(found, f"{each.claim.says}{data_set}{unit}")
-    columns = ("what the paper says", "paper", "here", "95 % interval", "verdict")
+    columns = ("quantity", "paper", "here", "95 % interval", "verdict")
     lines = tuple((name, *figures) for (_, *figures), name in names.items())
     return Table("What the paper says, and what was found", columns, lines)
 
