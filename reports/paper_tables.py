@@ -257,7 +257,7 @@ def _block(
 
 
 def figure_table(table: PaperTable, measured: Mapping[str, Repeated]) -> Table:
-    """A table of measured figures (lines by label).
+    """A table of measured figures (lines by label), without the mark of its block.
 
     Among measured figures under the same conditions, the best of a column is bold and, of at least
     three, the second best is italic.
@@ -267,7 +267,7 @@ def figure_table(table: PaperTable, measured: Mapping[str, Repeated]) -> Table:
         [text or ABSENT for text in marked(lines, metric, ("**%s**", "*%s*"))]
         for metric in table.metrics
     ]
-    names = [": ".join((line.label, *line.gaps)) for line in lines]
+    names = [": ".join((line.label.removesuffix(table.mark), *line.gaps)) for line in lines]
     heads = ("measured", *(metric_format(metric)[0] for metric in table.metrics))
     cells = tuple(zip(names, *columns, strict=True))
     return Table(table.title, heads, cells, sources=tuple(line.keys for line in lines))
@@ -281,6 +281,9 @@ def distance_table(table: PaperTable, measured: Mapping[str, Repeated]) -> Table
     metrics = [x for x in table.metrics if any(x in line.published for line in others)]
     runs = dict(zip(known, table.measured(measured), strict=True))
 
+    def name(line: Line) -> str:
+        return line.label.removesuffix(table.mark)
+
     def cell(line: Line, metric: str) -> str:
         here = gap(metric, runs[reference.label], runs[line.label])
         figures = (each.published.get(metric, math.nan) for each in (reference, line))
@@ -288,8 +291,8 @@ def distance_table(table: PaperTable, measured: Mapping[str, Repeated]) -> Table
         return " / ".join(texts) if {*texts} != {ABSENT} else ABSENT
 
     heads = (metric_format(metric)[0].rstrip(" ↑↓") for metric in metrics)
-    cells = tuple((line.label, *(cell(line, metric) for metric in metrics)) for line in others)
-    return Table("Distances", (f"here / paper, against {reference.label}", *heads), cells)
+    cells = tuple((name(line), *(cell(line, metric) for metric in metrics)) for line in others)
+    return Table("Distances", (f"here / paper, against {name(reference)}", *heads), cells)
 
 
 def _scenes(metrics: Sequence[str], lines: Sequence[Repeated]) -> Table:
