@@ -121,9 +121,10 @@ class PaperTable:
         each, what stands for a line has its published figures."""
         first, *further = self.blocks
         there = (x for x in further if any(line.label in measured for line in x.lines))
-        return [block._with_what_stands(measured) for block in (first, *there)]
+        return [block._with_stand_ins(measured) for block in (first, *there)]
 
-    def _with_what_stands(self, measured: Mapping[str, Repeated]) -> PaperTable:
+    def _with_stand_ins(self, measured: Mapping[str, Repeated]) -> PaperTable:
+        """With the line that `instead` has for one that was not measured, and a note about it."""
         lines = {line.label.removesuffix(self.mark): line for line in self.lines}
         known = dict(zip(lines, self.measured(measured), strict=True))
         there = {label for label, line in known.items() if line.runs}
