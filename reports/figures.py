@@ -62,7 +62,6 @@ def stage_bars(runs: Sequence[Run], path: Path) -> None:
         own = stage.removeprefix(STAGE)
         parts.setdefault("field" if own in OF_FIELD else own, []).append(stage)
     stages = sorted(parts, key=lambda stage: STAGE + stage == OTHER)
-    stages.sort(key=lambda stage: stage == OTHER)
     legend_lines = -(-len(stages) // LEGEND_COLUMNS)
     figure = Figure(figsize=(8, 0.7 + 0.25 * legend_lines + 0.5 * len(runs)), layout="constrained")
     axes = figure.subplots()

@@ -77,10 +77,10 @@ def main(options: argparse.Namespace) -> int:
     for name in options.only:
         if name not in wanted:
             raise unknown("--only", name, wanted)
-    log, failed = ConsoleLog(Path()), 0
+    log, code, failed = ConsoleLog(Path()), _code(), 0
     for name in options.only or wanted:
         command, folder = f"steerbench {wanted[name]['command']}", FOLDER / name
-        before, code = _read(folder), _code()
+        before = _read(folder)
         if before and (before.command, before.code) == (command, code):
             log.info(f"{name}: made at {before.commit}")
         elif options.check:

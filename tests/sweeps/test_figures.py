@@ -36,7 +36,8 @@ def checkout(elsewhere, tmp_path):
     (tmp_path / figures.LIST).write_text("\n".join(lines))
     text = f"before\n\n{region('run', '', 'table')}\n\n{region('run', 'Pictures', 'picture')}\n"
     (tmp_path / "README.md").write_text(f"{text}\nafter\n")
-    (tmp_path / "docs" / "more.md").write_text(region("run", "Pictures", "picture"))
+    more = [region("run", "Pictures", "picture"), region("list", "", "table")]
+    (tmp_path / "docs" / "more.md").write_text("\n".join(more))
     who = ["-c", "user.name=x", "-c", "user.email=x@x"]
     for words in (["init", "-q"], ["add", "."], [*who, "commit", "-qm", "all"]):
         subprocess.run(["git", *words], check=True)
@@ -56,6 +57,7 @@ def test_documents_get_tables_pictures_and_where_they_are_from(steerbench, check
     assert "| run | PSNR, dB ↑ |" in readme
     (shown,) = re.findall(r"\((docs/results/run-\S+\.png)\)", readme)
     assert f"({shown.removeprefix('docs/')})" in more
+    assert "| grey |" in more  # a table that a command without a page printed
     with Image.open(checkout / shown) as picture:
         assert picture.mode == "P"
 

@@ -57,7 +57,7 @@ def test_the_last_line_is_json_and_a_wrong_kernel_fails(steerbench, asked):
     outcome = steerbench("kernels")
     assert outcome.status == 1
     assert "wrong" in outcome.out  # instead of a time
-    assert json.loads(outcome.out.splitlines()[-1])[-1] == WRONG
+    assert json.loads(outcome.out.splitlines()[-1]) == [SMALL, REFERENCE, RIGHT, WRONG]
 
 
 def test_a_fast_version_has_a_line_with_the_time_of_its_reference(steerbench, asked):
@@ -68,6 +68,7 @@ def test_a_fast_version_has_a_line_with_the_time_of_its_reference(steerbench, as
     assert wrong["kernel"] == "march"  # first, then those that save most
     assert [right[x] for x in ("error", "tolerance")] == ["1.0e-07", "1.0e-06"]
     assert [right[x] for x in ("ms", "by its reference", "ratio")] == ["12.50", "387.50", "31.0x"]
+    assert right["M items/s"] == "10.40"
     assert small["by its reference"] == "n/a"
 
 
