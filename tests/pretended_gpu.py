@@ -285,6 +285,10 @@ def pretended_gpu() -> Iterator[PretendedGpu]:
     with pytest.MonkeyPatch.context() as patch:
         for name, what in _of_torch_cuda(_gpu).items():
             patch.setattr(torch.cuda, name, what)
+        # By these, Adam tells whether it is captured; without them a CUDA build asks its driver.
+        stream = SimpleNamespace(is_capturing=lambda: _gpu.graph is not None)
+        patch.setattr(torch.accelerator, "current_accelerator", lambda *args, **kwargs: GPU)
+        patch.setattr(torch.accelerator, "current_stream", lambda *device: stream)
         _patch_torch(patch, _gpu)
         _patch_triton(patch)
         for cached in (availability, multiplies_bf16):

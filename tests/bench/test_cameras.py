@@ -50,7 +50,8 @@ def test_the_principal_point_looks_along_the_axis_and_rays_are_z_depths(device: 
 def test_a_quarter_is_undone_exactly_and_its_pixels_look_through_the_middle_of_blocks() -> None:
     camera = camera_at((2.0, 2.0, 2.0))
     odd = replace(camera, fx=0.1, cx=1 / 3)
-    assert scale_camera(scale_camera(odd, 13, 9), 52, 36) == odd
+    # Dictionaries take the same tensor as equal; cameras would compare its elements.
+    assert vars(scale_camera(scale_camera(odd, 13, 9), 52, 36)) == vars(odd)
     low = cast(scale_camera(camera, 13, 9)).directions.reshape(9, 13, 3)
     high = cast(camera).directions.reshape(9, 4, 13, 4, 3).mean((1, 3))
     torch.testing.assert_close(low, high, rtol=0, atol=16 * FLOAT32)
@@ -63,7 +64,7 @@ def test_pixels_keep_their_rays_in_a_crop_and_in_the_middle_of_a_wider_frame() -
     torch.testing.assert_close(part.reshape(11, 20, 3), whole[7:18, 5:25], rtol=0, atol=4 * FLOAT32)
     wide = cast(frame_camera(camera, 52 + 2 * 20, 36)).directions.reshape(36, 92, 3)
     torch.testing.assert_close(wide[:, 20:-20], whole, rtol=0, atol=4 * FLOAT32)
-    assert frame_camera(camera, 104, 72) == scale_camera(camera, 104, 72)
+    assert vars(frame_camera(camera, 104, 72)) == vars(scale_camera(camera, 104, 72))
 
 
 def test_moving_camera_and_points_alike_keeps_pixels_and_scales_depth() -> None:
@@ -92,4 +93,4 @@ def test_a_packed_camera_comes_back_to_the_last_bit() -> None:
     camera = Camera(c2w, 1 / 3, 700.1, -2.7, 1e-9, 4097, 3)
     again = unpack_camera(pack_camera(camera))
     assert torch.equal(again.c2w, c2w)
-    assert replace(again, c2w=c2w) == camera
+    assert vars(replace(again, c2w=c2w)) == vars(camera)
