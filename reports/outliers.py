@@ -123,7 +123,7 @@ def outlier_table(found: Sequence[Outlier], runs: Sequence[Run]) -> Table:
         for outlier in found
         if outlier.key in facts
     )
-    return Table("Outliers: runs that look broken", ("run", *FACTS, "why"), lines, figures=False)
+    return Table("Outliers: runs that look broken", ("run", *FACTS, "why"), lines)
 
 
 def _psnr(run: Run) -> float:

@@ -111,4 +111,4 @@ def _provenance(runs: Sequence[Run]) -> Iterator[Part]:
             lines += zip(names, values, strict=True)
     yield "## Provenance\n\nEvery figure and picture on this page was made by"
     yield f"```sh\n{commands}\n```"
-    yield Table("Provenance", ("", ""), tuple(lines), figures=False)
+    yield Table("Provenance", ("", ""), tuple(lines))

@@ -7,6 +7,7 @@ which have fewer preceding frames than the method can use, are listed separately
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 
 import pandas as pd
@@ -14,6 +15,7 @@ import pandas as pd
 from bench.results import COLD, STEADY, WHOLE
 
 NOT_AVAILABLE = "n/a"
+EMPTY = ("", "–", NOT_AVAILABLE)
 DENSE = ".dense"  # suffix of a work counter for the work of a method that skips nothing
 
 QUALITY = {
@@ -36,7 +38,7 @@ QUALITY = {
 
 @dataclass(frozen=True)
 class Table:
-    """Lines of text under columns: a label, then figures, or text if `figures` is False.
+    """Lines of text under columns: a label, then figures or text.
 
     `bold` has line and column, both from 0, of every bold cell; `sources` has the keys of the runs
     behind each line, or is empty.
@@ -45,13 +47,19 @@ class Table:
     title: str
     columns: tuple[str, ...]
     lines: tuple[tuple[str, ...], ...]
-    figures: bool = True
     bold: frozenset[tuple[int, int]] = frozenset()
     sources: tuple[tuple[str, ...], ...] = ()
 
+    def right(self, column: int) -> bool:
+        """Whether the column is aligned right: at least half of what is in it are figures."""
+        cells = [line[column] for line in self.lines if line[column] not in EMPTY]
+        figures = sum(re.match(r"[-+±×*]*\d", cell) is not None for cell in cells)
+        return column > 0 and 2 * figures >= len(cells)
+
     def markdown(self) -> str:
         """The table in GitHub's Markdown, without its title."""
-        rows = [self.columns, ("---", *["---:" if self.figures else "---"] * len(self.columns[1:]))]
+        rules = ("---:" if self.right(column) else "---" for column in range(len(self.columns)))
+        rows = [self.columns, tuple(rules)]
         for row, line in enumerate(self.lines):
             texts = [text.replace("|", "\\|") for text in line]
             bold = ((row, column) in self.bold for column in range(len(line)))

@@ -95,7 +95,7 @@ def rich_table(table: Table) -> RichTable:
     """`table` with labels and text aligned left and figures aligned right."""
     grid = RichTable(title=escape(table.title), title_justify="left")
     for index, column in enumerate(table.columns):
-        grid.add_column(escape(column), justify="right" if index and table.figures else "left")
+        grid.add_column(escape(column), justify="right" if table.right(index) else "left")
     for row, line in enumerate(table.lines):
         cells = (
             f"[bold]{escape(text)}[/bold]" if (row, column) in table.bold else escape(text)

@@ -62,7 +62,7 @@ def _print_waits(words: Sequence[str], frames: int, launcher: Launcher) -> int:
     ]
     lines = tuple((decimal(row["waits"], 1), row["line"], row["source"]) for row in rows)
     title = f"{decimal(total.total() / len(waits), 1)} waits a frame, mean of {len(waits)}"
-    show(Table(title, ("waits", "line", "source"), lines, figures=False))
+    show(Table(title, ("waits", "line", "source"), lines))
     print_rows(rows)
     return 0
 

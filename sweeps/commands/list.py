@@ -46,7 +46,7 @@ def main(options: argparse.Namespace) -> int:
 
 def _show(title: str, columns: tuple[str, str], lines: Sequence[tuple[str, str]]) -> None:
     if lines:
-        show(Table(title, columns, tuple(lines), figures=False))
+        show(Table(title, columns, tuple(lines)))
 
 
 def described(group: str, words: Sequence[str] = ()) -> dict[str, str]:

@@ -35,10 +35,10 @@ def main(options: argparse.Namespace) -> int:
     rows = list(run_cases(cases, devices, ConsoleLog(Path())))
     wrong = sum(failed(row) for row in rows)
     title = f"Stress: {len(cases)} cases, {len(rows)} cells, {wrong} failed"
-    show(Table(title, COLUMNS, tuple(map(_line, rows)), figures=False))
+    show(Table(title, COLUMNS, tuple(map(_line, rows))))
     nearest = sorted(_worst_of_cases(rows), key=_nearness, reverse=True)[:NEAREST]
     title = "Nearest to their tolerances"
-    show(Table(title, COLUMNS, tuple(map(_line, nearest)), figures=False))
+    show(Table(title, COLUMNS, tuple(map(_line, nearest))))
     print_rows(rows)
     return int(wrong > 0)
 

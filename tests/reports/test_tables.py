@@ -65,11 +65,16 @@ def test_cold_frames_stand_apart_and_are_called_so(rows, rows_with_cold):
     assert tables.run_tables(cold) == [cold_quality, cold_time, memory]
 
 
-@pytest.mark.parametrize(("figures", "rule"), [(True, "| --- | ---: |"), (False, "| --- | --- |")])
-def test_markdown_aligns_figures_sets_bold_and_keeps_bars_in_their_cells(figures, rule):
-    lines, bold = (("a|b", "1"), ("c", "2")), frozenset({(1, 1)})
-    text = tables.Table("A title", ("name", "what"), lines, figures, bold).markdown()
-    assert text.splitlines() == ["| name | what |", rule, "| a\\|b | 1 |", "| c | **2** |"]
+def test_markdown_aligns_figures_sets_bold_and_keeps_bars_in_their_cells():
+    lines = (("1 a|b", "1.5", "fp32", "n/a"), ("2", "the same", "2 x", "+1"), ("3", "", "is", "b"))
+    text = tables.Table("A title", ("of", "dB", "what", "more"), lines, frozenset({(1, 3)}))
+    assert text.markdown().splitlines() == [
+        "| of | dB | what | more |",
+        "| --- | ---: | --- | ---: |",
+        "| 1 a\\|b | 1.5 | fp32 | n/a |",
+        "| 2 | the same | 2 x | **+1** |",
+        "| 3 |  | is | b |",
+    ]
 
 
 @pytest.mark.parametrize(
