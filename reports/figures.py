@@ -177,8 +177,13 @@ def quality_over_training(curves: Sequence[Curve], ceiling: Repeated | None, pat
     PSNR of `ceiling` is a dashed line.
     """
     titles = list(dict.fromkeys(curve.panel for curve in curves))
-    figure = Figure(figsize=(4.2 * len(titles), 3.6), layout="constrained")
-    for axes, title in zip(figure.subplots(1, len(titles), squeeze=False)[0], titles, strict=True):
+    across = min(len(titles), 2)
+    down = -(-len(titles) // across)
+    figure = Figure(figsize=(4 * across, 2.8 * down), layout="constrained")
+    panels = figure.subplots(down, across, squeeze=False, sharey=True).ravel()
+    for axes in panels[len(titles) :]:
+        axes.set_axis_off()
+    for axes, title in zip(panels, titles, strict=False):
         _label(axes, "steps of stage 2")
         axes.set_title(title, fontsize="medium")
         for number, curve in enumerate(curve for curve in curves if curve.panel == title):
@@ -193,7 +198,7 @@ def quality_over_training(curves: Sequence[Curve], ceiling: Repeated | None, pat
         axes.set_xticks(STEP_TICKS, [f"{steps:,}" for steps in STEP_TICKS])
         axes.set_xlim(axes.dataLim.x0 / 1.5, 1.5 * RELEASE_STEPS)
         axes.xaxis.set_minor_locator(NullLocator())
-        axes.legend(frameon=False, fontsize="small")
+        axes.legend(frameon=False, fontsize="small", loc="center right")
     figure.savefig(path, dpi=150)
 
 
