@@ -142,7 +142,7 @@ def _time(rows: pd.DataFrame, suffix: str) -> Table:
             lines.append((f"frame, {each}", decimal(value[f"frame_ms.{each}"], 2), ""))
         lines.append(("FPS", decimal(value["fps"], 2), ""))
         if wall := value.get("wall_ms"):
-            lines.append(("frame, with the pipe", decimal(wall, 2), ""))
+            lines.append(("frame, with the socket", decimal(wall, 2), ""))
     return Table(f"Time of a frame{suffix}", ("stage", "mean ms", "share"), tuple(lines))
 
 

@@ -73,7 +73,7 @@ def test_the_worker_of_the_document_is_a_row_of_ten_lines(steerbench, documented
     assert len([line for line in lines if line.strip()]) <= 10
     done = steerbench(*typed("run method=external method.command=mean"), *WHITE)
     assert done.status == 0, done.err
-    assert "frame, with the pipe" in done.out
+    assert "frame, with the socket" in done.out
     table = rows(tmp_path).set_index("metric")
     assert table.loc["psnr", "value"] == math.inf  # white, as the scene is
     assert 0 < table.loc["frame_ms", "value"] < table.loc["wall_ms", "value"]
