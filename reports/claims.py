@@ -37,8 +37,8 @@ class Claim:
     """`metric` grows from each of the `lines` (labels) to the next or, if `alike`, hardly changes.
 
     Differences that are apart by no more than `margin` count as equal: in the unit of the metric,
-    or as a factor where figures are compared by their ratio. A main finding of the paper `says` in
-    words which quantity it is about.
+    or as a factor where figures are compared by their ratio. A finding of the paper `says` in words
+    which quantity it is about; `main` ones stand out.
     """
 
     metric: str
@@ -46,6 +46,7 @@ class Claim:
     margin: float
     alike: bool = False
     says: str = ""
+    main: bool = False
 
 
 @dataclass(frozen=True)
@@ -198,20 +199,21 @@ def told(metric: str, by: float) -> str:
 
 
 def finding_table(comparisons: Sequence[Comparison]) -> Table:
-    """The main findings of the paper among `comparisons`, those that were measured.
+    """The findings of the paper among `comparisons`, those that were measured.
 
     Where a further data set has the same figures, as sizes have, the first line is enough.
     """
-    names: dict[tuple[str, ...], str] = {}
+    names: dict[tuple[str, ...], tuple[str, bool]] = {}
     for each in comparisons:
         if each.claim.says and each.here is not NOT_MEASURED:
             data_set = "".join(each.table.partition(",")[1:])
             unit = " (dB)" if each.claim.metric == "psnr" else ""
             found = (each.claim.says, *_figures(each), each.verdict)
-            names.setdefault(found, f"{each.claim.says}{data_set}{unit}")
+            names.setdefault(found, (f"{each.claim.says}{data_set}{unit}", each.claim.main))
     columns = ("quantity", "paper", "here", "95 % interval", "verdict")
-    lines = tuple((name, *figures) for (_, *figures), name in names.items())
-    return Table("What the paper says, and what was found", columns, lines)
+    lines = tuple((name, *figures) for (_, *figures), (name, _) in names.items())
+    bold = frozenset((row, 0) for row, (_, main) in enumerate(names.values()) if main)
+    return Table("What the paper says, and what was found", columns, lines, bold)
 
 
 def _figures(each: Comparison) -> tuple[str, str, str]:

@@ -183,7 +183,12 @@ def _table(path: Path, data_sets: Sequence[str]) -> PaperTable:
         lines.append(Line(name, job, figures, line.get("every_seed", False)))
     claims = [
         Claim(
-            x["metric"], x.get("alike") or x["rising"], x["margin"], "alike" in x, x.get("says", "")
+            x["metric"],
+            x.get("alike") or x["rising"],
+            x["margin"],
+            alike="alike" in x,
+            says=x.get("says", ""),
+            main=x.get("main", False),
         )
         for x in content.pop("claims")
     ]

@@ -190,6 +190,8 @@ def _region(
     def shorter(table: re.Match[str]) -> str:
         head, rule, *lines = table[0].strip().splitlines()
         kept = [x for x in lines if what != "bold" or x.startswith("| **")][:most]
+        if what == "bold":  # where all lines are, none stands out
+            kept = [re.sub(r"\*\*(.*?)\*\*", r"\1", x, count=1) for x in kept]
         if len(kept) == len(lines):
             return table[0]
         link = f"[{name}.csv]({to_results / name}.csv)"
