@@ -36,8 +36,8 @@ INK, PAPER, MARK = (30, 30, 30), (255, 255, 255), (214, 0, 110)
 ZOOM = 4  # magnification of the detail relative to its picture
 
 Box = tuple[int, int, int, int]  # left, top, right, bottom
-Band = tuple[str, Sequence[Image.Image | None]]
-"""One row of panels below a caption; None leaves a place empty."""
+Band = tuple[str, Sequence[Image.Image]]
+"""One row of panels below a caption."""
 
 
 @dataclass(frozen=True)
@@ -184,8 +184,18 @@ def write_image(frame: Frame, path: Path) -> None:
         caption += f"; error map: {frame.errors}"
     bands: list[Band] = [("", list(map(whole, pictures))), (caption, list(map(part, pictures)))]
     if maps:
-        bands.append((f"error maps: {frame.errors}", [None, *map(whole, maps)]))
+        bands.append((f"error maps: {frame.errors}", [_error_colours(size), *map(whole, maps)]))
     _compose(titles, bands, size).save(path)
+
+
+def _error_colours(size: tuple[int, int]) -> Image.Image:
+    """A panel with the colours of an error map, from no error on."""
+    from matplotlib import colormaps  # takes 0.3 s
+
+    colours = colormaps["inferno"](np.linspace(0, 1, size[0]), bytes=True)[None, :, :3]
+    panel = Image.new("RGB", size, PAPER)
+    panel.paste(Image.fromarray(colours).resize((size[0], LINE_PX)), (0, 0))
+    return panel
 
 
 def _outlined(panel: Image.Image, box: Sequence[int]) -> Image.Image:
@@ -212,8 +222,7 @@ def _compose(
             _write(image, (GAP_PX, down), caption, image.width - 2 * GAP_PX)
             down += LINE_PX
         for left, panel in zip(across, panels, strict=True):
-            if panel:
-                image.paste(panel, (left, down))
+            image.paste(panel, (left, down))
         down += height + GAP_PX
     return image
 

@@ -53,6 +53,8 @@ def test_an_image_has_a_place_for_every_picture(tmp_path, runs, columns, lines):
     assert lines * panel[0] < pixels.shape[0] < (lines + 1) * panel[0]
     for number in range(runs):
         assert np.count_nonzero((pixels == 50 * number).all(axis=-1)) > panel[0] * panel[1]
+    brightest = (pixels == [252, 254, 164]).all(axis=-1)  # of inferno: a scale beside several maps
+    assert brightest.any() == (lines == 3)
 
 
 def test_a_page_has_a_few_of_the_frames_that_all_runs_kept(tmp_path):
