@@ -134,10 +134,19 @@ class PaperTable:
                 published = lines.pop(missing).published
                 lines[other] = replace(lines[other], published=published)
                 standing[missing] = other
-                why = ": ".join(("not measured", *known[missing].gaps))
+                why = ": ".join(known[missing].gaps) or "not measured"
                 notes += [] if self.mark else [f"{other}, stands for {missing}: {why}."]
         claims = [replace(x, lines=[standing.get(y, y) for y in x.lines]) for x in self.claims]
+        for names in standing.items():  # what they differ in, as a claim says it
+            words, others = (name.rpartition(", ")[2] for name in names)
+            claims = [replace(x, says=x.says.replace(words, others)) for x in claims]
         return replace(self, lines=[*lines.values()], notes=notes, claims=claims)
+
+    def name_of(self, line: Line) -> str:
+        """The label of `line` as its block shows it; a method beyond the paper has its own name."""
+        method = line.job.get(METHOD, "")
+        label = line.label.removesuffix(self.mark)
+        return label.replace("SteerNeRF", method) if self.mark == f" ({method})" else label
 
     def measured(self, known: Mapping[str, Repeated]) -> list[Repeated]:
         """Its lines of `known`, by label; those that are not there have no runs."""
@@ -273,7 +282,10 @@ def figure_table(table: PaperTable, measured: Mapping[str, Repeated]) -> Table:
         [text or ABSENT for text in marked(lines, metric, ("**%s**", "*%s*"))]
         for metric in table.metrics
     ]
-    names = [": ".join((line.label.removesuffix(table.mark), *line.gaps)) for line in lines]
+    names = [
+        ": ".join((table.name_of(each), *line.gaps))
+        for each, line in zip(table.lines, lines, strict=True)
+    ]
     heads = ("measured", *(metric_format(metric)[0] for metric in table.metrics))
     cells = tuple(zip(names, *columns, strict=True))
     return Table(table.title, heads, cells, sources=tuple(line.keys for line in lines))
@@ -287,18 +299,16 @@ def distance_table(table: PaperTable, measured: Mapping[str, Repeated]) -> Table
     metrics = [x for x in table.metrics if any(x in line.published for line in others)]
     runs = dict(zip(known, table.measured(measured), strict=True))
 
-    def name(line: Line) -> str:
-        return line.label.removesuffix(table.mark)
-
     def cell(line: Line, metric: str) -> str:
         here = gap(metric, runs[reference.label], runs[line.label])
         figures = (each.published.get(metric, math.nan) for each in (reference, line))
         texts = told(metric, here.by), told(metric, apart(metric, *figures))
         return " / ".join(texts) if {*texts} != {ABSENT} else ABSENT
 
-    heads = (metric_format(metric)[0].rstrip(" ↑↓") for metric in metrics)
-    cells = tuple((name(line), *(cell(line, metric) for metric in metrics)) for line in others)
-    return Table("Distances", (f"here / paper, against {name(reference)}", *heads), cells)
+    heads = [f"here / paper, against {table.name_of(reference)}"]
+    heads += [metric_format(metric)[0].rstrip(" ↑↓") for metric in metrics]
+    cells = ((table.name_of(line), *(cell(line, metric) for metric in metrics)) for line in others)
+    return Table("Distances", tuple(heads), tuple(cells))
 
 
 def _scenes(metrics: Sequence[str], lines: Sequence[Repeated]) -> Table:

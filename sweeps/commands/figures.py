@@ -194,8 +194,8 @@ def _region(
             kept = [re.sub(r"\*\*(.*?)\*\*", r"\1", x, count=1) for x in kept]
         if len(kept) == len(lines):
             return table[0]
-        link = f"[{name}.csv]({to_results / name}.csv)"
-        return "\n".join([head, rule, *kept, "", f"{len(kept)} of {len(lines)} lines of {link}."])
+        told_all = f"{len(kept)} of {len(lines)} lines; all: [{name}.csv]({to_results / name}.csv)."
+        return "\n".join([head, rule, *kept, "", told_all])
 
     def copied(picture: re.Match[str]) -> str:
         return f"![{picture[1]}]({to_results / _copy(folder / picture[2], name)})"

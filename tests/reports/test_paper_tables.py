@@ -122,6 +122,9 @@ def test_what_stands_for_a_line_that_was_not_measured_is_compared_with_its_figur
     (one,) = (x for x in found if x.verdict != UNKNOWN)
     assert (one.smaller, one.larger) == ("SteerNeRF, fp32", "Instant-NGP")
     assert one.paper == pytest.approx(32.79 - 31.60)
+    assert {x.claim.says for x in found if "int8" in x.claim.says} == {
+        "PSNR lost by int8 against fp32"
+    }
 
 
 def test_a_table_says_for_which_line_another_stands_and_why(run, tmp_path):
@@ -133,8 +136,16 @@ def test_a_table_says_for_which_line_another_stands_and_why(run, tmp_path):
     text = markdown(section(TABLES["table1"], lines), tmp_path)
     assert "| SteerNeRF, half precision" not in text
     assert "| SteerNeRF, fp32 | +0.00 / -1.19 |" in text
-    why = "not measured: failed: no bfloat16."
+    why = "failed: no bfloat16."
     assert f"- SteerNeRF, fp32, stands for SteerNeRF, half precision: {why}" in text
+
+
+def test_a_method_beyond_the_paper_does_not_have_the_name_of_its_method(run, tmp_path):
+    lines = [Repeated("SteerNeRF, fp32 (steernerf_lean)", [run])]
+    text = markdown(section(TABLES["table1"], lines), tmp_path)
+    paper, beyond = text.split("### Beyond the paper: steernerf_lean")
+    assert "| steernerf_lean, fp32 |" in beyond
+    assert "steernerf_lean" not in paper
 
 
 @pytest.mark.parametrize("name", TABLES)

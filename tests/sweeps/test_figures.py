@@ -106,7 +106,8 @@ def test_a_document_shows_few_lines_of_a_long_table(steerbench, checkout, what):
     """All are in the CSV file, which stays while a document names it."""
     (checkout / "README.md").write_text(region("run", "", what))
     steerbench("figures")
-    assert "0 of 1 lines of [run.csv](docs/results/run.csv)" in (checkout / "README.md").read_text()
+    readme = (checkout / "README.md").read_text()
+    assert "0 of 1 lines; all: [run.csv](docs/results/run.csv)" in readme
     (file,) = (checkout / "docs/results").glob("*.csv")
     rows = [*csv.reader(file.read_text().splitlines())]
     assert next(row for row in rows if row[:1] == ["run"])[1] == "PSNR, dB ↑"
