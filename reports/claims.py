@@ -14,7 +14,7 @@ from bench.intervals import half_interval, path_interval
 from reports.comparison import metric_format
 from reports.regression import Figures, frames_apart
 from reports.runs import Repeated, Run
-from reports.tables import Table, decimal
+from reports.tables import ABSENT, Table, decimal
 
 AS, LARGER, SMALLER = "as in the paper", "larger than in the paper", "smaller than in the paper"
 AT_MOST = "smaller than in the paper, if there is one"
@@ -28,8 +28,6 @@ TIMES = ("frame_ms", "fps", "stage_ms")
 RATIOS = (*TIMES, "work", "size_bytes")
 """Metrics, by name up to the first dot, whose figures are compared by their ratio: a difference
 would depend on machine and scene. `TIMES` can be compared on one machine only."""
-
-ABSENT = "–"  # of a figure that the paper does not give or that cannot be measured here
 
 
 @dataclass(frozen=True)
@@ -203,17 +201,21 @@ def finding_table(comparisons: Sequence[Comparison]) -> Table:
 
     Where a further data set has the same figures, as sizes have, the first line is enough.
     """
-    names: dict[tuple[str, ...], tuple[str, bool]] = {}
+    first: dict[tuple[str, ...], Comparison] = {}
     for each in comparisons:
         if each.claim.says and each.here is not NOT_MEASURED:
-            data_set = "".join(each.table.partition(",")[1:])
-            unit = " (dB)" if each.claim.metric == "psnr" else ""
-            found = (each.claim.says, *_figures(each), each.verdict)
-            names.setdefault(found, (f"{each.claim.says}{data_set}{unit}", each.claim.main))
+            first.setdefault((each.claim.says, *_figures(each), each.verdict), each)
     columns = ("quantity", "paper", "here", "95 % interval", "verdict")
-    lines = tuple((name, *figures) for (_, *figures), (name, _) in names.items())
-    bold = frozenset((row, 0) for row, (_, main) in enumerate(names.values()) if main)
+    lines = tuple((_quantity(each), *figures) for (_, *figures), each in first.items())
+    bold = frozenset((row, 0) for row, each in enumerate(first.values()) if each.claim.main)
     return Table("What the paper says, and what was found", columns, lines, bold)
+
+
+def _quantity(each: Comparison) -> str:
+    """What a finding is about, on which further data set, in which unit."""
+    data_set = "".join(each.table.partition(",")[1:])
+    unit = " (dB)" if each.claim.metric == "psnr" else ""
+    return f"{each.claim.says}{data_set}{unit}"
 
 
 def _figures(each: Comparison) -> tuple[str, str, str]:

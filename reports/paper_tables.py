@@ -10,11 +10,11 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from reports.claims import ABSENT, Claim, Comparison, apart, compare, gap, told
+from reports.claims import Claim, Comparison, apart, compare, gap, told
 from reports.comparison import COMMON, marked, metric_format, written
 from reports.outliers import REFERENCES
 from reports.runs import Repeated, Run, missing_figures
-from reports.tables import NOT_AVAILABLE, Table
+from reports.tables import ABSENT, NOT_AVAILABLE, Table
 
 METHOD = "method"
 AFTER, SHARES = "method.after", (0.25, 0.5)

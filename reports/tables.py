@@ -15,7 +15,8 @@ import pandas as pd
 from bench.results import COLD, STEADY, WHOLE
 
 NOT_AVAILABLE = "n/a"
-EMPTY = ("", "–", NOT_AVAILABLE)
+ABSENT = "–"  # of a figure that the paper does not give or that cannot be measured here
+EMPTY = ("", ABSENT, NOT_AVAILABLE)
 DENSE = ".dense"  # suffix of a work counter for the work of a method that skips nothing
 
 QUALITY = {

@@ -285,10 +285,6 @@ def pretended_gpu() -> Iterator[PretendedGpu]:
     with pytest.MonkeyPatch.context() as patch:
         for name, what in _of_torch_cuda(_gpu).items():
             patch.setattr(torch.cuda, name, what)
-        # By these, Adam tells whether it is captured; without them a CUDA build asks its driver.
-        stream = SimpleNamespace(is_capturing=lambda: _gpu.graph is not None)
-        patch.setattr(torch.accelerator, "current_accelerator", lambda *args, **kwargs: GPU)
-        patch.setattr(torch.accelerator, "current_stream", lambda *device: stream)
         _patch_torch(patch, _gpu)
         _patch_triton(patch)
         for cached in (availability, multiplies_bf16):
@@ -362,6 +358,10 @@ def _patch_torch(patch: pytest.MonkeyPatch, gpu: PretendedGpu) -> None:
     def grouped(*args):
         return {(x[0][0][0].device, dtype): x for (_, dtype), x in group(*args).items()}
 
+    # By these, Adam learns whether it is captured; a CUDA build without a driver would fail.
+    stream = SimpleNamespace(is_capturing=lambda: gpu.graph is not None)
+    patch.setattr(torch.accelerator, "current_accelerator", lambda *args, **kwargs: GPU)
+    patch.setattr(torch.accelerator, "current_stream", lambda *device: stream)
     patch.setattr(Tensor, "to", to)
     patch.setattr(Tensor, "cuda", lambda self, *args, **kwargs: self.to(GPU))
     patch.setattr(Tensor, "cpu", lambda self, *args, **kwargs: self.to(CPU))

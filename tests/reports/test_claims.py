@@ -11,7 +11,6 @@ import pytest
 
 from bench.intervals import half_interval, path_interval
 from reports.claims import (
-    ABSENT,
     AGREES,
     AS,
     AT_MOST,
@@ -33,6 +32,7 @@ from reports.claims import (
     told,
 )
 from reports.runs import Repeated, Run
+from reports.tables import ABSENT
 from tests.reports.conftest import changed, elsewhere, shifted
 
 RISING = Claim("psnr", ["one", "two"], 0.1)

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from omegaconf import OmegaConf
 
-from reports.claims import ABSENT, UNKNOWN, Claim
+from reports.claims import UNKNOWN, Claim
 from reports.paper_tables import (
     DATA_SETS,
     FIRST,
@@ -22,7 +22,7 @@ from reports.paper_tables import (
 )
 from reports.publish import markdown
 from reports.runs import Repeated, Run
-from reports.tables import QUALITY
+from reports.tables import ABSENT, QUALITY
 from sweeps.overrides import CONFIGS
 from tests.reports.conftest import TABLES, changed
 
@@ -140,7 +140,7 @@ def test_a_table_says_for_which_line_another_stands_and_why(run, tmp_path):
     assert f"- SteerNeRF, fp32, stands for SteerNeRF, half precision: {why}" in text
 
 
-def test_a_method_beyond_the_paper_does_not_have_the_name_of_its_method(run, tmp_path):
+def test_a_method_beyond_the_paper_has_its_own_name(run, tmp_path):
     lines = [Repeated("SteerNeRF, fp32 (steernerf_lean)", [run])]
     text = markdown(section(TABLES["table1"], lines), tmp_path)
     paper, beyond = text.split("### Beyond the paper: steernerf_lean")

@@ -1,4 +1,4 @@
-"""Which rays of a frame are rendered, how, and what stands in its pixels."""
+"""Which rays of a frame are rendered, how, and what its pixels hold."""
 
 from __future__ import annotations
 
