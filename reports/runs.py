@@ -34,9 +34,9 @@ class Run:
 
     key: str
     label: str
-    rows: pd.DataFrame
-    read_frames: Callable[[], pd.DataFrame]
-    record: Mapping[str, Any]
+    rows: pd.DataFrame = field(repr=False)
+    read_frames: Callable[[], pd.DataFrame] = field(repr=False)
+    record: Mapping[str, Any] = field(repr=False)
     pictures: Path
 
     @property

@@ -43,6 +43,11 @@ def remembering(memory: int, scene: str = "one") -> Run:
     return replace(run, read_frames=lambda: frames)
 
 
+def test_a_run_is_shown_by_key_and_label_alone():
+    run = remembering(1)
+    assert repr(run) == f"Run(key={run.key!r}, label={run.label!r})"
+
+
 def test_equal_pictures_have_equal_figures_whatever_the_method_remembers():
     runs = over_common_frames([remembering(memory) for memory in (0, 1, 3)])
     for run in runs:
