@@ -37,7 +37,7 @@ class Run:
     rows: pd.DataFrame = field(repr=False)
     read_frames: Callable[[], pd.DataFrame] = field(repr=False)
     record: Mapping[str, Any] = field(repr=False)
-    pictures: Path
+    pictures: Path = field(repr=False)
 
     @property
     def frames(self) -> pd.DataFrame:
