@@ -9,6 +9,7 @@ import torch
 from bench.provenance import computed_by
 from bench.types import DEVICE, Budget, Log, Scene
 from methods.instant_ngp.field import HashField, Precision
+from methods.instant_ngp.table import SuitedGrid
 from methods.instant_ngp.training import FieldTraining, TrainingOptions, new_grid, restore_field
 from methods.kernels import multiplies_bf16, resolve
 from methods.kernels.encode import HashGrid
@@ -22,7 +23,7 @@ from methods.training import checkpoint, loop
 class Setup:
     """What a field is and where it runs; see `resolved`."""
 
-    grid: HashGrid  # shape of the hash table
+    grid: HashGrid  # shape of the hash table; `SuitedGrid`: the scene says how long it is
     training: TrainingOptions
     precision: Precision  # "bf16": packed table, bfloat16 networks
     backend: str
@@ -62,13 +63,17 @@ class Setup:
             "precision": self.precision if multiplied else "bf16 in fp32",
         }
 
+    def grid_of(self, scene: Scene) -> HashGrid:
+        """The shape of the hash table for `scene`."""
+        return self.grid.of(scene) if isinstance(self.grid, SuitedGrid) else self.grid
+
     def key(self, scene: Scene, budget: Budget) -> dict[str, object]:
         """Everything the trained field depends on."""
         return {
             "scene": scene.digest,
             "steps": budget.steps,
             "samples": budget.samples,
-            "grid": asdict(self.grid),
+            "grid": asdict(self.grid_of(scene)),
             "training": asdict(self.training),
             "precision": self.precision,
             "backend": self.backend,
@@ -102,7 +107,7 @@ def train_field(setup: Setup, scene: Scene, budget: Budget, log: Log) -> Trained
     """Train a field on the pictures of `scene`, or load the result of the same training."""
     generator = torch.Generator().manual_seed(setup.seed)
     field = HashField(
-        setup.grid, precision=setup.precision, backend=setup.backend, generator=generator
+        setup.grid_of(scene), precision=setup.precision, backend=setup.backend, generator=generator
     ).to(setup.device)
     finished = log.stage_dir("field", setup.key(scene, budget)) / "field.safetensors"
 

@@ -1,0 +1,66 @@
+"""How long a hash table a scene needs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+
+import torch
+from torch import Tensor
+
+from bench.types import Scene, Split
+from methods.kernels.encode import HashGrid
+
+CONTRAST = 0.04  # between neighbouring pixels, of 1, from which on they count as detail
+
+PICTURES = 16  # at most so many are looked at
+
+ENTRIES = 3.8
+"""Entries of a level for a pixel of detail, chosen on held-out views: docs/protocol.md."""
+
+LEAST, MOST = 17, 19  # log2 T
+
+
+class SuitedGrid(HashGrid):
+    """A hash grid whose table is as long as a scene needs it, for example like this one."""
+
+    def of(self, scene: Scene) -> HashGrid:
+        """The grid for `scene`."""
+        log2_table = suitable_table(detail(scene.splits["train"]))
+        return HashGrid(**{**asdict(self), "log2_table": log2_table})
+
+
+def hash_grid(
+    *, levels: int, features: int, log2_table: int | None, n_min: int, n_max: int
+) -> HashGrid:
+    """A hash grid of that shape; `log2_table` None: a `SuitedGrid`."""
+    shape = {"levels": levels, "features": features, "n_min": n_min, "n_max": n_max}
+    return SuitedGrid(**shape) if log2_table is None else HashGrid(log2_table=log2_table, **shape)
+
+
+def suitable_table(detail: float) -> int:
+    """log2 T for pictures with so many pixels of `detail`: a power of 2 with `ENTRIES` entries for
+    each, or more, from `LEAST` to `MOST`."""
+    needed = math.ceil(math.log2(max(ENTRIES * detail, 1)))
+    return min(max(needed, LEAST), MOST)
+
+
+def detail(split: Split) -> float:
+    """How many pixels of a picture of `split` show detail, in the mean: matter whose colour differs
+    from that of the pixel to the left or above by `CONTRAST` or more in some channel."""
+    count = len(split.images)
+    chosen = torch.linspace(0, count - 1, min(count, PICTURES)).long().unique()
+    return sum(_detailed(split.images[n]) for n in chosen.tolist()) / len(chosen)
+
+
+def _detailed(picture: Tensor) -> int:
+    """Number of pixels with detail of `picture` uint8 [H, W, 3 or 4]."""
+    rgb = picture[..., :3].float() / 255
+    shown = torch.ones_like(rgb[..., 0], dtype=torch.bool)
+    if picture.shape[-1] == 4:
+        alpha = picture[..., 3:].float() / 255
+        rgb, shown = rgb * alpha, alpha[..., 0] > 0.5
+    here = rgb[1:, 1:]
+    across, down = (here - rgb[1:, :-1]).abs(), (here - rgb[:-1, 1:]).abs()
+    differs = torch.maximum(across, down).amax(dim=-1) >= CONTRAST
+    return int((differs & shown[1:, 1:]).sum())

@@ -1,0 +1,75 @@
+"""How long a hash table a scene needs."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from bench.types import Budget, Log, Scene, Split
+from methods.instant_ngp.method import InstantNgp
+from methods.instant_ngp.table import (
+    ENTRIES,
+    LEAST,
+    MOST,
+    SuitedGrid,
+    detail,
+    hash_grid,
+    suitable_table,
+)
+from methods.kernels.encode import HashGrid
+from tests.methods.trainings import QUICK
+
+SHAPE = {"levels": 2, "features": 2, "n_min": 4, "n_max": 8}
+
+
+def split_of(*images: torch.Tensor) -> Split:
+    return Split([], images, [])
+
+
+def test_detail_is_counted_where_colours_change_on_matter():
+    picture = torch.full((20, 30, 4), 100, dtype=torch.uint8)
+    picture[..., 3] = 255
+    assert detail(split_of(picture)) == 0
+    picture[:, 10:, 1] += 11  # 0.043 of 1, in one channel, over a vertical edge
+    assert detail(split_of(picture)) == 19  # the first row has no row above
+    picture[15:, :, 3] = 0
+    assert detail(split_of(picture)) == 14
+    picture[:, 10:, 1] -= 2
+    assert detail(split_of(picture)) == 0
+
+
+def test_colours_behind_transparent_pixels_do_not_count():
+    noise = torch.randint(256, (16, 16, 4), generator=torch.Generator().manual_seed(0))
+    noise = noise.to(torch.uint8)
+    noise[..., 3] = 0
+    assert detail(split_of(noise)) == 0
+    assert detail(split_of(noise[..., :3])) > 200
+
+
+def test_detail_is_a_mean_over_pictures_from_all_over_the_path():
+    plain = torch.zeros(9, 9, 3, dtype=torch.uint8)
+    dotted = plain.clone()
+    dotted[4, 4] = 255  # differs from the left and from above, as do its right and its lower pixel
+    assert detail(split_of(dotted)) == 3
+    assert detail(split_of(*[plain] * 16, *[dotted] * 16)) == pytest.approx(1.5)
+
+
+def test_a_table_has_the_entries_that_detail_asks_for():
+    for pixels in (40_000, 70_000, 100_000, 137_000):
+        entries = 2 ** suitable_table(pixels)
+        assert ENTRIES * pixels <= entries < 2 * ENTRIES * pixels
+    assert suitable_table(0) == LEAST
+    assert suitable_table(10**7) == MOST
+
+
+def test_a_length_that_is_given_is_kept():
+    assert hash_grid(log2_table=12, **SHAPE) == HashGrid(log2_table=12, **SHAPE)
+    assert not isinstance(hash_grid(log2_table=12, **SHAPE), SuitedGrid)
+
+
+def test_a_field_gets_the_table_that_its_scene_needs(ball_scene: Scene, quiet_log: Log) -> None:
+    method = InstantNgp(grid=hash_grid(log2_table=None, **SHAPE), training=QUICK, device="cpu")
+    method.fit(ball_scene, Budget("test", steps=1, samples=64), quiet_log)
+    assert method.trained.field.grid == HashGrid(log2_table=LEAST, **SHAPE)
+    key = method.setup.key(ball_scene, Budget("test", steps=1, samples=64))
+    assert key["grid"] == {"log2_table": LEAST, **SHAPE}
