@@ -1,8 +1,11 @@
-"""How long a hash table a scene needs."""
+"""How long a hash table a scene needs: a long one where its pictures show much detail.
+
+A table that is too short blurs a scene, one that is too long takes time in every training step, and
+memory.
+"""
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict
 
 import torch
@@ -11,14 +14,14 @@ from torch import Tensor
 from bench.types import Scene, Split
 from methods.kernels.encode import HashGrid
 
+SHORT, LONG = 17, 19  # log2 T
+
+FINE = 50_000
+"""Pixels of detail in a picture from which on a scene needs the long table: docs/log.md."""
+
 CONTRAST = 0.04  # between neighbouring pixels, of 1, from which on they count as detail
 
 PICTURES = 16  # at most so many are looked at
-
-ENTRIES = 3.8
-"""Entries of a level for a pixel of detail, chosen on held-out views: docs/protocol.md."""
-
-LEAST, MOST = 17, 19  # log2 T
 
 
 class SuitedGrid(HashGrid):
@@ -26,7 +29,7 @@ class SuitedGrid(HashGrid):
 
     def of(self, scene: Scene) -> HashGrid:
         """The grid for `scene`."""
-        log2_table = suitable_table(detail(scene.splits["train"]))
+        log2_table = SHORT if detail(scene.splits["train"]) < FINE else LONG
         return HashGrid(**{**asdict(self), "log2_table": log2_table})
 
 
@@ -36,13 +39,6 @@ def hash_grid(
     """A hash grid of that shape; `log2_table` None: a `SuitedGrid`."""
     shape = {"levels": levels, "features": features, "n_min": n_min, "n_max": n_max}
     return SuitedGrid(**shape) if log2_table is None else HashGrid(log2_table=log2_table, **shape)
-
-
-def suitable_table(detail: float) -> int:
-    """log2 T for pictures with so many pixels of `detail`: a power of 2 with `ENTRIES` entries for
-    each, or more, from `LEAST` to `MOST`."""
-    needed = math.ceil(math.log2(max(ENTRIES * detail, 1)))
-    return min(max(needed, LEAST), MOST)
 
 
 def detail(split: Split) -> float:

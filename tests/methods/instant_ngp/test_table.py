@@ -7,19 +7,12 @@ import torch
 
 from bench.types import Budget, Log, Scene, Split
 from methods.instant_ngp.method import InstantNgp
-from methods.instant_ngp.table import (
-    ENTRIES,
-    LEAST,
-    MOST,
-    SuitedGrid,
-    detail,
-    hash_grid,
-    suitable_table,
-)
+from methods.instant_ngp.table import LONG, SHORT, SuitedGrid, detail, hash_grid
 from methods.kernels.encode import HashGrid
 from tests.methods.trainings import QUICK
 
 SHAPE = {"levels": 2, "features": 2, "n_min": 4, "n_max": 8}
+BUDGET = Budget("test", steps=1, samples=64)
 
 
 def split_of(*images: torch.Tensor) -> Split:
@@ -54,22 +47,17 @@ def test_detail_is_a_mean_over_pictures_from_all_over_the_path():
     assert detail(split_of(*[plain] * 16, *[dotted] * 16)) == pytest.approx(1.5)
 
 
-def test_a_table_has_the_entries_that_detail_asks_for():
-    for pixels in (40_000, 70_000, 100_000, 137_000):
-        entries = 2 ** suitable_table(pixels)
-        assert ENTRIES * pixels <= entries < 2 * ENTRIES * pixels
-    assert suitable_table(0) == LEAST
-    assert suitable_table(10**7) == MOST
-
-
 def test_a_length_that_is_given_is_kept():
     assert hash_grid(log2_table=12, **SHAPE) == HashGrid(log2_table=12, **SHAPE)
     assert not isinstance(hash_grid(log2_table=12, **SHAPE), SuitedGrid)
 
 
-def test_a_field_gets_the_table_that_its_scene_needs(ball_scene: Scene, quiet_log: Log) -> None:
+@pytest.mark.parametrize(("fine", "expected"), [(10**6, SHORT), (0, LONG)])
+def test_a_field_gets_the_table_that_its_scene_needs(
+    ball_scene: Scene, quiet_log: Log, monkeypatch: pytest.MonkeyPatch, fine: int, expected: int
+) -> None:
+    monkeypatch.setattr("methods.instant_ngp.table.FINE", fine)
     method = InstantNgp(grid=hash_grid(log2_table=None, **SHAPE), training=QUICK, device="cpu")
-    method.fit(ball_scene, Budget("test", steps=1, samples=64), quiet_log)
-    assert method.trained.field.grid == HashGrid(log2_table=LEAST, **SHAPE)
-    key = method.setup.key(ball_scene, Budget("test", steps=1, samples=64))
-    assert key["grid"] == {"log2_table": LEAST, **SHAPE}
+    method.fit(ball_scene, BUDGET, quiet_log)
+    assert method.trained.field.grid == HashGrid(log2_table=expected, **SHAPE)
+    assert method.setup.key(ball_scene, BUDGET)["grid"] == {"log2_table": expected, **SHAPE}
