@@ -26,6 +26,7 @@ class InstantNgp:
     study = Study(
         knobs={"stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3"))},
         trained={
+            "log2 T, trained": turned("log2 T", "method.grid.log2_table", (17, 18, 19)),
             "step, trained": turned("trained step", "method.training.march_step", (1, 2, 4)),
             "stop, trained": turned("trained stop", "method.training.stop", ("1e-2", "1e-4")),
             "thin, trained": turned("thin", "method.training.thin", (0,)),
