@@ -63,7 +63,6 @@ class TrainingOptions(PixelOptions):
     stop: float = 3e-2  # transmittance at which a ray ends
     thin: float = 1e-2  # see `Sampling`
     by_error: float = 0.5
-    opacity_entropy: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
