@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import torch
 
@@ -63,9 +63,11 @@ class Setup:
             "precision": self.precision if multiplied else "bf16 in fp32",
         }
 
-    def grid_of(self, scene: Scene) -> HashGrid:
-        """The shape of the hash table for `scene`."""
-        return self.grid.of(scene) if isinstance(self.grid, SuitedGrid) else self.grid
+    def suited(self, scene: Scene) -> Setup:
+        """This setup with the hash table that `scene` needs, if it leaves that to the scene."""
+        return (
+            replace(self, grid=self.grid.of(scene)) if isinstance(self.grid, SuitedGrid) else self
+        )
 
     def key(self, scene: Scene, budget: Budget) -> dict[str, object]:
         """Everything the trained field depends on."""
@@ -73,7 +75,7 @@ class Setup:
             "scene": scene.digest,
             "steps": budget.steps,
             "samples": budget.samples,
-            "grid": asdict(self.grid_of(scene)),
+            "grid": asdict(self.suited(scene).grid),
             "training": asdict(self.training),
             "precision": self.precision,
             "backend": self.backend,
@@ -105,9 +107,10 @@ class TrainedField:
 
 def train_field(setup: Setup, scene: Scene, budget: Budget, log: Log) -> TrainedField:
     """Train a field on the pictures of `scene`, or load the result of the same training."""
+    setup = setup.suited(scene)  # once: it reads pictures
     generator = torch.Generator().manual_seed(setup.seed)
     field = HashField(
-        setup.grid_of(scene), precision=setup.precision, backend=setup.backend, generator=generator
+        setup.grid, precision=setup.precision, backend=setup.backend, generator=generator
     ).to(setup.device)
     finished = log.stage_dir("field", setup.key(scene, budget)) / "field.safetensors"
 

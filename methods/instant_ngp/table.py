@@ -25,7 +25,7 @@ PICTURES = 16  # at most so many are looked at
 
 
 class SuitedGrid(HashGrid):
-    """A hash grid whose table is as long as a scene needs it, for example like this one."""
+    """A hash grid whose table is as long as a scene needs it; `log2_table` is not used."""
 
     def of(self, scene: Scene) -> HashGrid:
         """The grid for `scene`."""
