@@ -303,12 +303,14 @@ def distance_table(table: PaperTable, measured: Mapping[str, Repeated]) -> Table
         here = gap(metric, runs[reference.label], runs[line.label])
         figures = (each.published.get(metric, math.nan) for each in (reference, line))
         texts = told(metric, here.by), told(metric, apart(metric, *figures))
-        return " / ".join(texts) if {*texts} != {ABSENT} else ABSENT
+        return "{} ({})".format(*texts).removesuffix(f" ({ABSENT})")
 
-    heads = [f"here / paper, against {table.name_of(reference)}"]
-    heads += [metric_format(metric)[0].rstrip(" ↑↓") for metric in metrics]
-    cells = ((table.name_of(line), *(cell(line, metric) for metric in metrics)) for line in others)
-    return Table("Distances", tuple(heads), tuple(cells))
+    columns = {metric: [cell(line, metric) for line in others] for metric in metrics}
+    columns = {metric: cells for metric, cells in columns.items() if {*cells} != {ABSENT}}
+    heads = [metric_format(metric)[0].rstrip(" ↑↓") for metric in columns]
+    names = (table.name_of(line) for line in others)
+    against = f"here (paper), against {table.name_of(reference)}"
+    return Table("Distances", (against, *heads), tuple(zip(names, *columns.values(), strict=True)))
 
 
 def _scenes(metrics: Sequence[str], lines: Sequence[Repeated]) -> Table:

@@ -60,12 +60,13 @@ class Table:
     def markdown(self) -> str:
         """The table in GitHub's Markdown, without its title."""
         rules = ("---:" if self.right(column) else "---" for column in range(len(self.columns)))
-        rows = [self.columns, tuple(rules)]
+        rows = [self.columns]
         for row, line in enumerate(self.lines):
             texts = [text.replace("|", "\\|") for text in line]
             bold = ((row, column) in self.bold for column in range(len(line)))
             rows.append(tuple(f"**{x}**" if b else x for x, b in zip(texts, bold, strict=True)))
-        return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+        head, *lines = (f"| {' | '.join(row)} |" for row in rows)
+        return "\n".join((head, f"|{'|'.join(rules)}|", *lines))
 
 
 def spread(low: float, high: float, decimals: int = 1) -> str:

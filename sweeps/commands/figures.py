@@ -2,8 +2,9 @@
 
 docs/figures.toml names the commands. A document shows a part of what one of them wrote between two
 comments, `<!-- figures NAME | HEADING | WHAT -->` and `<!-- end of figures -->`: of the section of
-its page whose heading begins so (none: the first), the first `table` (`table 8`: its first lines),
-the `bold` lines of it, the first `picture`, or `all`. What is between the comments is replaced.
+its page whose heading begins so (none: the first), the first `table`, the `bold` lines of it, the
+first `picture`, or `all`. `table 8` has its first lines, `table of case, ms` those columns whose
+heading is so up to its unit. What is between the comments is replaced.
 """
 
 from __future__ import annotations
@@ -38,12 +39,14 @@ MADE = "made.json"  # beside a page: what made it
 
 REGION = re.compile(
     r"<!-- figures (?P<name>[\w-]+) \| (?P<heading>[^|\n]*?) \| "
-    r"(?P<what>all|table|bold|picture)(?: (?P<most>\d+))?"
-    r"[^\n]*-->\n.*?<!-- end of figures -->",
+    r"(?P<what>(?P<part>all|table|bold|picture)(?: (?P<most>\d+))?(?: of (?P<columns>[^|\n]+?))?)"
+    r"(?: \|[^\n]*)? -->\n.*?<!-- end of figures -->",
     re.DOTALL,
 )
 HEADING = re.compile(r"^#{1,2} (.*)$", re.MULTILINE)
 PICTURE = re.compile(r"^!\[(.*)\]\((.+)\)$", re.MULTILINE)
+CELL = re.compile(r"(?<!\\)\|")  # what is between two cells of a table
+UNIT = re.compile(r",| [↑↓]")  # begins what a heading says after its name
 TABLE = re.compile(r"(?:^\|.*\|\n?)+", re.MULTILINE)
 
 COLOURS_OF_A_PLOT = 2**14  # at most; a picture with more shows renderings
@@ -173,29 +176,31 @@ def _region(
 
     The first one of a page tells what made it; `told` are the names of pages that have.
     """
-    name, heading, what = region["name"], region["heading"], region["what"]
+    name, heading, part = region["name"], region["heading"], region["part"]
     most = int(region["most"]) if region["most"] else None
+    columns = region["columns"].split(", ") if region["columns"] else ()
     if name not in pages:
         return region[0]
     folder, made = pages[name], _read(pages[name])
     assert made is not None
     text = _section((folder / PAGE).read_text(encoding="utf-8"), heading, name)
-    if what != "all":
-        found = (PICTURE if what == "picture" else TABLE).search(text)
+    if part != "all":
+        found = (PICTURE if part == "picture" else TABLE).search(text)
         if not found:
-            raise SteerbenchError(f"{document}: figures {name} | {heading}: it has no {what}")
+            raise SteerbenchError(f"{document}: figures {name} | {heading}: it has no {part}")
         text = found[0].strip()
     to_results = RESULTS if document.parent == Path() else RESULTS.relative_to(document.parent)
 
     def shorter(table: re.Match[str]) -> str:
         head, rule, *lines = table[0].strip().splitlines()
-        kept = [x for x in lines if what != "bold" or x.startswith("| **")][:most]
-        if what == "bold":  # where all lines are, none stands out
+        kept = [x for x in lines if part != "bold" or x.startswith("| **")][:most]
+        if part == "bold":  # where all lines are, none stands out
             kept = [re.sub(r"\*\*(.*?)\*\*", r"\1", x, count=1) for x in kept]
-        if len(kept) == len(lines):
+        rows = _of_columns([head, rule, *kept], columns)
+        if rows == [head, rule, *lines]:
             return table[0]
-        told_all = f"{len(kept)} of {len(lines)} lines; all: [{name}.csv]({to_results / name}.csv)."
-        return "\n".join([head, rule, *kept, "", told_all])
+        few = f"{len(kept)} of {len(lines)} lines; all" if len(kept) < len(lines) else "All columns"
+        return "\n".join([*rows, "", f"{few}: [{name}.csv]({to_results / name}.csv)."])
 
     def copied(picture: re.Match[str]) -> str:
         return f"![{picture[1]}]({to_results / _copy(folder / picture[2], name)})"
@@ -203,10 +208,22 @@ def _region(
     text = PICTURE.sub(copied, TABLE.sub(shorter, text))
     first = name not in told
     told.add(name)
-    shown = what if most is None else f"{what} {most}"
-    start = f"<!-- figures {name} | {heading} | {shown} | {made.commit} -->"
+    start = f"<!-- figures {name} | {heading} | {region['what']} | {made.commit} -->"
     made_by = f"{made.told}\n\n" if first else ""
     return f"{start}\n{made_by}{text}\n<!-- end of figures -->"
+
+
+def _of_columns(rows: Sequence[str], wanted: Sequence[str]) -> list[str]:
+    """The `rows` of a table with the `wanted` columns alone; none: all."""
+    if not wanted:
+        return [*rows]
+    cells = [CELL.split(row)[1:-1] for row in rows]
+    names = [UNIT.split(cell.strip())[0] for cell in cells[0]]
+    for name in wanted:
+        if name not in names:
+            raise unknown("column", name, names)
+    chosen = [names.index(name) for name in wanted]
+    return [f"|{'|'.join(row[column] for column in chosen)}|" for row in cells]
 
 
 def _section(text: str, heading: str, name: str) -> str:
@@ -244,10 +261,10 @@ def _rows(text: str) -> Iterator[list[str]]:
     for line in text.splitlines():
         if line.startswith("#"):
             heading = line.lstrip("# ")
-        elif line.startswith("| ---"):
+        elif line.startswith("|---"):
             continue
         elif line.startswith("| "):
-            cells = re.split(r" (?<!\\)\| ?", line[2:])[:-1]
+            cells = [cell.strip() for cell in CELL.split(line)[1:-1]]
             if heading:
                 yield from ([], [heading])
                 heading = ""

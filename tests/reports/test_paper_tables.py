@@ -135,7 +135,7 @@ def test_a_table_says_for_which_line_another_stands_and_why(run, tmp_path):
     ]
     text = markdown(section(TABLES["table1"], lines), tmp_path)
     assert "| SteerNeRF, half precision" not in text
-    assert "| SteerNeRF, fp32 | +0.00 / -1.19 |" in text
+    assert "| SteerNeRF, fp32 | +0.00 (-1.19) |" in text
     why = "failed: no bfloat16."
     assert f"- SteerNeRF, fp32, stands for SteerNeRF, half precision: {why}" in text
 
@@ -165,9 +165,9 @@ def test_a_section_shows_both_blocks_and_distances_of_the_first(run, tmp_path):
     assert "(steernerf_lean)" not in text  # the heading says it
     assert "| with joint training | " in beyond
     assert paper.count("| measured |") == beyond.count("| measured |") == 1
-    assert "| here / paper, against with joint training | PSNR, dB | SSIM | LPIPS vgg |" in paper
-    assert "| without joint training | +0.00 / -1.07 |" in paper
-    assert "here / paper" not in beyond
+    assert "| here (paper), against with joint training | PSNR, dB | SSIM | LPIPS vgg |" in paper
+    assert "| without joint training | +0.00 (-1.07) |" in paper
+    assert "here (paper)" not in beyond
 
 
 def test_a_cell_has_the_distance_to_the_reference_here_and_in_the_paper(run):
@@ -180,10 +180,10 @@ def test_a_cell_has_the_distance_to_the_reference_here_and_in_the_paper(run):
     lines = [TABLE.lines[0], replace(TABLE.lines[1], published=published)]
     table = replace(TABLE, reference="here", lines=lines)
     (line,) = distance_table(table, measured).lines
-    assert line == ("elsewhere", "-1.46 / -1.00", "×0.50 / ×1.20", ABSENT)
+    assert line == ("elsewhere", "-1.46 (-1.00)", "×0.50 (×1.20)")
     (line,) = distance_table(table, {}).lines
-    assert line == ("elsewhere", f"{ABSENT} / -1.00", f"{ABSENT} / ×1.20", ABSENT)
-    heads = ("here / paper, against here", "PSNR, dB", "ms / frame", "model, MB")
+    assert line == ("elsewhere", f"{ABSENT} (-1.00)", f"{ABSENT} (×1.20)")
+    heads = ("here (paper), against here", "PSNR, dB", "ms / frame")  # no size has a distance
     assert distance_table(table, {}).columns == heads
 
 

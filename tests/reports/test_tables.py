@@ -70,7 +70,7 @@ def test_markdown_aligns_figures_sets_bold_and_keeps_bars_in_their_cells():
     text = tables.Table("A title", ("of", "dB", "what", "more"), lines, frozenset({(1, 3)}))
     assert text.markdown().splitlines() == [
         "| of | dB | what | more |",
-        "| --- | ---: | --- | ---: |",
+        "|---|---:|---|---:|",
         "| 1 a\\|b | 1.5 | fp32 | n/a |",
         "| 2 | the same | 2 x | **+1** |",
         "| 3 |  | is | b |",

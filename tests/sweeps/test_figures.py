@@ -113,6 +113,21 @@ def test_a_document_shows_few_lines_of_a_long_table(steerbench, checkout, what):
     assert next(row for row in rows if row[:1] == ["run"])[1] == "PSNR, dB ↑"
 
 
+def test_a_document_shows_some_columns_of_a_table(steerbench, checkout):
+    (checkout / "README.md").write_text(region("run", "", "table of PSNR, run"))
+    assert steerbench("figures", "--only", "run").status == 0
+    shown = (checkout / "README.md").read_text()
+    head, rule, line = (x for x in shown.splitlines() if x.startswith("|"))
+    assert (head, rule) == ("| PSNR, dB ↑ | run |", "|---:|---|")
+    assert re.fullmatch(r"\| [\d.]+ \| \w+ \|", line)
+    assert "All columns: [run.csv](docs/results/run.csv)." in shown
+    assert shown.startswith("<!-- figures run |  | table of PSNR, run | ")
+    (checkout / "README.md").write_text(region("run", "", "table of PSRN"))
+    outcome = steerbench("figures")
+    assert outcome.status == 2
+    assert "unknown column 'PSRN'. Did you mean PSNR?" in outcome.err
+
+
 # The documents of this checkout
 
 
