@@ -16,8 +16,8 @@ from reports.regression import Figures, frames_apart
 from reports.runs import Repeated, Run
 from reports.tables import ABSENT, Table, decimal
 
-AS, LARGER, SMALLER = "as in the paper", "larger than in the paper", "smaller than in the paper"
-AT_MOST = "smaller than in the paper, if there is one"
+AS, LARGER, SMALLER = "as in the paper", "larger", "smaller"
+AT_MOST = "smaller, if any"
 AGREES = "same direction"
 """Of a difference whose size the paper does not give."""
 OPPOSITE, OPEN, UNKNOWN = "opposite", "cannot be told", "not measured"

@@ -89,7 +89,7 @@ def test_a_job_that_fails_stands_in_its_line_and_the_others_run(steerbench, meas
     assert "about 0:00:0" in outcome.err
     page = Path(re.search(r"report: (.*)", outcome.err)[1])
     assert labels(page) == ["L = 0", "L = 1", "L = 2", "L = 3: failed: no room for L = 3"]
-    assert "/ +0.20 |" in page.read_text()  # from L = 0 to 2
+    assert "(+0.20) |" in page.read_text()  # from L = 0 to 2
 
 
 def test_the_jobs_go_where_hydras_launcher_puts_them(steerbench, measured, launched, outputs):
@@ -310,7 +310,7 @@ def test_the_page_of_a_data_set_has_means_scenes_and_gaps(steerbench, tmp_path, 
     assert f"| a grey | **{mean}** |" in page
     assert f"| a dark one | {sum(dark) / 2:.2f} |" in page
     by = sum(one - other for one, other in zip(grey, dark, strict=True)) / 2
-    assert f"| a dark one | -{by:.2f} / -0.50 |" in page
+    assert f"| a dark one | -{by:.2f} (-0.50) |" in page
     assert "### Each scene" in page
     for place, scene in enumerate(values):
         assert f"| {scene}: a grey | {grey[place]:.2f} |" in page
