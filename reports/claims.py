@@ -205,7 +205,7 @@ def finding_table(comparisons: Sequence[Comparison]) -> Table:
     for each in comparisons:
         if each.claim.says and each.here is not NOT_MEASURED:
             first.setdefault((each.claim.says, *_figures(each), each.verdict), each)
-    columns = ("quantity", "paper", "here", "95 % interval", "verdict")
+    columns = ("quantity", "paper", "here", "95 % interval", "against the paper")
     lines = tuple((_quantity(each), *figures) for (_, *figures), each in first.items())
     bold = frozenset((row, 0) for row, each in enumerate(first.values()) if each.claim.main)
     return Table("What the paper says, and what was found", columns, lines, bold)
@@ -237,7 +237,7 @@ def claim_table(comparisons: Sequence[Comparison]) -> Table:
         margin = f"×{each.claim.margin:g}" if _by_ratio(metric) else f"{each.claim.margin:g}"
         figures = (*_figures(each), each.here.over, margin)
         lines.append((name, *figures, each.verdict))
-    columns = ("claim", "paper", "here", "95 % interval", "over", "margin", "verdict")
+    columns = ("claim", "paper", "here", "95 % interval", "over", "margin", "against the paper")
     return Table("All comparisons", columns, tuple(lines))
 
 

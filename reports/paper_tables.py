@@ -135,7 +135,7 @@ class PaperTable:
                 lines[other] = replace(lines[other], published=published)
                 standing[missing] = other
                 why = ": ".join(known[missing].gaps) or "not measured"
-                notes += [] if self.mark else [f"{other}, stands for {missing}: {why}."]
+                notes += [] if self.mark else [f'"{other}" stands for "{missing}" ({why}).']
         claims = [replace(x, lines=[standing.get(y, y) for y in x.lines]) for x in self.claims]
         for names in standing.items():  # what they differ in, as a claim says it
             words, others = (name.rpartition(", ")[2] for name in names)
@@ -309,7 +309,7 @@ def distance_table(table: PaperTable, measured: Mapping[str, Repeated]) -> Table
     columns = {metric: cells for metric, cells in columns.items() if {*cells} != {ABSENT}}
     heads = [metric_format(metric)[0].rstrip(" ↑↓") for metric in columns]
     names = (table.name_of(line) for line in others)
-    against = f"here (paper), against {table.name_of(reference)}"
+    against = f'here (paper), relative to "{table.name_of(reference)}"'
     return Table("Distances", (against, *heads), tuple(zip(names, *columns.values(), strict=True)))
 
 

@@ -95,7 +95,7 @@ def test_a_page_of_nothing_still_says_what_is_missing(tmp_path):
     lines = {"table5": [Repeated("with joint training", [], ["not measured yet"])]}
     text = write_paper_page([*TABLES.values()], lines, [], tmp_path).read_text()
     assert "| with joint training: not measured yet | – |" in text
-    assert "| without joint training | – (-1.07) |" in text
+    assert "| with joint training | – (+1.07) |" in text
     assert "comparisons" not in text
     assert "![" not in text
     assert "Outliers" not in text
