@@ -10,14 +10,13 @@ import ctypes
 import sys
 from collections.abc import Callable
 
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8  # of malloc.h
-LARGEST_KEPT = 32 << 20  # bytes of a block that is kept; glibc allows no higher limit
+M_TRIM_THRESHOLD, M_MMAP_MAX, M_ARENA_MAX = -1, -4, -8  # of malloc.h
 
 
 def keep_freed() -> None:
     """Keep memory that is freed from now on, for later allocations by any thread."""
     if mallopt := _of_libc("mallopt"):
-        mallopt(M_MMAP_THRESHOLD, LARGEST_KEPT)
+        mallopt(M_MMAP_MAX, 0)  # a block with a mapping of its own is returned at once
         mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
         mallopt(M_ARENA_MAX, 1)  # other arenas would still return freed memory
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +15,7 @@ from methods.engines.network import Built, Network
 from methods.kernels.types import expect
 from methods.rendering.frame import FeatureFrame
 from methods.steernerf.buffer import Points
+from methods.steernerf.kernels.convolution import convolution, halved
 from methods.steernerf.kernels.drawing import corrected, shown
 
 UNWATCHED = NullProbe()
@@ -81,6 +83,7 @@ class UNet(Renderer2d):
         once = len(observations) == 1 and not torch.is_grad_enabled()
         inputs = _stacked([self._input(o, once) for o in observations]).permute(0, 3, 1, 2)
         height, width = inputs.shape[-2:]
+        self.network.backend = observations[0].backend
         if height % DIVISOR or width % DIVISOR:
             inputs = functional.pad(inputs, (0, -width % DIVISOR, 0, -height % DIVISOR))
         (correction,) = self.run(probe, inputs)  # Eq. 11
@@ -128,17 +131,21 @@ class _Network(Network):
 
     def forward(self, inputs: Tensor) -> tuple[Tensor]:
         """[B, C, H, W] to [B, 3, H, W]; H and W are multiples of `DIVISOR`."""
-        full = self.enter(self.first(inputs)).relu()
-        half = self.at_half(functional.max_pool2d(full, 2)).relu()
-        quarter = self.narrow(functional.max_pool2d(half, 2)).relu()
+        backend = self.backend
+        full = _drawn(
+            self.enter, _drawn(self.first, inputs, backend=backend), relu=True, backend=backend
+        )
+        half = self.at_half(halved(full, backend=backend), backend)
+        quarter = _drawn(self.narrow, halved(half, backend=backend), relu=True, backend=backend)
         for block in self.at_quarter:
-            quarter = block(quarter).relu()
-        wide = functional.pixel_shuffle(self.widen_quarter(quarter), 2)
-        merged = _merged(self.merge_half, wide, half).relu()
-        merged = self.half_again(merged).relu()
-        wide = functional.pixel_shuffle(self.widen_half(merged), 2)
-        merged = _merged(self.merge_full, wide, full).relu()
-        return (self.last(self.leave(merged).relu()),)
+            quarter = block(quarter, backend)
+        wide = _drawn(self.widen_quarter, quarter, shuffle=True, backend=backend)
+        merged = _drawn(self.merge_half, wide, half, relu=True, backend=backend)
+        merged = self.half_again(merged, backend)
+        wide = _drawn(self.widen_half, merged, shuffle=True, backend=backend)
+        merged = _drawn(self.merge_full, wide, full, relu=True, backend=backend)
+        merged = _drawn(self.leave, merged, relu=True, backend=backend)
+        return (_drawn(self.last, merged, backend=backend),)
 
     def products(self, *inputs: Tensor) -> int:
         """Multiplications by weights: every kernel counts once per pixel at its resolution."""
@@ -151,7 +158,7 @@ class _Network(Network):
 
 
 class _Residual(nn.Module):
-    """x + conv(ReLU(conv(x)))."""
+    """ReLU(x + conv(ReLU(conv(x))))."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -159,17 +166,15 @@ class _Residual(nn.Module):
         for layer in (self.first, self.second):
             _kaiming(layer, 0.1)
 
-    def forward(self, x: Tensor) -> Tensor:
-        return x + self.second(self.first(x).relu())
+    def forward(self, x: Tensor, backend: str) -> Tensor:
+        inner = _drawn(self.first, x, relu=True, backend=backend)
+        return _drawn(self.second, inner, plus=x, relu=True, backend=backend)
 
 
-def _merged(layer: nn.Conv2d, one: Tensor, other: Tensor) -> Tensor:
-    """`layer` of the channels of `one` and `other`, which are not copied side by side."""
-    of_other = layer.out_channels  # `other` has the channels of the result
-    of_one = layer.in_channels - of_other
-    weights = layer.weight.split((of_one, of_other), dim=1)
-    merged = functional.conv2d(one, weights[0], padding=1)
-    return merged + functional.conv2d(other, weights[1], layer.bias, padding=1)
+def _drawn(layer: nn.Conv2d, *parts: Tensor, **how: Any) -> Tensor:
+    """`layer` of the channels of all `parts`, as `convolution` does it."""
+    assert layer.bias is not None
+    return convolution(parts, layer.weight, layer.bias, **how)
 
 
 def _stacked(pictures: Sequence[Tensor]) -> Tensor:

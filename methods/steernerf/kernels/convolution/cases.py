@@ -1,0 +1,152 @@
+"""Cases of the convolution: widths and sides of any number, two parts, all that can follow it.
+
+Most have short whole numbers, of which the fast algorithm rounds none: weights are multiples of
+24^2, so that G g G^T is whole, and no sum of absolute values exceeds 2^24.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from bench.case import U32, Bound, Case, Given, Operation, uniform
+from methods.kernels.dispatch import served
+from methods.steernerf.kernels.convolution import convolution, halved
+
+# B^T, 24 G and A^T of Lavin & Gray 2016, Section 4.3, without signs.
+B_T = torch.tensor(
+    [
+        [4, 0, 5, 0, 1, 0],
+        [0, 4, 4, 1, 1, 0],
+        [0, 4, 4, 1, 1, 0],
+        [0, 2, 1, 2, 1, 0],
+        [0, 2, 1, 2, 1, 0],
+        [0, 4, 0, 5, 0, 1],
+    ],
+    dtype=torch.float64,
+)
+G24 = torch.tensor(
+    [[6, 0, 0], [4, 4, 4], [4, 4, 4], [1, 2, 4], [1, 2, 4], [0, 0, 24]], dtype=torch.float64
+)
+A_T = torch.tensor(
+    [[1, 1, 1, 1, 1, 0], [0, 1, 1, 2, 2, 0], [0, 1, 1, 4, 4, 0], [0, 1, 1, 8, 8, 1]],
+    dtype=torch.float64,
+)
+
+FRAME = (1, 800, 704)  # of the U-Net
+CHANNELS = 16
+
+
+def _largest(given: Given) -> Tensor:
+    """The sums of `convolution` where all numbers on the way are positive and nothing cancels:
+    S = |A^T| [(|G| |g| |G^T|) . (|B^T| |d| |B|)] |A|, [B, O, H, W]."""
+    pictures = torch.cat(list(given["parts"]), dim=1).double().abs()
+    height, width = pictures.shape[2:]
+    around = functional.pad(pictures, (1, 1 + -width % 4, 1, 1 + -height % 4))
+    tiles = B_T @ around.unfold(2, 6, 4).unfold(3, 6, 4) @ B_T.T  # [B, C, down, across, 6, 6]
+    weight = G24 @ given["weight"].double().abs() @ G24.T / 24**2
+    squares = A_T @ torch.einsum("oiab,niyxab->noyxab", weight, tiles) @ A_T.T
+    total = squares.transpose(3, 4).flatten(4, 5).flatten(2, 3)[..., :height, :width]
+    total = total + given["bias"].double().abs()[:, None, None]
+    return total + given["plus"].abs() if "plus" in given else total
+
+
+def _off(given: Given) -> Tensor:
+    """Numbers are rounded once in the weights, 2 x 3 times in B^T d B, once a channel in the sum, 2
+    x 4 times in A^T m A, and twice where something is added; the reference rounds 9 times a
+    channel."""
+    channels = given["weight"].shape[1]
+    return (10 * channels + 17) * U32 * _largest(given)
+
+
+def _operation(bound: Bound) -> Operation:
+    backends = served(__package__)
+    return Operation(
+        "convolution",
+        backends,
+        lambda given, backend: (convolution(**given, backend=backend),),
+        {"sums": bound},
+    )
+
+
+EXACT = Bound("short numbers: 0", 0.0)
+SHORT = _operation(EXACT)
+LONG = _operation(Bound("(10 C + 17) u S", _off))
+HALVED = Operation(
+    "halved",
+    served(__package__),
+    lambda given, backend: (halved(given["pictures"], backend=backend),),
+    {"maxima": EXACT},
+)
+
+
+def cases() -> list[Case]:
+    """One pixel, sides of all remainders, few and many channels; a frame of the U-Net, timed."""
+    kinds: dict[str, tuple[Sequence[int], Sequence[int], int, dict[str, bool]]] = {
+        "one pixel": ((1, 1, 1), (16,), 16, {}),
+        "a tile": ((1, 4, 4), (16,), 16, {}),
+        "5 x 7, few channels": ((1, 5, 7), (3,), 5, {"relu": True}),
+        "two parts, a sum": ((2, 9, 10), (32, 18), 16, {"relu": True, "plus": True}),
+        "two parts of few channels": ((1, 6, 203), (2, 17), 3, {}),
+        "shuffled": ((2, 8, 11), (16,), 64, {"shuffle": True, "relu": True}),
+        "few shuffled": ((1, 7, 6), (4,), 12, {"shuffle": True}),
+    }
+    found = [
+        case for name, kind in kinds.items() for case in SHORT.cases(name, partial(_short, *kind))
+    ]
+    long: dict[str, tuple[Sequence[int], int | None]] = {
+        "long numbers": ((1, 30, 30), None),
+        "a frame, 16 channels": (FRAME, 800 * 704),
+    }
+    for name, (size, items) in long.items():
+        found += LONG.cases(name, partial(_long, size), items=items)
+    pictures: dict[str, tuple[Sequence[int], int | None]] = {
+        "2 x 2": ((1, 3, 2, 2), None),
+        "several": ((2, 16, 6, 10), None),
+        "a frame, 16 channels": ((1, CHANNELS, *FRAME[1:]), 800 * 704),
+    }
+    for name, (shape, items) in pictures.items():
+        found += HALVED.cases(name, partial(_pictures, shape), items=items)
+    return found
+
+
+def _short(
+    size: Sequence[int], channels: Sequence[int], outputs: int, how: dict[str, bool]
+) -> Given:
+    generator = torch.Generator().manual_seed(outputs)
+    batch, height, width = size
+
+    def draw(shape: Sequence[int], share: float) -> Tensor:
+        signs = torch.randint(0, 2, tuple(shape), generator=generator) * 2.0 - 1
+        return signs * (torch.rand(tuple(shape), generator=generator) < share)
+
+    given = {
+        "parts": [draw((batch, count, height, width), 0.05) for count in channels],
+        "weight": 24**2 * draw((outputs, sum(channels), 3, 3), 0.5),
+        "bias": draw((outputs,), 1),
+        **({"plus": draw((batch, outputs, height, width), 1)} if how.get("plus") else {}),
+    }
+    assert _largest(given).max() < 2**24, "numbers that are not short"
+    return given | {name: yes for name, yes in how.items() if name != "plus"}
+
+
+def _long(size: Sequence[int]) -> Given:
+    batch, height, width = size
+    generator = torch.Generator().manual_seed(height)
+    return {
+        "parts": [_pictures((batch, CHANNELS, height, width))["pictures"]],
+        "weight": uniform(generator, (CHANNELS, CHANNELS, 3, 3)),
+        "bias": uniform(generator, (CHANNELS,)),
+        "relu": True,
+    }
+
+
+def _pictures(shape: Sequence[int]) -> Given:
+    """Channels lie last."""
+    batch, channels, height, width = shape
+    generator = torch.Generator().manual_seed(height)
+    return {"pictures": uniform(generator, (batch, height, width, channels)).permute(0, 3, 1, 2)}

@@ -1,0 +1,333 @@
+"""Convolution by Winograd's minimal filtering, F(4 x 4, 3 x 3), with numba.
+
+A tile of 6 x 6 pixels d gives 4 x 4 pixels of the result (Lavin & Gray 2016, Eq. 8 and Section
+4.3): A^T [(G g G^T) . (B^T d B)] A. The product in the middle is one of numbers, 36 for 16 pixels
+where the sum over 3 x 3 pixels needs 144; over all channels it becomes 36 matrix products. Channels
+lie last and are computed `LANES` at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from llvmlite import ir
+from numba import njit, prange, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numba.np.arrayobj import make_array
+from torch import Tensor
+from torch.nn import functional
+
+from methods.kernels.cpu import LANES, check_float32, f32, multiply
+from methods.steernerf.kernels.convolution import reference
+
+TILES = 48  # tiles of a row that go together: with 16 channels, their numbers fit the L2 cache
+
+G = torch.tensor(
+    [
+        [1 / 4, 0, 0],
+        [-1 / 6, -1 / 6, -1 / 6],
+        [-1 / 6, 1 / 6, -1 / 6],
+        [1 / 24, 1 / 12, 1 / 6],
+        [1 / 24, -1 / 12, 1 / 6],
+        [0, 0, 1],
+    ],
+    dtype=torch.float64,
+)
+
+NOTHING = torch.empty(0)
+
+
+def convolution(
+    parts: Sequence[Tensor],
+    weight: Tensor,
+    bias: Tensor,
+    plus: Tensor | None,
+    relu: bool,
+    shuffle: bool,
+) -> Tensor:
+    given = [*parts, weight, bias, *([] if plus is None else [plus])]
+    learns = torch.is_grad_enabled() and any(x.requires_grad for x in given)
+    half = torch.is_autocast_enabled("cpu") or all(x.dtype == torch.bfloat16 for x in parts)
+    if learns or half:
+        return reference.convolution(parts, weight, bias, plus, relu, shuffle)
+    check_float32(*given)
+    outputs = len(weight)
+    together = shuffle and outputs % (4 * LANES) == 0  # a vector goes to one pixel
+    if together:  # the channels that go to one pixel lie side by side
+        weight = weight.view(-1, 4, *weight.shape[1:]).transpose(0, 1).flatten(0, 1)
+        bias = bias.view(-1, 4).T.flatten()
+    pictures = [_last(part) for part in parts]
+    batch, height, width, _ = pictures[0].shape
+    out = torch.empty(batch, 2 * height, 2 * width, outputs // 4) if together else None
+    if out is None:
+        out = torch.empty(batch, height, width, outputs)
+    channels = [x.shape[3] for x in pictures] + [0] * (2 - len(pictures))
+    padded = outputs + -outputs % LANES
+    _convolve(
+        *_flat(pictures[0], pictures[1] if len(pictures) > 1 else NOTHING),
+        *channels,
+        *(batch, height, width),
+        *_flat(_transformed(weight, [x.shape[1] for x in parts], channels, padded)),
+        *_flat(functional.pad(bias, (0, padded - outputs))),
+        *(padded, outputs, relu, plus is not None, together),
+        *_flat(NOTHING if plus is None else plus.permute(0, 2, 3, 1), out),
+    )
+    result = out.permute(0, 3, 1, 2)
+    return functional.pixel_shuffle(result, 2) if shuffle and not together else result
+
+
+def halved(pictures: Tensor) -> Tensor:
+    if pictures.dtype != torch.float32 or (torch.is_grad_enabled() and pictures.requires_grad):
+        return reference.halved(pictures)
+    batch, channels, height, width = pictures.shape
+    out = torch.empty(batch, height // 2, width // 2, channels)
+    given = pictures.permute(0, 2, 3, 1).contiguous()
+    _halve(given.flatten(0, 1).numpy(), out.flatten(0, 1).numpy())
+    return out.permute(0, 3, 1, 2)
+
+
+def _last(part: Tensor) -> Tensor:
+    """`part` [B, C, H, W] with the channels last and, at least, `LANES` of them."""
+    missing, part = LANES - part.shape[1], part.permute(0, 2, 3, 1)
+    return functional.pad(part, (0, missing)) if missing > 0 else part
+
+
+def _transformed(
+    weight: Tensor, given: Sequence[int], channels: Sequence[int], outputs: int
+) -> Tensor:
+    """G g G^T of `weight`, [36, all `channels`, `outputs`]: of the `given` channels of each part,
+    and of `outputs` filled up with 0."""
+    both = torch.kron(G, G)  # from 9 to 36
+    found = weight.new_zeros(len(both), sum(channels), outputs)
+    at = 0
+    for part, size in zip(weight.split(list(given), dim=1), channels, strict=False):
+        tile = (part.flatten(2).double() @ both.T).permute(2, 1, 0)
+        found[:, at : at + part.shape[1], : len(weight)] = tile
+        at += size
+    return found
+
+
+def _flat(*tensors: Tensor) -> list[np.ndarray]:
+    return [tensor.detach().contiguous().view(-1).numpy() for tensor in tensors]
+
+
+class _Lanes:
+    """Operations on `LANES` numbers at once, in LLVM's terms: LLVM does not find out by itself that
+    the arrays do not overlap."""
+
+    kind = ir.VectorType(ir.FloatType(), LANES)
+
+    def __init__(self, context, builder, signature, values) -> None:
+        self.context, self.builder = context, builder
+        self.signature, self.values = signature, values
+        ends = ir.FunctionType(self.kind, [self.kind] * 3)
+        name = f"llvm.fma.v{LANES}f32"
+        self._fma = cgutils.get_or_insert_function(builder.module, ends, name)
+
+    def place(self, array: int, at: ir.Value) -> ir.Value:
+        """The numbers of an argument from the index `at` on."""
+        kind, value = self.signature.args[array], self.values[array]
+        data = make_array(kind)(self.context, self.builder, value).data
+        return self.builder.bitcast(self.builder.gep(data, [at]), self.kind.as_pointer())
+
+    def constant(self, number: float) -> ir.Constant:
+        return ir.Constant(self.kind, [float(number)] * LANES)
+
+    def fma(self, factor: float, x: ir.Value, y: ir.Value) -> ir.Value:
+        return self.builder.call(self._fma, [self.constant(factor), x, y])
+
+    def add(self, *terms: ir.Value) -> ir.Value:
+        first, *others = terms
+        for other in others:
+            first = self.builder.fadd(first, other)
+        return first
+
+    def sub(self, x: ir.Value, y: ir.Value) -> ir.Value:
+        return self.builder.fsub(x, y)
+
+
+def _into(o: _Lanes, d: Sequence[ir.Value]) -> list[ir.Value]:
+    """B^T d."""
+    even, odd = o.fma(-4, d[2], d[4]), o.fma(-4, d[1], d[3])
+    near, across = o.sub(d[4], d[2]), o.sub(d[3], d[1])
+    return [
+        o.fma(4, d[0], o.fma(-5, d[2], d[4])),
+        o.add(even, odd),
+        o.sub(even, odd),
+        o.fma(2, across, near),
+        o.fma(-2, across, near),
+        o.fma(4, d[1], o.fma(-5, d[3], d[5])),
+    ]
+
+
+def _out_of(o: _Lanes, m: Sequence[ir.Value]) -> list[ir.Value]:
+    """A^T m."""
+    near, near_apart = o.add(m[1], m[2]), o.sub(m[1], m[2])
+    far, far_apart = o.add(m[3], m[4]), o.sub(m[3], m[4])
+    return [
+        o.add(m[0], near, far),
+        o.fma(2, far_apart, near_apart),
+        o.fma(4, far, near),
+        o.add(o.fma(8, far_apart, near_apart), m[5]),
+    ]
+
+
+def _along(how: Callable[[_Lanes, Sequence[ir.Value]], list[ir.Value]]):
+    """An intrinsic: reads six vectors from `at` on, `step` apart, writes `how` of them."""
+
+    @intrinsic
+    def transform(typing, source, at, step, target, to, apart):
+        def generate(context, builder, signature, values):
+            o = _Lanes(context, builder, signature, values)
+
+            def place(array: int, number: int) -> ir.Value:
+                ahead = builder.mul(values[array + 2], ir.Constant(ir.IntType(64), number))
+                return o.place(array, builder.add(values[array + 1], ahead))
+
+            given = [builder.load(place(0, number), align=4) for number in range(6)]
+            for number, result in enumerate(how(o, given)):
+                builder.store(result, place(3, number), align=4)
+            return context.get_dummy_value()
+
+        n = types.int64
+        return types.void(source, n, n, target, n, n), generate
+
+    return transform
+
+
+_to_tile, _from_tile = _along(_into), _along(_out_of)
+
+
+@intrinsic
+def _finish(typing, source, at, bias, b_at, plus, p_at, adds, relu, target, to):
+    """target = source + bias, + plus if `adds`, no number negative if `relu`; NaN stays."""
+
+    def generate(context, builder, signature, values):
+        o = _Lanes(context, builder, signature, values)
+
+        def load(array: int) -> ir.Value:
+            return builder.load(o.place(array, values[array + 1]), align=4)
+
+        plain, before = o.add(load(0), load(2)), builder.block
+        with builder.if_then(values[6]):
+            more, inside = o.add(load(4), plain), builder.block
+        total = builder.phi(o.kind)
+        total.add_incoming(plain, before)
+        total.add_incoming(more, inside)
+        zero = o.constant(0)
+        negative = builder.fcmp_ordered("<", total, zero)
+        shown = builder.select(values[7], builder.select(negative, zero, total), total)
+        builder.store(shown, o.place(8, values[9]), align=4)
+        return context.get_dummy_value()
+
+    n, yes = types.int64, types.boolean
+    return types.void(source, n, bias, n, plus, n, yes, yes, target, n), generate
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _convolve(
+    one, other, c_one, c_other, batch, height, width, weight, bias, padded, outputs, relu, adds,
+    shuffled, plus, out,
+):  # fmt: skip
+    """All arrays are flat, with channels last. Each strip of four rows is computed by itself."""
+    down, across = (height + 3) // 4, (width + 3) // 4
+    blocks = (across + TILES - 1) // TILES
+    size = (across + blocks - 1) // blocks
+    channels, pixels = c_one + c_other, height * width
+    for strip in prange(batch * down):
+        picture, top = strip // down, 4 * (strip % down)
+        tiles, results = np.empty(36 * size * channels, f32), np.empty(36 * size * padded, f32)
+        patch, space = np.zeros(36 * max(c_one, c_other), f32), np.empty(36 * LANES, f32)
+        square, none = np.empty(16 * LANES, f32), np.zeros(padded, f32)
+        for first in range(0, across, size):
+            count = min(size, across - first)
+            for t in range(count):
+                left, to = 4 * (first + t), t * channels
+                _tile(one, picture * pixels * c_one, c_one, height, width, top, left,
+                      patch, space, tiles, to, count * channels)  # fmt: skip
+                _tile(other, picture * pixels * c_other, c_other, height, width, top, left,
+                      patch, space, tiles, to + c_one, count * channels)  # fmt: skip
+            for n in range(36):
+                here = n * count
+                w = weight[n * channels * padded : (n + 1) * channels * padded]
+                multiply(count, tiles, here * channels, channels, 1, w, padded, none,
+                         results, here * padded, channels, False)  # fmt: skip
+            for t in range(count):
+                left = 4 * (first + t)
+                for k in range(0, padded, LANES):
+                    _pixels(results, t * padded + k, count * padded, space, square)
+                    for i in range(min(4, height - top)):
+                        for j in range(min(4, width - left)):
+                            y, x, at = top + i, left + j, (4 * i + j) * LANES
+                            if shuffled:
+                                part, c = k // (outputs // 4), k % (outputs // 4)
+                                y, x = 2 * y + part // 2, 2 * x + part % 2
+                                row = (picture * 2 * height + y) * 2 * width + x
+                                to = row * (outputs // 4) + c
+                            else:
+                                to = ((picture * height + y) * width + x) * outputs + k
+                            if k + LANES <= outputs:
+                                _finish(square, at, bias, k, plus, to, adds, relu, out, to)
+                            else:
+                                for c in range(outputs - k):
+                                    value = square[at + c] + bias[k + c]
+                                    value = value + plus[to + c] if adds else value
+                                    out[to + c] = f32(0) if relu and value < f32(0) else value
+
+
+@njit(cache=True, error_model="numpy")
+def _tile(
+    source, start, channels, height, width, top, left, patch, space, tiles, to, step
+):  # fmt: skip
+    """B^T d B of the 6 x 6 pixels around the 4 x 4 from `top`, `left` on, into 36 places of `tiles`
+    that are `step` apart."""
+    if channels == 0:
+        return
+    top, left = top - 1, left - 1
+    at, row = start + (top * width + left) * channels, width * channels
+    if top < 0 or left < 0 or top + 6 > height or left + 6 > width:
+        for i in range(6):
+            for j in range(6):
+                there = 0 <= top + i < height and 0 <= left + j < width
+                for c in range(channels):
+                    seen = source[at + i * row + j * channels + c] if there else f32(0)
+                    patch[(6 * i + j) * channels + c] = seen
+        source, at, row = patch, 0, 6 * channels
+    c = 0
+    while c < channels:
+        c = min(c, channels - LANES)  # the last ones overlap: some are computed twice
+        for j in range(6):
+            _to_tile(source, at + j * channels + c, row, space, j * LANES, 6 * LANES)
+        for i in range(6):
+            _to_tile(space, 6 * i * LANES, LANES, tiles, to + c + 6 * i * step, step)
+        c += LANES
+
+
+@njit(cache=True, error_model="numpy")
+def _pixels(results, at, step, space, square):
+    """A^T m A of 36 vectors that are `step` apart: `square` [4, 4, LANES]."""
+    for j in range(6):
+        _from_tile(results, at + j * step, 6 * step, space, j * LANES, 6 * LANES)
+    for i in range(4):
+        _from_tile(space, 6 * i * LANES, LANES, square, 4 * i * LANES, LANES)
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _halve(given, out):
+    """`given` [rows, W, C] with the rows of all pictures, an even number in each."""
+    _, width, channels = out.shape
+    for y in prange(len(out)):
+        for x in range(width):
+            for c in range(channels):
+                above = _larger(given[2 * y, 2 * x, c], given[2 * y, 2 * x + 1, c])
+                below = _larger(given[2 * y + 1, 2 * x, c], given[2 * y + 1, 2 * x + 1, c])
+                out[y, x, c] = _larger(above, below)
+
+
+@njit(cache=True)
+def _larger(x, y):
+    """The larger number; NaN if one is."""
+    return y if y > x or y != y else x
