@@ -56,8 +56,9 @@ class TorchEngine(Engine):
                 return network(*inputs)
 
         size = sum(weight.numel() for weight in network.parameters()) * dtype.itemsize
-        made = run if _on_cpu(network) else _recorded(run, network, samples, log)
-        return Built(made, size, dtype)
+        plain = _on_cpu(network)
+        made = run if plain else _recorded(run, network, samples, log)
+        return Built(made, size, dtype, plain)
 
 
 def _on_cpu(network: Network) -> bool:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +16,7 @@ from methods.engines.network import Built, Network
 from methods.kernels.types import expect
 from methods.rendering.frame import FeatureFrame
 from methods.steernerf.buffer import Points
-from methods.steernerf.kernels.convolution import convolution, halved
+from methods.steernerf.kernels.convolution import Spans, convolution, halved
 from methods.steernerf.kernels.drawing import corrected, shown
 
 UNWATCHED = NullProbe()
@@ -36,6 +37,7 @@ class Observation:
     preceding: Points  # of preceding frames, newest first, indices [L', H', W'], L' at most L
     backend: str  # of the kernels that a renderer calls
     part: Part = WHOLE  # of the frame, to be drawn; the H' x W' pixels are of this part
+    spans: Spans | None = None  # of the part, to be drawn; None: all of it
 
 
 class Renderer2d(nn.Module):
@@ -44,6 +46,11 @@ class Renderer2d(nn.Module):
 
     network: Network
     engine: Built | None = None
+
+    @property
+    def skips(self) -> bool:
+        """Whether it can leave out pixels inside a part; networks that engines compile cannot."""
+        return self.engine is None or self.engine.plain
 
     def run(self, probe: Probe, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Compute the network's output."""
@@ -62,6 +69,8 @@ class UNet(Renderer2d):
     `channels`, `frames`, `scale` are K, L, s; `width` is the number of channels at full size.
     """
 
+    network: _Network
+
     def __init__(
         self, channels: int, frames: int, scale: int, *, width: int, aligned: bool
     ) -> None:
@@ -79,11 +88,11 @@ class UNet(Renderer2d):
         clip: bool = False,
     ) -> Tensor:
         """Draw all observations, whose parts have one size: pictures [B, H, W, 3], `clip`ped to
-        [0, 1]. Beyond its part, a picture is its base."""
+        [0, 1]. Beyond its part, and the spans of the first one, a picture is its base."""
         once = len(observations) == 1 and not torch.is_grad_enabled()
         inputs = _stacked([self._input(o, once) for o in observations]).permute(0, 3, 1, 2)
         height, width = inputs.shape[-2:]
-        self.network.backend = observations[0].backend
+        self.network.backend, self.network.spans = observations[0].backend, observations[0].spans
         if height % DIVISOR or width % DIVISOR:
             inputs = functional.pad(inputs, (0, -width % DIVISOR, 0, -height % DIVISOR))
         (correction,) = self.run(probe, inputs)  # Eq. 11
@@ -115,6 +124,8 @@ class UNet(Renderer2d):
 class _Network(Network):
     """The layers of `ReconstructionNet_v4`, with `width` channels at full resolution."""
 
+    spans: Spans | None = None  # of its pictures; outside, every layer gives 0
+
     def __init__(self, inputs: int, width: int) -> None:
         super().__init__()
         self.first, self.enter = _conv(inputs, width), _conv(width, width)
@@ -131,26 +142,30 @@ class _Network(Network):
 
     def forward(self, inputs: Tensor) -> tuple[Tensor]:
         """[B, C, H, W] to [B, 3, H, W]; H and W are multiples of `DIVISOR`."""
-        backend = self.backend
-        full = _drawn(
-            self.enter, _drawn(self.first, inputs, backend=backend), relu=True, backend=backend
+        at_full, at_half, at_quarter = (
+            {"backend": self.backend, "spans": self.spans and self.spans.at(size)}
+            for size in (1, 2, 4)
         )
-        half = self.at_half(halved(full, backend=backend), backend)
-        quarter = _drawn(self.narrow, halved(half, backend=backend), relu=True, backend=backend)
+        full = _drawn(self.first, inputs, **at_full)
+        full = _drawn(self.enter, full, relu=True, **at_full)
+        half = self.at_half(halved(full, backend=self.backend), at_half)
+        quarter = halved(half, backend=self.backend)
+        quarter = _drawn(self.narrow, quarter, relu=True, **at_quarter)
         for block in self.at_quarter:
-            quarter = block(quarter, backend)
-        wide = _drawn(self.widen_quarter, quarter, shuffle=True, backend=backend)
-        merged = _drawn(self.merge_half, wide, half, relu=True, backend=backend)
-        merged = self.half_again(merged, backend)
-        wide = _drawn(self.widen_half, merged, shuffle=True, backend=backend)
-        merged = _drawn(self.merge_full, wide, full, relu=True, backend=backend)
-        merged = _drawn(self.leave, merged, relu=True, backend=backend)
-        return (_drawn(self.last, merged, backend=backend),)
+            quarter = block(quarter, at_quarter)
+        wide = _drawn(self.widen_quarter, quarter, shuffle=True, **at_quarter)
+        merged = _drawn(self.merge_half, wide, half, relu=True, **at_half)
+        merged = self.half_again(merged, at_half)
+        wide = _drawn(self.widen_half, merged, shuffle=True, **at_half)
+        merged = _drawn(self.merge_full, wide, full, relu=True, **at_full)
+        merged = _drawn(self.leave, merged, relu=True, **at_full)
+        return (_drawn(self.last, merged, **at_full),)
 
     def products(self, *inputs: Tensor) -> int:
-        """Multiplications by weights: every kernel counts once per pixel at its resolution."""
-        batch, _, height, width = inputs[0].shape
-        pixels = batch * height * width
+        """Multiplications by weights, as a plain convolution does them: every kernel counts once
+        per pixel at its resolution."""
+        batch, _, *size = inputs[0].shape
+        pixels = batch * (self.spans.count(*size) if self.spans else math.prod(size))
         half = dict.fromkeys(("at_half", "merge_half", "half_again", "widen_half"), 4)
         fewer = {**half, "narrow": 16, "at_quarter": 16, "widen_quarter": 16}
         weights = ((name.split(".")[0], x) for name, x in self.named_parameters() if x.dim() > 1)
@@ -166,9 +181,9 @@ class _Residual(nn.Module):
         for layer in (self.first, self.second):
             _kaiming(layer, 0.1)
 
-    def forward(self, x: Tensor, backend: str) -> Tensor:
-        inner = _drawn(self.first, x, relu=True, backend=backend)
-        return _drawn(self.second, inner, plus=x, relu=True, backend=backend)
+    def forward(self, x: Tensor, how: Mapping[str, Any]) -> Tensor:
+        inner = _drawn(self.first, x, relu=True, **how)
+        return _drawn(self.second, inner, plus=x, relu=True, **how)
 
 
 def _drawn(layer: nn.Conv2d, *parts: Tensor, **how: Any) -> Tensor:

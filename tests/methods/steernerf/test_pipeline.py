@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Literal
 
 import pytest
 import torch
+from torch.nn import functional
 
 from bench.cameras import cast, project
 from bench.types import NullProbe
 from methods.steernerf.buffer import Buffer, Cloud
 from methods.steernerf.options import RangeReduction
-from methods.steernerf.pipeline import near_matter
+from methods.steernerf.pipeline import MARGIN, near_matter, spans_near_matter
 from tests.methods.conftest import Work, look_at_the_middle
 from tests.methods.models import new_pipeline, small_model, small_rendering
 
@@ -150,8 +152,26 @@ def test_a_view_of_nothing_has_a_part_too() -> None:
     assert [side.stop - side.start for side in part] == [24, 24]
 
 
+@pytest.mark.parametrize("scale", [1, 3, 4, 8])
+def test_spans_reach_a_margin_beyond_what_is_seen_and_end_with_their_unit(scale: int) -> None:
+    """In Python, row by row; the last band is not whole."""
+    seen = torch.rand(50, 70, generator=torch.Generator().manual_seed(scale)) < 0.003
+    seen[20:44] = False  # nothing near the middle of it
+    spans, band = spans_near_matter(seen, scale), math.lcm(16, scale) // scale
+    assert spans.unit == band * scale
+    rows, columns = seen.nonzero().unbind(1)
+    for number, (begin, end) in enumerate(spans.columns.tolist()):
+        near = (rows >= number * band - MARGIN) & (rows < (number + 1) * band + MARGIN)
+        if near.any():
+            first, last = columns[near].min().item(), columns[near].max().item()
+            assert begin == max(first - MARGIN, 0) // band
+            assert end == -(-(last + 1 + MARGIN) // band)
+        else:
+            assert begin >= end
+
+
 def test_far_from_matter_a_picture_is_background_and_near_it_that_of_the_whole() -> None:
-    """At the border of its part the network sees less than in the whole picture; what it draws of
+    """At the border of its spans the network sees less than in the whole picture; what it draws of
     a pixel depends on no other farther away than 52: 2 + 3 convolutions at full size, 2 + 4 at
     half and 8 at a quarter of it, and what is pooled."""
     lens = {"fx": 500.0, "fy": 500.0, "cx": 400.0, "cy": 400.0}
@@ -161,17 +181,19 @@ def test_far_from_matter_a_picture_is_background_and_near_it_that_of_the_whole()
         pipeline.render(camera, Buffer(maxlen=2), rendering, NullProbe())
         for rendering in (USUAL, whole)
     )
-    rows, columns = near_matter(every.alpha[::4, ::4] > 0)
     assert torch.equal(every.alpha, some.alpha)
+    seen = every.alpha[::4, ::4] > 0
+    rows, columns = near_matter(seen)
+    spans = spans_near_matter(seen[rows, columns], 4)
     drawn = torch.zeros(800, 800, dtype=torch.bool)
-    drawn[4 * rows.start : 4 * rows.stop, 4 * columns.start : 4 * columns.stop] = True
-    assert 0.05 < drawn.float().mean() < 0.5
+    part = drawn[4 * rows.start : 4 * rows.stop, 4 * columns.start : 4 * columns.stop]
+    part[:] = spans.mask(*part.shape)
+    assert 0.05 < drawn.float().mean() < 0.9 * part.numel() / 800**2
     assert (some.rgb[~drawn] == pipeline.background[:3]).all()
-    inner = (slice(4 * side.start + 52, 4 * side.stop - 52) for side in (rows, columns))
-    place = tuple(inner)
-    assert every.rgb[place].shape[0] > 50
+    inner = functional.max_pool2d((~drawn)[None].float(), 105, 1, 52)[0] == 0
+    assert inner.sum() > 2500
     # Float32, sums of a few hundred products, in another order where the size is another.
-    torch.testing.assert_close(some.rgb[place], every.rgb[place], rtol=0, atol=1e-5)
+    torch.testing.assert_close(some.rgb[inner], every.rgb[inner], rtol=0, atol=1e-5)
     assert not torch.equal(some.rgb, every.rgb)
 
 

@@ -6,11 +6,39 @@ There is no Triton version: on a GPU torch computes both.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 from bench.types import check_shape
 from methods.kernels.dispatch import implementation
+
+
+@dataclass(frozen=True)
+class Spans:
+    """The part of a picture that is computed: in each band of `unit` rows, the columns from the
+    first to before the second of `columns` [bands, 2] int64, which are in units as well. A unit is
+    a multiple of 4 pixels."""
+
+    columns: Tensor
+    unit: int
+
+    def at(self, size: int) -> Spans:
+        """The same of a picture that is 1 / `size` as wide and high."""
+        return replace(self, unit=self.unit // size)
+
+    def mask(self, height: int, width: int) -> Tensor:
+        """Which pixels of a picture are computed, [height, width] bool."""
+        first, end = self.columns.repeat_interleave(self.unit, 0)[:height].unbind(1)
+        column = torch.arange(width, device=first.device) // self.unit
+        return (column >= first[:, None]) & (column < end[:, None])
+
+    def count(self, height: int, width: int) -> int:
+        """How many pixels of a picture are computed."""
+        first, end = (self.unit * self.columns).clamp(max=width).unbind(1)
+        tops = self.unit * torch.arange(len(first), device=first.device)
+        return int(((end - first).clamp(min=0) * (height - tops).clamp(0, self.unit)).sum())
 
 
 def convolution(
@@ -21,6 +49,7 @@ def convolution(
     plus: Tensor | None = None,
     relu: bool = False,
     shuffle: bool = False,
+    spans: Spans | None = None,
     backend: str = "auto",
 ) -> Tensor:
     """Convolve the channels of one or two `parts` [B, C, H, W], which are 0 beyond their border,
@@ -28,7 +57,7 @@ def convolution(
 
     Returns [B, O, H, W], without negative numbers if `relu`; if `shuffle`, which goes without
     `plus`, every four channels become one of twice the height and width, as by `pixel_shuffle`.
-    Differentiable in all tensors.
+    Outside the `spans` of the parts, the result is 0. Differentiable in all tensors.
     """
     first = parts[0]
     check_shape("weight", weight, None, sum(part.shape[1] for part in parts), 3, 3)
@@ -38,7 +67,7 @@ def convolution(
     if plus is not None:
         check_shape("plus", plus, len(first), len(weight), *first.shape[2:])
     kernel = implementation(__name__, backend, first.device)
-    return kernel.convolution(parts, weight, bias, plus, relu, shuffle)
+    return kernel.convolution(parts, weight, bias, plus, relu, shuffle, spans)
 
 
 def halved(pictures: Tensor, *, backend: str = "auto") -> Tensor:

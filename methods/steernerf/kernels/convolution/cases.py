@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from bench.case import U32, Bound, Case, Given, Operation, uniform
 from methods.kernels.dispatch import served
-from methods.steernerf.kernels.convolution import convolution, halved
+from methods.steernerf.kernels.convolution import Spans, convolution, halved
 
 # B^T, 24 G and A^T of Lavin & Gray 2016, Section 4.3, without signs.
 B_T = torch.tensor(
@@ -36,6 +36,9 @@ A_T = torch.tensor(
     [[1, 1, 1, 1, 1, 0], [0, 1, 1, 2, 2, 0], [0, 1, 1, 4, 4, 0], [0, 1, 1, 8, 8, 1]],
     dtype=torch.float64,
 )
+
+# Of 30 x 50 pixels: to both sides, none, all, past the end.
+SPANS = Spans(torch.tensor([[1, 4], [3, 3], [0, 7], [5, 9]]), 8)
 
 FRAME = (1, 800, 704)  # of the U-Net
 CHANNELS = 16
@@ -94,6 +97,8 @@ def cases() -> list[Case]:
         "two parts of few channels": ((1, 6, 203), (2, 17), 3, {}),
         "shuffled": ((2, 8, 11), (16,), 64, {"shuffle": True, "relu": True}),
         "few shuffled": ((1, 7, 6), (4,), 12, {"shuffle": True}),
+        "spans": ((2, 30, 50), (16,), 16, {"spans": True, "plus": True}),
+        "spans, shuffled": ((1, 30, 50), (2, 16), 64, {"spans": True, "shuffle": True}),
     }
     found = [
         case for name, kind in kinds.items() for case in SHORT.cases(name, partial(_short, *kind))
@@ -131,7 +136,8 @@ def _short(
         **({"plus": draw((batch, outputs, height, width), 1)} if how.get("plus") else {}),
     }
     assert _largest(given).max() < 2**24, "numbers that are not short"
-    return given | {name: yes for name, yes in how.items() if name != "plus"}
+    kept = {name: how[name] for name in ("relu", "shuffle") if name in how}
+    return given | kept | ({"spans": SPANS} if how.get("spans") else {})
 
 
 def _long(size: Sequence[int]) -> Given:

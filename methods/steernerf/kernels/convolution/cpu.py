@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from methods.kernels.cpu import LANES, check_float32, f32, multiply
-from methods.steernerf.kernels.convolution import reference
+from methods.steernerf.kernels.convolution import Spans, reference
 
 TILES = 48  # tiles of a row that go together: with 16 channels, their numbers fit the L2 cache
 
@@ -47,12 +47,13 @@ def convolution(
     plus: Tensor | None,
     relu: bool,
     shuffle: bool,
+    spans: Spans | None,
 ) -> Tensor:
     given = [*parts, weight, bias, *([] if plus is None else [plus])]
     learns = torch.is_grad_enabled() and any(x.requires_grad for x in given)
     half = torch.is_autocast_enabled("cpu") or all(x.dtype == torch.bfloat16 for x in parts)
     if learns or half:
-        return reference.convolution(parts, weight, bias, plus, relu, shuffle)
+        return reference.convolution(parts, weight, bias, plus, relu, shuffle, spans)
     check_float32(*given)
     outputs = len(weight)
     together = shuffle and outputs % (4 * LANES) == 0  # a vector goes to one pixel
@@ -64,12 +65,16 @@ def convolution(
     out = torch.empty(batch, 2 * height, 2 * width, outputs // 4) if together else None
     if out is None:
         out = torch.empty(batch, height, width, outputs)
+    if spans is None:
+        unit = 4 * max(1, -(-height // 4))  # one band of all rows
+        spans = Spans(torch.tensor([[0, -(-width // unit)]]), unit)
     channels = [x.shape[3] for x in pictures] + [0] * (2 - len(pictures))
     padded = outputs + -outputs % LANES
     _convolve(
         *_flat(pictures[0], pictures[1] if len(pictures) > 1 else NOTHING),
         *channels,
         *(batch, height, width),
+        *(spans.columns.numpy(), spans.unit // 4),
         *_flat(_transformed(weight, [x.shape[1] for x in parts], channels, padded)),
         *_flat(functional.pad(bias, (0, padded - outputs))),
         *(padded, outputs, relu, plus is not None, together),
@@ -229,21 +234,26 @@ def _finish(typing, source, at, bias, b_at, plus, p_at, adds, relu, target, to):
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _convolve(
-    one, other, c_one, c_other, batch, height, width, weight, bias, padded, outputs, relu, adds,
-    shuffled, plus, out,
+    one, other, c_one, c_other, batch, height, width, columns, unit, weight, bias, padded, outputs,
+    relu, adds, shuffled, plus, out,
 ):  # fmt: skip
-    """All arrays are flat, with channels last. Each strip of four rows is computed by itself."""
+    """Arrays are flat, with channels last; `columns` [bands, 2] are in units of `unit` tiles. Each
+    strip of four rows is computed by itself."""
     down, across = (height + 3) // 4, (width + 3) // 4
-    blocks = (across + TILES - 1) // TILES
-    size = (across + blocks - 1) // blocks
     channels, pixels = c_one + c_other, height * width
     for strip in prange(batch * down):
-        picture, top = strip // down, 4 * (strip % down)
+        picture, top, band = strip // down, 4 * (strip % down), strip % down // unit
+        begin, end = min(columns[band, 0] * unit, across), min(columns[band, 1] * unit, across)
+        _clear(picture, top, height, width, 4 * begin, 4 * end, outputs, shuffled, out)
+        if begin >= end:
+            continue
+        blocks = (end - begin + TILES - 1) // TILES
+        size = (end - begin + blocks - 1) // blocks
         tiles, results = np.empty(36 * size * channels, f32), np.empty(36 * size * padded, f32)
         patch, space = np.zeros(36 * max(c_one, c_other), f32), np.empty(36 * LANES, f32)
         square, none = np.empty(16 * LANES, f32), np.zeros(padded, f32)
-        for first in range(0, across, size):
-            count = min(size, across - first)
+        for first in range(begin, end, size):
+            count = min(size, end - first)
             for t in range(count):
                 left, to = 4 * (first + t), t * channels
                 _tile(one, picture * pixels * c_one, c_one, height, width, top, left,
@@ -276,6 +286,21 @@ def _convolve(
                                     value = square[at + c] + bias[k + c]
                                     value = value + plus[to + c] if adds else value
                                     out[to + c] = f32(0) if relu and value < f32(0) else value
+
+
+@njit(cache=True, error_model="numpy")
+def _clear(picture, top, height, width, begin, end, outputs, shuffled, out):
+    """Write 0 to four rows before the column `begin` and from `end` on."""
+    times = 2 if shuffled else 1  # the result's width and height
+    row, pixel = times * width, outputs // 4 if shuffled else outputs
+    begin, end = min(times * begin, row), min(times * end, row)
+    for y in range(times * top, times * min(top + 4, height)):
+        at = (picture * times * height + y) * row
+        if begin < end:
+            out[at * pixel : (at + begin) * pixel] = f32(0)
+            out[(at + end) * pixel : (at + row) * pixel] = f32(0)
+        else:
+            out[at * pixel : (at + row) * pixel] = f32(0)
 
 
 @njit(cache=True, error_model="numpy")

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
 from torch.nn import functional
+
+from methods.steernerf.kernels.convolution import Spans
 
 
 def convolution(
@@ -15,6 +18,7 @@ def convolution(
     plus: Tensor | None,
     relu: bool,
     shuffle: bool,
+    spans: Spans | None,
 ) -> Tensor:
     """The sum of the convolutions of all `parts`, which are not copied side by side."""
     *weights, last = weight.split([part.shape[1] for part in parts], dim=1)
@@ -23,6 +27,8 @@ def convolution(
         out = functional.conv2d(part, of_part, padding=1) + out
     if plus is not None:
         out = plus + out
+    if spans is not None:
+        out = torch.where(spans.mask(*out.shape[2:]), out, 0)
     if shuffle:
         out = functional.pixel_shuffle(out, 2)
     return out.relu() if relu else out

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from bench.case import uniform
-from methods.steernerf.kernels.convolution import convolution, halved, reference
+from methods.steernerf.kernels.convolution import Spans, convolution, halved, reference
 
 BACKENDS = ("reference", "cpu")
 
@@ -42,6 +42,19 @@ def test_what_follows_a_convolution(backend: str) -> None:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+def test_outside_its_spans_a_picture_is_0(backend: str) -> None:
+    """Of 6 x 9 pixels, in bands and units of 4, of which the last are not whole."""
+    spans = Spans(torch.tensor([[1, 2], [0, 3]]), 4)
+    given = [torch.ones(1, 1, 6, 9)], torch.zeros(1, 1, 3, 3), torch.ones(1)
+    (picture,) = convolution(*given, spans=spans, backend=backend)[0]
+    wanted = torch.zeros(6, 9)
+    wanted[:4, 4:8], wanted[4:] = 1, 1
+    assert torch.equal(picture, wanted)
+    assert torch.equal(spans.mask(6, 9), wanted > 0)
+    assert spans.count(6, 9) == wanted.sum()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_the_largest_of_four_pixels_stays_and_nan_is_larger(backend: str) -> None:
     given = torch.tensor([[1.0, 5, -3, -2], [2, 0, -9, torch.nan]]).view(1, 1, 2, 4)
     ((left, right),) = halved(given, backend=backend)[0, 0].tolist()
@@ -67,7 +80,7 @@ def test_bfloat16_is_computed_by_the_reference() -> None:
     with torch.autocast("cpu", torch.bfloat16):
         found = convolution(*given, backend="cpu")
         assert found.dtype == torch.bfloat16
-        assert torch.equal(found, reference.convolution(*given, None, False, False))
+        assert torch.equal(found, reference.convolution(*given, None, False, False, None))
 
 
 def test_float64_asks_for_the_reference() -> None:
