@@ -187,11 +187,15 @@ def test_a_setting_that_cannot_be_had_is_named(override, said):
 
 @pytest.mark.parametrize(("gpu", "engine"), [(False, "OpenVino"), (True, "TorchEngine")])
 @pytest.mark.parametrize("asked", [[], ["engine=torch"]])
-def test_the_engine_of_the_first_table_is_one_for_the_device(gpu, engine, asked, monkeypatch):
+def test_the_engine_of_the_first_table_is_one_for_device_and_precision(
+    gpu, engine, asked, monkeypatch
+):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
     jobs = plan(TABLES["table1"], asked)
-    targets = {job.config.engine._target_.split(".")[-1] for job in jobs}
+    targets = {job.config.engine._target_.split(".")[-1] for job in jobs if "fp32" not in job.line}
     assert targets == {"TorchEngine" if asked else engine}
+    in_fp32 = {job.config.engine._target_ for job in jobs if "fp32" in job.line}
+    assert in_fp32 == {"methods.engines.torch_engine.TorchEngine"}
     words = with_engine([*asked, "device=auto"])
     assert composed(words).engine._target_.split(".")[-1] in targets
 

@@ -66,19 +66,21 @@ def _off(given: Given) -> Tensor:
     return (10 * channels + 17) * U32 * _largest(given)
 
 
-def _operation(bound: Bound) -> Operation:
-    backends = served(__package__)
-    return Operation(
-        "convolution",
-        backends,
-        lambda given, backend: (convolution(**given, backend=backend),),
-        {"sums": bound},
-    )
+def _signs(generator: torch.Generator, shape: Sequence[int], share: float = 0.05) -> Tensor:
+    """-1 or 1 in a `share` of the places, 0 in the others."""
+    signs = 2.0 * torch.randint(0, 2, tuple(shape), generator=generator) - 1
+    return signs * (torch.rand(tuple(shape), generator=generator) < share)
+
+
+def _convolved(given: Given, backend: str) -> tuple[Tensor, ...]:
+    return (convolution(**given, backend=backend),)
 
 
 EXACT = Bound("short numbers: 0", 0.0)
-SHORT = _operation(EXACT)
-LONG = _operation(Bound("(10 C + 17) u S", _off))
+SHORT = Operation("convolution", served(__package__), _convolved, {"sums": EXACT})
+LONG = Operation(
+    "convolution", served(__package__), _convolved, {"sums": Bound("(10 C + 17) u S", _off)}
+)
 HALVED = Operation(
     "halved",
     served(__package__),
@@ -124,17 +126,13 @@ def _short(
 ) -> Given:
     generator = torch.Generator().manual_seed(outputs)
     batch, height, width = size
-
-    def draw(shape: Sequence[int], share: float) -> Tensor:
-        signs = torch.randint(0, 2, tuple(shape), generator=generator) * 2.0 - 1
-        return signs * (torch.rand(tuple(shape), generator=generator) < share)
-
     given = {
-        "parts": [draw((batch, count, height, width), 0.05) for count in channels],
-        "weight": 24**2 * draw((outputs, sum(channels), 3, 3), 0.5),
-        "bias": draw((outputs,), 1),
-        **({"plus": draw((batch, outputs, height, width), 1)} if how.get("plus") else {}),
+        "parts": [_signs(generator, (batch, count, height, width)) for count in channels],
+        "weight": 24**2 * _signs(generator, (outputs, sum(channels), 3, 3), 0.5),
+        "bias": _signs(generator, (outputs,), 1),
     }
+    if how.get("plus"):
+        given["plus"] = _signs(generator, (batch, outputs, height, width), 1)
     assert _largest(given).max() < 2**24, "numbers that are not short"
     kept = {name: how[name] for name in ("relu", "shuffle") if name in how}
     return given | kept | ({"spans": SPANS} if how.get("spans") else {})

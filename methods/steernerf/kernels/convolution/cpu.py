@@ -25,17 +25,10 @@ from methods.steernerf.kernels.convolution import Spans, reference
 
 TILES = 48  # tiles of a row that go together: with 16 channels, their numbers fit the L2 cache
 
-G = torch.tensor(
-    [
-        [1 / 4, 0, 0],
-        [-1 / 6, -1 / 6, -1 / 6],
-        [-1 / 6, 1 / 6, -1 / 6],
-        [1 / 24, 1 / 12, 1 / 6],
-        [1 / 24, -1 / 12, 1 / 6],
-        [0, 0, 1],
-    ],
-    dtype=torch.float64,
+G24 = torch.tensor(
+    [[6, 0, 0], [-4, -4, -4], [-4, 4, -4], [1, 2, 4], [1, -2, 4], [0, 0, 24]], dtype=torch.float64
 )
+"""24 G, in whole numbers."""
 
 NOTHING = torch.empty(0)
 
@@ -50,31 +43,27 @@ def convolution(
     spans: Spans | None,
 ) -> Tensor:
     given = [*parts, weight, bias, *([] if plus is None else [plus])]
-    learns = torch.is_grad_enabled() and any(x.requires_grad for x in given)
     half = torch.is_autocast_enabled("cpu") or all(x.dtype == torch.bfloat16 for x in parts)
-    if learns or half:
+    if half or _learns(*given):
         return reference.convolution(parts, weight, bias, plus, relu, shuffle, spans)
     check_float32(*given)
-    outputs = len(weight)
+    pictures, outputs = [_last(part) for part in parts], len(weight)
+    batch, height, width, _ = pictures[0].shape
     together = shuffle and outputs % (4 * LANES) == 0  # a vector goes to one pixel
     if together:  # the channels that go to one pixel lie side by side
         weight = weight.view(-1, 4, *weight.shape[1:]).transpose(0, 1).flatten(0, 1)
         bias = bias.view(-1, 4).T.flatten()
-    pictures = [_last(part) for part in parts]
-    batch, height, width, _ = pictures[0].shape
-    out = torch.empty(batch, 2 * height, 2 * width, outputs // 4) if together else None
-    if out is None:
+        out = torch.empty(batch, 2 * height, 2 * width, outputs // 4)
+    else:
         out = torch.empty(batch, height, width, outputs)
     if spans is None:
-        unit = 4 * max(1, -(-height // 4))  # one band of all rows
-        spans = Spans(torch.tensor([[0, -(-width // unit)]]), unit)
+        unit = max(height, width) + -max(height, width) % 4  # one band, of everything
+        spans = Spans(torch.tensor([[0, 1]]), unit)
     channels = [x.shape[3] for x in pictures] + [0] * (2 - len(pictures))
     padded = outputs + -outputs % LANES
     _convolve(
         *_flat(pictures[0], pictures[1] if len(pictures) > 1 else NOTHING),
-        *channels,
-        *(batch, height, width),
-        *(spans.columns.numpy(), spans.unit // 4),
+        *(*channels, batch, height, width, spans.columns.numpy(), spans.unit // 4),
         *_flat(_transformed(weight, [x.shape[1] for x in parts], channels, padded)),
         *_flat(functional.pad(bias, (0, padded - outputs))),
         *(padded, outputs, relu, plus is not None, together),
@@ -85,13 +74,19 @@ def convolution(
 
 
 def halved(pictures: Tensor) -> Tensor:
-    if pictures.dtype != torch.float32 or (torch.is_grad_enabled() and pictures.requires_grad):
+    if pictures.dtype != torch.float32 or _learns(pictures):
         return reference.halved(pictures)
     batch, channels, height, width = pictures.shape
     out = torch.empty(batch, height // 2, width // 2, channels)
     given = pictures.permute(0, 2, 3, 1).contiguous()
     _halve(given.flatten(0, 1).numpy(), out.flatten(0, 1).numpy())
     return out.permute(0, 3, 1, 2)
+
+
+def _learns(*given: Tensor) -> bool:
+    """Whether a gradient is wanted: the reference computes faster what a training needs, as half of
+    its time goes to the gradients of the weights."""
+    return torch.is_grad_enabled() and any(x.requires_grad for x in given)
 
 
 def _last(part: Tensor) -> Tensor:
@@ -105,12 +100,12 @@ def _transformed(
 ) -> Tensor:
     """G g G^T of `weight`, [36, all `channels`, `outputs`]: of the `given` channels of each part,
     and of `outputs` filled up with 0."""
-    both = torch.kron(G, G)  # from 9 to 36
+    both = torch.kron(G24, G24)  # from 9 to 36
     found = weight.new_zeros(len(both), sum(channels), outputs)
     at = 0
     for part, size in zip(weight.split(list(given), dim=1), channels, strict=False):
-        tile = (part.flatten(2).double() @ both.T).permute(2, 1, 0)
-        found[:, at : at + part.shape[1], : len(weight)] = tile
+        tile = (part.reshape(-1, 9).double() @ both.T / 24**2).view(*part.shape[:2], -1)
+        found[:, at : at + part.shape[1], : len(weight)] = tile.permute(2, 1, 0)
         at += size
     return found
 

@@ -63,14 +63,14 @@ def test_the_largest_of_four_pixels_stays_and_nan_is_larger(backend: str) -> Non
 
 
 def test_a_network_that_learns_gets_the_gradients_of_the_reference() -> None:
-    parts = [pictures(1, 4, 5, 6), pictures(1, 3, 5, 6, seed=1)]
-    weight, bias = pictures(8, 7, 3, 3, seed=2), pictures(8, seed=3)
+    parts = [pictures(1, 4, 6, 8), pictures(1, 3, 6, 8, seed=1)]
+    given = [*parts, pictures(8, 7, 3, 3, seed=2), pictures(8, seed=3), pictures(1, 8, 6, 8)]
     found = []
     for backend in BACKENDS:
-        leaves = [x.clone().requires_grad_() for x in (*parts, weight, bias)]
-        one, other, *rest = leaves
-        out = halved(convolution([one, other], *rest, relu=True, backend=backend)[..., :4, :])
-        found.append(torch.autograd.grad(out.square().sum(), leaves))
+        leaves = [x.clone().requires_grad_() for x in given]
+        one, other, weight, bias, plus = leaves
+        out = convolution([one, other], weight, bias, plus=plus, relu=True, backend=backend)
+        found.append(torch.autograd.grad(halved(out, backend=backend).square().sum(), leaves))
     for one, other in zip(*found, strict=True):
         assert torch.equal(one, other)
 
