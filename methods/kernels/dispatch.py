@@ -73,6 +73,12 @@ def refuse_gpu(backend: str, method: str) -> None:
         )
 
 
+def torch_for_gpu(backend: str) -> str:
+    """The backend of a kernel that has no Triton version and that methods with others need: with
+    "gpu", torch computes it."""
+    return "reference" if backend == "gpu" else backend
+
+
 @cache
 def multiplies_bf16(kind: str) -> bool:
     """Whether devices of this kind ("cpu", "cuda") here have products of bfloat16.

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from bench.types import check_shape
-from methods.kernels.dispatch import implementation
+from methods.kernels.dispatch import implementation, torch_for_gpu
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def convolution(
         check_shape("parts", part, len(first), None, *first.shape[2:])
     if plus is not None:
         check_shape("plus", plus, len(first), len(weight), *first.shape[2:])
-    kernel = implementation(__name__, backend, first.device)
+    kernel = implementation(__name__, torch_for_gpu(backend), first.device)
     return kernel.convolution(parts, weight, bias, plus, relu, shuffle, spans)
 
 
@@ -74,4 +74,4 @@ def halved(pictures: Tensor, *, backend: str = "auto") -> Tensor:
     """The maximum of every 2 x 2 pixels of `pictures` [B, C, H, W], of even height and width.
     Differentiable."""
     check_shape("pictures", pictures, None, None, None, None)
-    return implementation(__name__, backend, pictures.device).halved(pictures)
+    return implementation(__name__, torch_for_gpu(backend), pictures.device).halved(pictures)

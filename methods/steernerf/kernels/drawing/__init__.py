@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from bench.types import check_shape
-from methods.kernels.dispatch import implementation
+from methods.kernels.dispatch import implementation, torch_for_gpu
 
 
 def shown(
@@ -67,7 +67,7 @@ def corrected(
 
 
 def _by(backend: str, x: Tensor) -> ModuleType:
-    return implementation(__name__, "reference" if backend == "gpu" else backend, x.device)
+    return implementation(__name__, torch_for_gpu(backend), x.device)
 
 
 class _Shown(torch.autograd.Function):
