@@ -74,4 +74,6 @@ def halved(pictures: Tensor, *, backend: str = "auto") -> Tensor:
     """The maximum of every 2 x 2 pixels of `pictures` [B, C, H, W], of even height and width.
     Differentiable."""
     check_shape("pictures", pictures, None, None, None, None)
+    if any(side % 2 for side in pictures.shape[2:]):
+        raise ValueError(f"pictures: expected even sides, got {tuple(pictures.shape[2:])}")
     return implementation(__name__, torch_for_gpu(backend), pictures.device).halved(pictures)

@@ -8,6 +8,7 @@ lie last and are computed `LANES` at a time.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -29,6 +30,9 @@ G24 = torch.tensor(
     [[6, 0, 0], [-4, -4, -4], [-4, 4, -4], [1, 2, 4], [1, -2, 4], [0, 0, 24]], dtype=torch.float64
 )
 """24 G, in whole numbers."""
+
+GOLDEN = (math.sqrt(5) - 1) / 2
+"""Steps of this share of a row of things visit all parts of it alike."""
 
 NOTHING = torch.empty(0)
 
@@ -236,7 +240,12 @@ def _convolve(
     strip of four rows is computed by itself."""
     down, across = (height + 3) // 4, (width + 3) // 4
     channels, pixels = c_one + c_other, height * width
-    for strip in prange(batch * down):
+    strips = batch * down
+    stride = max(1, int(GOLDEN * strips))
+    while _gcd(stride, strips) > 1:
+        stride += 1
+    for number in prange(strips):  # each thread has its share of all of the picture
+        strip = number * stride % strips
         picture, top, band = strip // down, 4 * (strip % down), strip % down // unit
         begin, end = min(columns[band, 0] * unit, across), min(columns[band, 1] * unit, across)
         _clear(picture, top, height, width, 4 * begin, 4 * end, outputs, shuffled, out)
@@ -281,6 +290,14 @@ def _convolve(
                                     value = square[at + c] + bias[k + c]
                                     value = value + plus[to + c] if adds else value
                                     out[to + c] = f32(0) if relu and value < f32(0) else value
+
+
+@njit(cache=True)
+def _gcd(x, y):
+    """The greatest common divisor."""
+    while y:
+        x, y = y, x % y
+    return x
 
 
 @njit(cache=True, error_model="numpy")
