@@ -85,8 +85,8 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
     Seeds are those in `words`, otherwise the first `tables.seeds`; methods other than the paper's
     use only one of them, but for lines with `every_seed`. Settings that a line lacks are those of
     the experiment. Lines at a precision that the engine lacks are left out. On a GPU the engine is
-    torch, unless `words` choose another. SteerbenchError if a word gives several values to another
-    setting than scene and seed.
+    torch; one that `words` choose is that of all lines. SteerbenchError if a word gives several
+    values to another setting than scene and seed.
     """
     scenes = scenes_of(words, data)
     words, seeds = _taken(words, "seed")
@@ -100,6 +100,7 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
         experiment = composed([*fixed, *first])
     build(experiment, "budget")  # refuses a wrong one before anything runs
     several, beyond = build(experiment, "tables")
+    asked = {"engine"} if any(word.startswith("engine=") for word in words) else set()
     usual = [str(seed) for seed in range(several)]
     precisions = target_of(experiment.engine).precisions
 
@@ -111,7 +112,8 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
     for title, block, line, repeated in _lines(table, beyond):
         if "precision" in line.job and line.job["precision"] not in precisions:
             continue
-        settings = [f"{name}={value}" for name, value in line.job.items()]
+        own_settings = {name: of for name, of in line.job.items() if name not in asked}
+        settings = [f"{name}={value}" for name, value in own_settings.items()]
         groups = [word for word in settings if choices(word.partition("=")[0], fixed)]
         values = [word for word in settings if word not in groups]
         of_line = seeds or (usual if repeated else usual[:1])

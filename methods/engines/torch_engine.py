@@ -56,9 +56,8 @@ class TorchEngine(Engine):
                 return network(*inputs)
 
         size = sum(weight.numel() for weight in network.parameters()) * dtype.itemsize
-        plain = _on_cpu(network)
-        made = run if plain else _recorded(run, network, samples, log)
-        return Built(made, size, dtype, plain)
+        made = run if _on_cpu(network) else _recorded(run, network, samples, log)
+        return Built(made, size, dtype, plain=made is run and dtype == torch.float32)
 
 
 def _on_cpu(network: Network) -> bool:

@@ -92,10 +92,14 @@ class UNet(Renderer2d):
         once = len(observations) == 1 and not torch.is_grad_enabled()
         inputs = _stacked([self._input(o, once) for o in observations]).permute(0, 3, 1, 2)
         height, width = inputs.shape[-2:]
-        self.network.backend, self.network.spans = observations[0].backend, observations[0].spans
+        self.network.backend = observations[0].backend
         if height % DIVISOR or width % DIVISOR:
             inputs = functional.pad(inputs, (0, -width % DIVISOR, 0, -height % DIVISOR))
-        (correction,) = self.run(probe, inputs)  # Eq. 11
+        self.network.spans = observations[0].spans
+        try:
+            (correction,) = self.run(probe, inputs)  # Eq. 11
+        finally:
+            self.network.spans = None  # an engine builds a network that draws everything
         correction = correction[..., :height, :width]
         how, pictures = (self.scale, self.aligned), []
         for o, added in zip(observations, correction.permute(0, 2, 3, 1), strict=True):

@@ -83,7 +83,7 @@ def _waits(words: Sequence[str], frames: int) -> list[Counter[Line]]:
 
 
 def with_engine(words: Sequence[str]) -> list[str]:
-    """`words`, preceded by the fastest engine for the device that they name."""
+    """`words`, preceded by the engine with the most precisions on the device that they name."""
     device = str(composed(words).get("device"))
     return ["engine=torch" if on_gpu(device) else "engine=openvino", *words]
 

@@ -196,6 +196,8 @@ def test_the_engine_of_the_first_table_is_one_for_device_and_precision(
     assert targets == {"TorchEngine" if asked else engine}
     in_fp32 = {job.config.engine._target_ for job in jobs if "fp32" in job.line}
     assert in_fp32 == {"methods.engines.torch_engine.TorchEngine"}
+    every = {job.config.engine._target_ for job in plan(TABLES["table1"], ["engine=openvino"])}
+    assert every == {"methods.engines.openvino_engine.OpenVino"}
     words = with_engine([*asked, "device=auto"])
     assert composed(words).engine._target_.split(".")[-1] in targets
 

@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from bench.cameras import cast, project
 from bench.types import NullProbe
+from methods.engines import readable
 from methods.steernerf.buffer import Buffer, Cloud
 from methods.steernerf.options import RangeReduction
 from methods.steernerf.pipeline import MARGIN, near_matter, spans_near_matter
@@ -195,6 +196,18 @@ def test_far_from_matter_a_picture_is_background_and_near_it_that_of_the_whole()
     # Float32, sums of a few hundred products, in another order where the size is another.
     torch.testing.assert_close(some.rgb[inner], every.rgb[inner], rtol=0, atol=1e-5)
     assert not torch.equal(some.rgb, every.rgb)
+
+
+def test_an_engine_gets_a_network_that_draws_everything() -> None:
+    """Also after a frame that left out what is far from matter."""
+    camera, pipeline = replace(CAMERA, width=400, height=400, cx=200.0, cy=200.0), new_pipeline()
+    network = pipeline.renderer.network
+    inputs = torch.rand(1, network.first.in_channels, 400, 400)
+    with torch.no_grad():
+        (before,) = readable(network)(inputs)
+        pipeline.render(camera, Buffer(maxlen=2), USUAL, NullProbe())
+        (after,) = readable(network)(inputs)
+    assert torch.equal(before, after)
 
 
 def test_drawing_less_is_less_work() -> None:

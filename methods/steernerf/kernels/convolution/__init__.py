@@ -66,6 +66,13 @@ def convolution(
         check_shape("parts", part, len(first), None, *first.shape[2:])
     if plus is not None:
         check_shape("plus", plus, len(first), len(weight), *first.shape[2:])
+    if spans is not None:
+        bands = len(spans.columns)
+        if spans.unit % 4 or bands * spans.unit < first.shape[2]:
+            raise ValueError(
+                f"spans: expected a unit of a multiple of 4 pixels, and bands of {first.shape[2]} "
+                f"rows in all, got {bands} of {spans.unit}"
+            )
     kernel = implementation(__name__, torch_for_gpu(backend), first.device)
     return kernel.convolution(parts, weight, bias, plus, relu, shuffle, spans)
 

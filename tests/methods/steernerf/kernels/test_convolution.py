@@ -83,6 +83,13 @@ def test_bfloat16_is_computed_by_the_reference() -> None:
         assert torch.equal(found, reference.convolution(*given, None, False, False, None))
 
 
+@pytest.mark.parametrize(("bands", "unit"), [(1, 4), (2, 6)])
+def test_spans_of_too_few_rows_or_of_parts_of_tiles_are_refused(bands: int, unit: int) -> None:
+    given = [pictures(1, 16, 8, 8)], pictures(16, 16, 3, 3), pictures(16)
+    with pytest.raises(ValueError, match=f"bands of 8 rows in all, got {bands} of {unit}"):
+        convolution(*given, spans=Spans(torch.zeros(bands, 2, dtype=torch.int64), unit))
+
+
 def test_float64_asks_for_the_reference() -> None:
     given = [pictures(1, 16, 8, 8).double()], pictures(16, 16, 3, 3).double(), pictures(16).double()
     with pytest.raises(ValueError, match="use backend='reference'"):
