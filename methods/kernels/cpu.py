@@ -83,6 +83,11 @@ def arrays(*tensors: Tensor) -> list[np.ndarray]:
     return [tensor.detach().contiguous().numpy() for tensor in tensors]
 
 
+def flat(*tensors: Tensor) -> list[np.ndarray]:
+    """As `arrays`, each in one dimension."""
+    return [array.reshape(-1) for array in arrays(*tensors)]
+
+
 @njit(cache=True, error_model="numpy")
 def exp(x):
     """e^x of a float32 to 3 u, for -87 <= x <= 87, and beyond that of the nearer end; NaN of NaN.

@@ -15,7 +15,7 @@ from numba import njit, prange
 from torch import Tensor
 from torch.nn import functional
 
-from methods.kernels.cpu import LANES, check_float32, f32, multiply, u64
+from methods.kernels.cpu import LANES, check_float32, f32, flat, multiply, u64
 from methods.kernels.mlp.reference import layer_by_layer
 
 DEEP = 96  # samples whose activations, with 64 channels, stay in the first-level cache
@@ -52,8 +52,8 @@ def _outputs(
     widths = [left.shape[1] + right.shape[1], *map(len, weights)]
     kept = torch.empty(len(left) * sum(map(_padded, widths[1:-1])) if learning else 0)
     out = torch.empty(len(left), widths[-1])
-    given, joined = _flat(left, right), _flat(_joined(weights, turned=False))
-    _forward(*given, left.shape[1], *joined, *_sizes(widths), *_flat(kept, out))
+    given, joined = flat(left, right), flat(_joined(weights, turned=False))
+    _forward(*given, left.shape[1], *joined, *_sizes(widths), *flat(kept, out))
     return out, kept
 
 
@@ -72,8 +72,8 @@ class _Network(torch.autograd.Function):
         of_weights = torch.zeros(CHUNKS, len(turned))
         wanted = any(ctx.needs_input_grad[:2])
         of_inputs = [x.new_empty(x.shape if wanted else 0) for x in (left, right)]
-        given, results = _flat(left, right), [*_flat(kept, grad, *of_inputs), of_weights.numpy()]
-        _backward(*given, left.shape[1], *_flat(turned), *_sizes(widths), *results)
+        given, results = flat(left, right), [*flat(kept, grad, *of_inputs), of_weights.numpy()]
+        _backward(*given, left.shape[1], *flat(turned), *_sizes(widths), *results)
         shapes = [(_padded(i), _padded(o)) for i, o in pairwise(widths)]
         parts = of_weights.sum(dim=0).split([i * o for i, o in shapes])
         of_layers = [
@@ -125,10 +125,6 @@ def _joined(weights: Sequence[Tensor], *, turned: bool) -> Tensor:
         full = functional.pad(layer.detach(), (0, -inputs % LANES, 0, -outputs % LANES))
         parts.append((full if turned else full.T).reshape(-1))
     return torch.cat(parts)
-
-
-def _flat(*tensors: Tensor) -> list[np.ndarray]:
-    return [tensor.detach().contiguous().view(-1).numpy() for tensor in tensors]
 
 
 @njit(cache=True, parallel=True)

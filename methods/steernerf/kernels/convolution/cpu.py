@@ -21,7 +21,7 @@ from numba.np.arrayobj import make_array
 from torch import Tensor
 from torch.nn import functional
 
-from methods.kernels.cpu import LANES, check_float32, f32, multiply
+from methods.kernels.cpu import LANES, check_float32, f32, flat, multiply
 from methods.steernerf.kernels.convolution import Spans, reference
 
 TILES = 48  # tiles of a row that go together: with 16 channels, their numbers fit the L2 cache
@@ -66,12 +66,13 @@ def convolution(
     channels = [x.shape[3] for x in pictures] + [0] * (2 - len(pictures))
     padded = outputs + -outputs % LANES
     _convolve(
-        *_flat(pictures[0], pictures[1] if len(pictures) > 1 else NOTHING),
-        *(*channels, batch, height, width, spans.columns.numpy(), spans.unit // 4),
-        *_flat(_transformed(weight, [x.shape[1] for x in parts], channels, padded)),
-        *_flat(functional.pad(bias, (0, padded - outputs))),
+        *flat(pictures[0], pictures[1] if len(pictures) > 1 else NOTHING),
+        *(*channels, batch, height, width, _stride(batch * -(-height // 4))),
+        *(spans.columns.numpy(), spans.unit // 4),
+        *flat(_transformed(weight, [x.shape[1] for x in parts], channels, padded)),
+        *flat(functional.pad(bias, (0, padded - outputs))),
         *(padded, outputs, relu, plus is not None, together),
-        *_flat(NOTHING if plus is None else plus.permute(0, 2, 3, 1), out),
+        *flat(NOTHING if plus is None else plus.permute(0, 2, 3, 1), out),
     )
     result = out.permute(0, 3, 1, 2)
     return functional.pixel_shuffle(result, 2) if shuffle and not together else result
@@ -93,6 +94,15 @@ def _learns(*given: Tensor) -> bool:
     return torch.is_grad_enabled() and any(x.requires_grad for x in given)
 
 
+def _stride(strips: int) -> int:
+    """A step through `strips` that meets each once, and gives each thread its share of narrow and
+    wide ones."""
+    stride = max(1, int(GOLDEN * strips))
+    while math.gcd(stride, strips) > 1:
+        stride += 1
+    return stride
+
+
 def _last(part: Tensor) -> Tensor:
     """`part` [B, C, H, W] with the channels last and, at least, `LANES` of them."""
     missing, part = LANES - part.shape[1], part.permute(0, 2, 3, 1)
@@ -112,10 +122,6 @@ def _transformed(
         found[:, at : at + part.shape[1], : len(weight)] = tile.permute(2, 1, 0)
         at += size
     return found
-
-
-def _flat(*tensors: Tensor) -> list[np.ndarray]:
-    return [tensor.detach().contiguous().view(-1).numpy() for tensor in tensors]
 
 
 class _Lanes:
@@ -233,19 +239,15 @@ def _finish(typing, source, at, bias, b_at, plus, p_at, adds, relu, target, to):
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _convolve(
-    one, other, c_one, c_other, batch, height, width, columns, unit, weight, bias, padded, outputs,
-    relu, adds, shuffled, plus, out,
+    one, other, c_one, c_other, batch, height, width, stride, columns, unit, weight, bias, padded,
+    outputs, relu, adds, shuffled, plus, out,
 ):  # fmt: skip
     """Arrays are flat, with channels last; `columns` [bands, 2] are in units of `unit` tiles. Each
-    strip of four rows is computed by itself."""
+    strip of four rows is computed by itself, `stride` strips after the one before."""
     down, across = (height + 3) // 4, (width + 3) // 4
     channels, pixels = c_one + c_other, height * width
-    strips = batch * down
-    stride = max(1, int(GOLDEN * strips))
-    while _gcd(stride, strips) > 1:
-        stride += 1
-    for number in prange(strips):  # each thread has its share of all of the picture
-        strip = number * stride % strips
+    for number in prange(batch * down):
+        strip = number * stride % (batch * down)
         picture, top, band = strip // down, 4 * (strip % down), strip % down // unit
         begin, end = min(columns[band, 0] * unit, across), min(columns[band, 1] * unit, across)
         _clear(picture, top, height, width, 4 * begin, 4 * end, outputs, shuffled, out)
@@ -290,14 +292,6 @@ def _convolve(
                                     value = square[at + c] + bias[k + c]
                                     value = value + plus[to + c] if adds else value
                                     out[to + c] = f32(0) if relu and value < f32(0) else value
-
-
-@njit(cache=True)
-def _gcd(x, y):
-    """The greatest common divisor."""
-    while y:
-        x, y = y, x % y
-    return x
 
 
 @njit(cache=True, error_model="numpy")
