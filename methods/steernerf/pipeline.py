@@ -19,7 +19,7 @@ from methods.kernels.types import Occupancy
 from methods.rendering.compaction import compacts
 from methods.rendering.frame import FeatureFrame, everywhere, render_frame
 from methods.steernerf.buffer import Buffer, Cloud, Points, reproject
-from methods.steernerf.kernels.convolution import Spans
+from methods.steernerf.kernels.spans import Spans
 from methods.steernerf.options import Model, Rendering
 from methods.steernerf.unet import WHOLE, Observation, Part, Renderer2d
 

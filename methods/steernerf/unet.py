@@ -16,8 +16,9 @@ from methods.engines.network import Built, Network
 from methods.kernels.types import expect
 from methods.rendering.frame import FeatureFrame
 from methods.steernerf.buffer import Points
-from methods.steernerf.kernels.convolution import Spans, convolution, halved
+from methods.steernerf.kernels.convolution import convolution, halved
 from methods.steernerf.kernels.drawing import corrected, shown
+from methods.steernerf.kernels.spans import Spans
 
 UNWATCHED = NullProbe()
 
@@ -87,8 +88,8 @@ class UNet(Renderer2d):
         *,
         clip: bool = False,
     ) -> Tensor:
-        """Draw all observations, whose parts have one size: pictures [B, H, W, 3], `clip`ped to
-        [0, 1]. Beyond its part, and the spans of the first one, a picture is its base."""
+        """Draw all observations, which have one size and the same spans: pictures [B, H, W, 3],
+        `clip`ped to [0, 1]. Beyond its part and its spans, a picture is its base."""
         once = len(observations) == 1 and not torch.is_grad_enabled()
         inputs = _stacked([self._input(o, once) for o in observations]).permute(0, 3, 1, 2)
         height, width = inputs.shape[-2:]
@@ -101,11 +102,13 @@ class UNet(Renderer2d):
         finally:
             self.network.spans = None  # an engine builds a network that draws everything
         correction = correction[..., :height, :width]
-        how, pictures = (self.scale, self.aligned), []
+        pictures = []
         for o, added in zip(observations, correction.permute(0, 2, 3, 1), strict=True):
             rgb, (top, left) = o.frame.values[..., :3], (side.start or 0 for side in o.part)
             corner = self.scale * top, self.scale * left
-            pictures.append(corrected(rgb, added, corner, *how, clip=clip, backend=o.backend))
+            given = rgb, added, corner, self.scale, self.aligned
+            picture = corrected(*given, clip=clip, spans=o.spans, backend=o.backend)
+            pictures.append(picture)
         return _stacked(pictures)
 
     def _input(self, observation: Observation, once: bool) -> Tensor:
@@ -117,9 +120,9 @@ class UNet(Renderer2d):
             dtype = self.engine.dtype
         elif torch.is_autocast_enabled(kind):
             dtype = torch.get_autocast_dtype(kind)
-        given = o.frame.values[o.part], o.preceding.values, o.preceding.index
+        given = o.frame.values[o.part], o.preceding.values, o.preceding.index, self.frames
         memory = self._memory if once else None
-        canvas = shown(*given, self.frames, dtype=dtype, memory=memory, backend=o.backend)
+        canvas = shown(*given, dtype=dtype, memory=memory, spans=o.spans, backend=o.backend)
         if once and canvas.data_ptr() != self._memory.data_ptr():
             self._memory = canvas.view(-1)
         return canvas
@@ -128,7 +131,7 @@ class UNet(Renderer2d):
 class _Network(Network):
     """The layers of `ReconstructionNet_v4`, with `width` channels at full resolution."""
 
-    spans: Spans | None = None  # of its pictures; outside, every layer gives 0
+    spans: Spans | None = None  # of its pictures
 
     def __init__(self, inputs: int, width: int) -> None:
         super().__init__()
@@ -146,14 +149,11 @@ class _Network(Network):
 
     def forward(self, inputs: Tensor) -> tuple[Tensor]:
         """[B, C, H, W] to [B, 3, H, W]; H and W are multiples of `DIVISOR`."""
-        at_full, at_half, at_quarter = (
-            {"backend": self.backend, "spans": self.spans and self.spans.at(size)}
-            for size in (1, 2, 4)
-        )
+        at_full, at_half, at_quarter = (self._at(size) for size in (1, 2, 4))
         full = _drawn(self.first, inputs, **at_full)
         full = _drawn(self.enter, full, relu=True, **at_full)
-        half = self.at_half(halved(full, backend=self.backend), at_half)
-        quarter = halved(half, backend=self.backend)
+        half = self.at_half(halved(full, **at_full), at_half)
+        quarter = halved(half, **at_half)
         quarter = _drawn(self.narrow, quarter, relu=True, **at_quarter)
         for block in self.at_quarter:
             quarter = block(quarter, at_quarter)
@@ -164,6 +164,10 @@ class _Network(Network):
         merged = _drawn(self.merge_full, wide, full, relu=True, **at_full)
         merged = _drawn(self.leave, merged, relu=True, **at_full)
         return (_drawn(self.last, merged, **at_full),)
+
+    def _at(self, size: int) -> dict[str, Any]:
+        """How a picture that is 1 / `size` as wide and high is computed."""
+        return {"backend": self.backend, "spans": self.spans and self.spans.at(size)}
 
     def products(self, *inputs: Tensor) -> int:
         """Multiplications by weights, as a plain convolution does them: every kernel counts once

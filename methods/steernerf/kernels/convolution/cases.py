@@ -7,6 +7,7 @@ Most have short whole numbers, of which the fast algorithm rounds none: weights 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -15,7 +16,8 @@ from torch.nn import functional
 
 from bench.case import U32, Bound, Case, Given, Operation, uniform
 from methods.kernels.dispatch import served
-from methods.steernerf.kernels.convolution import Spans, convolution, halved
+from methods.steernerf.kernels.convolution import convolution, halved
+from methods.steernerf.kernels.spans import Spans
 
 # B^T, 24 G and A^T of Lavin & Gray 2016, Section 4.3, without signs.
 B_T = torch.tensor(
@@ -73,7 +75,13 @@ def _signs(generator: torch.Generator, shape: Sequence[int], share: float = 0.05
 
 
 def _convolved(given: Given, backend: str) -> tuple[Tensor, ...]:
-    return (convolution(**given, backend=backend),)
+    """The result, 0 where it is undefined."""
+    out, spans = convolution(**given, backend=backend), given.get("spans")
+    if spans is None:
+        return (out,)
+    times = 2 if given.get("shuffle") else 1
+    enlarged = replace(spans, unit=times * spans.unit)
+    return (torch.where(enlarged.mask(*out.shape[2:]), out, 0),)
 
 
 EXACT = Bound("short numbers: 0", 0.0)

@@ -22,7 +22,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from methods.kernels.cpu import LANES, check_float32, f32, flat, multiply
-from methods.steernerf.kernels.convolution import Spans, reference
+from methods.steernerf.kernels.convolution import reference
+from methods.steernerf.kernels.spans import Spans, ends
 
 TILES = 48  # tiles of a row that go together: with 16 channels, their numbers fit the L2 cache
 
@@ -60,15 +61,12 @@ def convolution(
         out = torch.empty(batch, 2 * height, 2 * width, outputs // 4)
     else:
         out = torch.empty(batch, height, width, outputs)
-    if spans is None:
-        unit = max(height, width) + -max(height, width) % 4  # one band, of everything
-        spans = Spans(torch.tensor([[0, 1]]), unit)
     channels = [x.shape[3] for x in pictures] + [0] * (2 - len(pictures))
     padded = outputs + -outputs % LANES
     _convolve(
         *flat(pictures[0], pictures[1] if len(pictures) > 1 else NOTHING),
         *(*channels, batch, height, width, _stride(batch * -(-height // 4))),
-        *(spans.columns.numpy(), spans.unit // 4),
+        ends(spans, height, width).numpy(),
         *flat(_transformed(weight, [x.shape[1] for x in parts], channels, padded)),
         *flat(functional.pad(bias, (0, padded - outputs))),
         *(padded, outputs, relu, plus is not None, together),
@@ -78,13 +76,14 @@ def convolution(
     return functional.pixel_shuffle(result, 2) if shuffle and not together else result
 
 
-def halved(pictures: Tensor) -> Tensor:
+def halved(pictures: Tensor, spans: Spans | None) -> Tensor:
     if pictures.dtype != torch.float32 or _learns(pictures):
-        return reference.halved(pictures)
+        return reference.halved(pictures, spans)
     batch, channels, height, width = pictures.shape
     out = torch.empty(batch, height // 2, width // 2, channels)
     given = pictures.permute(0, 2, 3, 1).contiguous()
-    _halve(given.flatten(0, 1).numpy(), out.flatten(0, 1).numpy())
+    of_rows = ends(spans, height, width).numpy()
+    _halve(given.flatten(0, 1).numpy(), out.flatten(0, 1).numpy(), of_rows)
     return out.permute(0, 3, 1, 2)
 
 
@@ -114,12 +113,12 @@ def _transformed(
 ) -> Tensor:
     """G g G^T of `weight`, [36, all `channels`, `outputs`]: of the `given` channels of each part,
     and of `outputs` filled up with 0."""
-    both = torch.kron(G24, G24)  # from 9 to 36
+    both = torch.kron(G24, G24) / 24**2  # [36, 9]
     found = weight.new_zeros(len(both), sum(channels), outputs)
     at = 0
     for part, size in zip(weight.split(list(given), dim=1), channels, strict=False):
-        tile = (part.reshape(-1, 9).double() @ both.T / 24**2).view(*part.shape[:2], -1)
-        found[:, at : at + part.shape[1], : len(weight)] = tile.permute(2, 1, 0)
+        taps = part.double().permute(2, 3, 1, 0).reshape(9, -1)
+        found[:, at : at + part.shape[1], : len(weight)] = (both @ taps).view(36, -1, len(weight))
         at += size
     return found
 
@@ -239,18 +238,16 @@ def _finish(typing, source, at, bias, b_at, plus, p_at, adds, relu, target, to):
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _convolve(
-    one, other, c_one, c_other, batch, height, width, stride, columns, unit, weight, bias, padded,
-    outputs, relu, adds, shuffled, plus, out,
+    one, other, c_one, c_other, batch, height, width, stride, ends, weight, bias, padded, outputs,
+    relu, adds, shuffled, plus, out,
 ):  # fmt: skip
-    """Arrays are flat, with channels last; `columns` [bands, 2] are in units of `unit` tiles. Each
-    strip of four rows is computed by itself, `stride` strips after the one before."""
-    down, across = (height + 3) // 4, (width + 3) // 4
-    channels, pixels = c_one + c_other, height * width
+    """Arrays are flat, with channels last; `ends` are of rows. Each strip of four rows is computed
+    by itself, `stride` strips after the one before."""
+    down, channels, pixels = (height + 3) // 4, c_one + c_other, height * width
     for number in prange(batch * down):
         strip = number * stride % (batch * down)
-        picture, top, band = strip // down, 4 * (strip % down), strip % down // unit
-        begin, end = min(columns[band, 0] * unit, across), min(columns[band, 1] * unit, across)
-        _clear(picture, top, height, width, 4 * begin, 4 * end, outputs, shuffled, out)
+        picture, top = strip // down, 4 * (strip % down)
+        begin, end = ends[top, 0] // 4, (ends[top, 1] + 3) // 4
         if begin >= end:
             continue
         blocks = (end - begin + TILES - 1) // TILES
@@ -262,9 +259,9 @@ def _convolve(
             count = min(size, end - first)
             for t in range(count):
                 left, to = 4 * (first + t), t * channels
-                _tile(one, picture * pixels * c_one, c_one, height, width, top, left,
+                _tile(one, picture * pixels * c_one, c_one, height, width, top, left, ends,
                       patch, space, tiles, to, count * channels)  # fmt: skip
-                _tile(other, picture * pixels * c_other, c_other, height, width, top, left,
+                _tile(other, picture * pixels * c_other, c_other, height, width, top, left, ends,
                       patch, space, tiles, to + c_one, count * channels)  # fmt: skip
             for n in range(36):
                 here = n * count
@@ -295,34 +292,23 @@ def _convolve(
 
 
 @njit(cache=True, error_model="numpy")
-def _clear(picture, top, height, width, begin, end, outputs, shuffled, out):
-    """Write 0 to four rows before the column `begin` and from `end` on."""
-    times = 2 if shuffled else 1  # the result's width and height
-    row, pixel = times * width, outputs // 4 if shuffled else outputs
-    begin, end = min(times * begin, row), min(times * end, row)
-    for y in range(times * top, times * min(top + 4, height)):
-        at = (picture * times * height + y) * row
-        if begin < end:
-            out[at * pixel : (at + begin) * pixel] = f32(0)
-            out[(at + end) * pixel : (at + row) * pixel] = f32(0)
-        else:
-            out[at * pixel : (at + row) * pixel] = f32(0)
-
-
-@njit(cache=True, error_model="numpy")
 def _tile(
-    source, start, channels, height, width, top, left, patch, space, tiles, to, step
+    source, start, channels, height, width, top, left, ends, patch, space, tiles, to, step
 ):  # fmt: skip
     """B^T d B of the 6 x 6 pixels around the 4 x 4 from `top`, `left` on, into 36 places of `tiles`
-    that are `step` apart."""
+    that are `step` apart. Pixels beyond the `ends` of their row count as 0."""
     if channels == 0:
         return
     top, left = top - 1, left - 1
     at, row = start + (top * width + left) * channels, width * channels
-    if top < 0 or left < 0 or top + 6 > height or left + 6 > width:
+    inside = top >= 0 and top + 6 <= height
+    for y in range(max(top, 0), min(top + 6, height)):
+        inside = inside and ends[y, 0] <= left and left + 6 <= ends[y, 1]
+    if not inside:
         for i in range(6):
+            y = min(max(top + i, 0), height - 1)
             for j in range(6):
-                there = 0 <= top + i < height and 0 <= left + j < width
+                there = y == top + i and ends[y, 0] <= left + j < ends[y, 1]
                 for c in range(channels):
                     seen = source[at + i * row + j * channels + c] if there else f32(0)
                     patch[(6 * i + j) * channels + c] = seen
@@ -347,12 +333,13 @@ def _pixels(results, at, step, space, square):
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def _halve(given, out):
-    """`given` [rows, W, C] with the rows of all pictures, an even number in each."""
-    _, width, channels = out.shape
+def _halve(given, out, ends):
+    """`given` [rows, W, C] with the rows of all pictures, an even number in each; `ends` are of the
+    rows of one."""
     for y in prange(len(out)):
-        for x in range(width):
-            for c in range(channels):
+        first, end = ends[2 * y % len(ends)]
+        for x in range(first // 2, end // 2):
+            for c in range(out.shape[2]):
                 above = _larger(given[2 * y, 2 * x, c], given[2 * y, 2 * x + 1, c])
                 below = _larger(given[2 * y + 1, 2 * x, c], given[2 * y + 1, 2 * x + 1, c])
                 out[y, x, c] = _larger(above, below)

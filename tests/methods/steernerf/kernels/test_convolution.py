@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from bench.case import uniform
-from methods.steernerf.kernels.convolution import Spans, convolution, halved, reference
+from methods.steernerf.kernels.convolution import convolution, halved, reference
+from methods.steernerf.kernels.spans import Spans
 
 BACKENDS = ("reference", "cpu")
 
@@ -42,16 +43,18 @@ def test_what_follows_a_convolution(backend: str) -> None:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_outside_its_spans_a_picture_is_0(backend: str) -> None:
-    """Of 6 x 9 pixels, in bands and units of 4, of which the last are not whole."""
-    spans = Spans(torch.tensor([[1, 2], [0, 3]]), 4)
-    given = [torch.ones(1, 1, 6, 9)], torch.zeros(1, 1, 3, 3), torch.ones(1)
-    (picture,) = convolution(*given, spans=spans, backend=backend)[0]
-    wanted = torch.zeros(6, 9)
-    wanted[:4, 4:8], wanted[4:] = 1, 1
-    assert torch.equal(picture, wanted)
-    assert torch.equal(spans.mask(6, 9), wanted > 0)
-    assert spans.count(6, 9) == wanted.sum()
+def test_pixels_outside_the_spans_count_as_0_whatever_they_are(backend: str) -> None:
+    """Of 20 x 28 pixels, in bands and units of 8, of which the last are not whole."""
+    spans = Spans(torch.tensor([[1, 3], [0, 2], [3, 9]]), 8)
+    mask, given = spans.mask(20, 28), pictures(1, 16, 20, 28)
+    weight, bias = pictures(16, 16, 3, 3, seed=1), pictures(16, seed=2)
+    unknown, zero = (torch.where(mask, given, other) for other in (torch.nan, 0.0))
+    wanted = convolution([zero], weight, bias, backend=backend)
+    found = convolution([unknown], weight, bias, spans=spans, backend=backend)
+    assert torch.equal(found[..., mask], wanted[..., mask])
+    smaller, wanted = spans.at(2).mask(10, 14), halved(zero, backend=backend)
+    found = halved(unknown, spans=spans, backend=backend)
+    assert torch.equal(found[..., smaller], wanted[..., smaller])
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -81,13 +84,6 @@ def test_bfloat16_is_computed_by_the_reference() -> None:
         found = convolution(*given, backend="cpu")
         assert found.dtype == torch.bfloat16
         assert torch.equal(found, reference.convolution(*given, None, False, False, None))
-
-
-@pytest.mark.parametrize(("bands", "unit"), [(1, 4), (2, 6)])
-def test_spans_of_too_few_rows_or_of_parts_of_tiles_are_refused(bands: int, unit: int) -> None:
-    given = [pictures(1, 16, 8, 8)], pictures(16, 16, 3, 3), pictures(16)
-    with pytest.raises(ValueError, match=f"bands of 8 rows in all, got {bands} of {unit}"):
-        convolution(*given, spans=Spans(torch.zeros(bands, 2, dtype=torch.int64), unit))
 
 
 def test_float64_asks_for_the_reference() -> None:
