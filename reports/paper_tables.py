@@ -260,12 +260,18 @@ def section(
 def _block(
     table: PaperTable, measured: Mapping[str, Repeated], said: Collection[str]
 ) -> list[str | Table]:
-    """What was measured, under which conditions; distances, here and in the paper; notes."""
+    """What was measured, under which conditions; distances, here and in the paper; notes.
+
+    All figures are shown where lines are methods, or where there are no distances.
+    """
     runs = [run for line in table.measured(measured) for run in line.runs]
     facts = {name: value for name, value in conditions(runs).items() if name not in said}
     where = ", ".join(f"{name} {value}" for name, value in facts.items()) if runs else ""
-    parts: list[str | Table] = [where and f"Measured: {where}.", figure_table(table, measured)]
-    if any(line.published for line in table.lines):
+    published = any(line.published for line in table.lines)
+    parts: list[str | Table] = [where and f"Measured: {where}."]
+    if not published or any(METHOD in line.job for line in table.lines):
+        parts.append(figure_table(table, measured))
+    if published:
         parts += [f"Paper: {table.published_on}.", distance_table(table, measured)]
     notes = dict.fromkeys((*table.notes, *missing_figures(runs)))
     return [part for part in (*parts, "\n".join(f"- {note}" for note in notes)) if part]
@@ -292,11 +298,11 @@ def figure_table(table: PaperTable, measured: Mapping[str, Repeated]) -> Table:
 
 
 def distance_table(table: PaperTable, measured: Mapping[str, Repeated]) -> Table:
-    """How far each line is from the table's reference, here and in the paper, by metric."""
+    """The figures of the table's reference, then how far each line is from it, here and in the
+    paper, by metric."""
     known = {line.label: line for line in table.lines}
     reference = known[table.reference or table.lines[0].label]
     others = [line for line in table.lines if line is not reference]
-    metrics = [x for x in table.metrics if any(x in line.published for line in others)]
     runs = dict(zip(known, table.measured(measured), strict=True))
 
     def cell(line: Line, metric: str) -> str:
@@ -305,12 +311,17 @@ def distance_table(table: PaperTable, measured: Mapping[str, Repeated]) -> Table
         texts = told(metric, here.by), told(metric, apart(metric, *figures))
         return "{} ({})".format(*texts).removesuffix(f" ({ABSENT})")
 
-    columns = {metric: [cell(line, metric) for line in others] for metric in metrics}
-    columns = {metric: cells for metric, cells in columns.items() if {*cells} != {ABSENT}}
-    heads = [metric_format(metric)[0].rstrip(" ↑↓") for metric in columns]
-    names = (table.name_of(line) for line in others)
-    against = f'here (paper), relative to "{table.name_of(reference)}"'
-    return Table("Distances", (against, *heads), tuple(zip(names, *columns.values(), strict=True)))
+    columns = {metric: [cell(line, metric) for line in others] for metric in table.metrics}
+    columns = {
+        metric: [written(runs[reference.label], metric) or ABSENT, *cells]
+        for metric, cells in columns.items()
+        if {*cells} != {ABSENT}
+    }
+    heads = ("here (paper)", *(metric_format(metric)[0] for metric in columns))
+    lines = reference, *others
+    names = [": ".join((table.name_of(line), *runs[line.label].gaps)) for line in lines]
+    cells = tuple(zip(names, *columns.values(), strict=True))
+    return Table("Distances", heads, cells, sources=tuple(runs[x.label].keys for x in lines))
 
 
 def _scenes(metrics: Sequence[str], lines: Sequence[Repeated]) -> Table:

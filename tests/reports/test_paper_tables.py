@@ -164,9 +164,10 @@ def test_a_section_shows_both_blocks_and_distances_of_the_first(run, tmp_path):
     paper, beyond = text.split("### Beyond the paper: steernerf_lean")
     assert "(steernerf_lean)" not in text  # the heading says it
     assert "| with joint training | " in beyond
-    assert paper.count("| measured |") == beyond.count("| measured |") == 1
-    head = '| here (paper), relative to "without joint training" | PSNR, dB | SSIM | LPIPS vgg |'
-    assert head in paper
+    assert beyond.count("| measured |") == 1
+    assert "| measured |" not in paper  # its lines are no methods
+    assert "| here (paper) | PSNR, dB ↑ | SSIM ↑ | LPIPS vgg ↓ |" in paper
+    assert "| without joint training | 30.46 |" in paper
     assert "| with joint training | +0.00 (+1.07) |" in paper
     assert "here (paper)" not in beyond
 
@@ -180,11 +181,13 @@ def test_a_cell_has_the_distance_to_the_reference_here_and_in_the_paper(run):
     published = {"psnr": 30.0, "frame_ms": 1.2 * 9.98, "size_bytes.total": 5e6}
     lines = [TABLE.lines[0], replace(TABLE.lines[1], published=published)]
     table = replace(TABLE, reference="here", lines=lines)
-    (line,) = distance_table(table, measured).lines
-    assert line == ("elsewhere", "-1.46 (-1.00)", "×0.50 (×1.20)")
-    (line,) = distance_table(table, {}).lines
+    first, line = distance_table(table, measured).lines
+    assert first == ("here", "30.46", "12.0", "8.00")
+    assert line == ("elsewhere", "-1.46 (-1.00)", "×0.50 (×1.20)", "×1.00")
+    first, line = distance_table(table, {}).lines
+    assert first == ("here", ABSENT, ABSENT)
     assert line == ("elsewhere", f"{ABSENT} (-1.00)", f"{ABSENT} (×1.20)")
-    heads = ('here (paper), relative to "here"', "PSNR, dB", "ms / frame")  # no size has a distance
+    heads = ("here (paper)", "PSNR, dB ↑", "ms / frame ↓")  # no size has a distance
     assert distance_table(table, {}).columns == heads
 
 
