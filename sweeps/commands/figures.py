@@ -197,8 +197,8 @@ def _region(
         if part == "bold":  # where all lines are, none stands out
             kept = [re.sub(r"\*\*(.*?)\*\*", r"\1", x, count=1) for x in kept]
         rows = _of_columns([head, rule, *kept], columns)
-        if rows == [head, rule, *lines]:
-            return table[0]
+        if rows == _of_columns([head, rule, *lines], ()):
+            return "\n".join(rows)
         few = f"{len(kept)} of {len(lines)} lines; all" if len(kept) < len(lines) else "All columns"
         return "\n".join([*rows, "", f"{few}: [{name}.csv]({to_results / name}.csv)."])
 
@@ -214,15 +214,13 @@ def _region(
 
 
 def _of_columns(rows: Sequence[str], wanted: Sequence[str]) -> list[str]:
-    """The `rows` of a table with the `wanted` columns alone; none: all."""
-    if not wanted:
-        return [*rows]
-    cells = [CELL.split(row)[1:-1] for row in rows]
-    names = [UNIT.split(cell.strip())[0] for cell in cells[0]]
+    """The `rows` of a table with the `wanted` columns alone, none: all; no space beside bars."""
+    cells = [[cell.strip() for cell in CELL.split(row)[1:-1]] for row in rows]
+    names = [UNIT.split(cell)[0] for cell in cells[0]]
     for name in wanted:
         if name not in names:
             raise unknown("column", name, names)
-    chosen = [names.index(name) for name in wanted]
+    chosen = [names.index(name) for name in wanted] or range(len(names))
     return [f"|{'|'.join(row[column] for column in chosen)}|" for row in cells]
 
 

@@ -54,10 +54,10 @@ def test_documents_get_tables_pictures_and_where_they_are_from(steerbench, check
     assert re.search(
         rf"`steerbench {re.escape(RUN.partition(' report')[0])}`, at [0-9a-f]{{12}}, on ", readme
     )
-    assert "| run | PSNR, dB ↑ |" in readme
+    assert "|run|PSNR, dB ↑|" in readme
     (shown,) = re.findall(r"\((docs/results/run-\S+\.png)\)", readme)
     assert f"({shown.removeprefix('docs/')})" in more
-    assert "| grey |" in more  # a table that a command without a page printed
+    assert "|grey|" in more  # a table that a command without a page printed
     with Image.open(checkout / shown) as picture:
         assert picture.mode == "P"
 
@@ -84,7 +84,7 @@ def test_a_command_that_fails_leaves_its_region_and_the_others_are_measured(stee
     assert outcome.status == 1
     assert "nowhere" in outcome.err
     assert (checkout / "docs" / "wrong.md").read_text() == region("wrong", "", "all")
-    assert "| run | PSNR, dB ↑ |" in (checkout / "README.md").read_text()
+    assert "|run|PSNR, dB ↑|" in (checkout / "README.md").read_text()
 
 
 @pytest.mark.parametrize(
@@ -118,8 +118,8 @@ def test_a_document_shows_some_columns_of_a_table(steerbench, checkout):
     assert steerbench("figures", "--only", "run").status == 0
     shown = (checkout / "README.md").read_text()
     head, rule, line = (x for x in shown.splitlines() if x.startswith("|"))
-    assert (head, rule) == ("| PSNR, dB ↑ | run |", "|---:|---|")
-    assert re.fullmatch(r"\| [\d.]+ \| \w+ \|", line)
+    assert (head, rule) == ("|PSNR, dB ↑|run|", "|---:|---|")
+    assert re.fullmatch(r"\|[\d.]+\|\w+\|", line)
     assert "All columns: [run.csv](docs/results/run.csv)." in shown
     assert shown.startswith("<!-- figures run |  | table of PSNR, run | ")
     (checkout / "README.md").write_text(region("run", "", "table of PSRN"))
