@@ -42,20 +42,29 @@ A_T = torch.tensor(
 # Of 30 x 50 pixels: to both sides, none, all, past the end.
 SPANS = Spans(torch.tensor([[1, 4], [3, 3], [0, 7], [5, 9]]), 8)
 
-FRAME = (1, 800, 704)  # of the U-Net
+FRAME, PATCH = (1, 800, 704), (1, 300, 300)  # of the U-Net, drawn and trained
 CHANNELS = 16
 
 
-def _largest(given: Given) -> Tensor:
-    """The sums of `convolution` where all numbers on the way are positive and nothing cancels:
-    S = |A^T| [(|G| |g| |G^T|) . (|B^T| |d| |B|)] |A|, [B, O, H, W]."""
-    pictures = torch.cat(list(given["parts"]), dim=1).double().abs()
+def _tiles(pictures: Tensor) -> Tensor:
+    """|B^T| |d| |B| of all tiles, [B, C, down, across, 6, 6]."""
     height, width = pictures.shape[2:]
-    around = functional.pad(pictures, (1, 1 + -width % 4, 1, 1 + -height % 4))
-    tiles = B_T @ around.unfold(2, 6, 4).unfold(3, 6, 4) @ B_T.T  # [B, C, down, across, 6, 6]
-    weight = G24 @ given["weight"].double().abs() @ G24.T / 24**2
-    squares = A_T @ torch.einsum("oiab,niyxab->noyxab", weight, tiles) @ A_T.T
-    total = squares.transpose(3, 4).flatten(4, 5).flatten(2, 3)[..., :height, :width]
+    around = functional.pad(pictures.double().abs(), (1, 1 + -width % 4, 1, 1 + -height % 4))
+    return B_T @ around.unfold(2, 6, 4).unfold(3, 6, 4) @ B_T.T
+
+
+def _sums(pictures: Tensor, weight: Tensor) -> Tensor:
+    """The sums of a convolution where all numbers on the way are positive and nothing cancels:
+    S = |A^T| [(|G| |g| |G^T|) . (|B^T| |d| |B|)] |A|, [B, O, H, W]."""
+    height, width = pictures.shape[2:]
+    weight = G24 @ weight.double().abs() @ G24.T / 24**2
+    squares = A_T @ torch.einsum("oiab,niyxab->noyxab", weight, _tiles(pictures)) @ A_T.T
+    return squares.transpose(3, 4).flatten(4, 5).flatten(2, 3)[..., :height, :width]
+
+
+def _largest(given: Given) -> Tensor:
+    """The same of all parts, and what is added."""
+    total = _sums(torch.cat(list(given["parts"]), dim=1), given["weight"])
     total = total + given["bias"].double().abs()[:, None, None]
     return total + given["plus"].abs() if "plus" in given else total
 
@@ -66,6 +75,32 @@ def _off(given: Given) -> Tensor:
     channel."""
     channels = given["weight"].shape[1]
     return (10 * channels + 17) * U32 * _largest(given)
+
+
+def _parts_off(given: Given) -> float:
+    """As above; the gradient of the parts is a convolution of that of the result, here at most 1,
+    over the channels of which it sums."""
+    outputs, (batch, _, *size) = len(given["weight"]), given["parts"][0].shape
+    back = given["weight"].transpose(0, 1).flip(2, 3)
+    largest = _sums(torch.ones(batch, outputs, *size), back).max().item()
+    return (10 * outputs + 17) * U32 * largest
+
+
+def _weight_off(given: Given) -> Tensor:
+    """S = |G^T| [sum of (|A| |Y| |A^T|) . (|B^T| |d| |B|)] |G| over all tiles, with Y at most 1.
+    Numbers are rounded 2 x 3 times in B^T d B and in A Y A^T, at most twice for each tile in their
+    sum, and less than 12 times after it; those of the reference twice for each pixel."""
+    tiles = _tiles(torch.cat(list(given["parts"]), dim=1))
+    most = A_T.sum(0)  # |A| 1
+    sums = torch.einsum("niyxab,a,b->iab", tiles, most, most)
+    count = given["parts"][0][:, 0].numel()
+    return (2 * count + 2 * count + 24) * U32 * (G24.T @ sums @ G24 / 24**2)
+
+
+def _bias_off(given: Given) -> float:
+    """n numbers of at most 1, in any order: n u n in each backend."""
+    count = given["parts"][0][:, 0].numel()
+    return 2 * U32 * count**2
 
 
 def _signs(generator: torch.Generator, shape: Sequence[int], share: float = 0.05) -> Tensor:
@@ -85,9 +120,17 @@ def _convolved(given: Given, backend: str) -> tuple[Tensor, ...]:
 
 
 EXACT = Bound("short numbers: 0", 0.0)
-SHORT = Operation("convolution", served(__package__), _convolved, {"sums": EXACT})
+SHORT = Operation("convolution", served(__package__), _convolved, {"sums": EXACT}, draw=_signs)
 LONG = Operation(
     "convolution", served(__package__), _convolved, {"sums": Bound("(10 C + 17) u S", _off)}
+)
+LEARNED = replace(
+    LONG,
+    gradients={
+        "parts": Bound("(10 O + 17) u S", _parts_off),
+        "weight": Bound("n pixels: (4 n + 24) u S", _weight_off),
+        "bias": Bound("n pixels: 2 n^2 u", _bias_off),
+    },
 )
 HALVED = Operation(
     "halved",
@@ -110,15 +153,17 @@ def cases() -> list[Case]:
         "spans": ((2, 30, 50), (16,), 16, {"spans": True, "plus": True}),
         "spans, shuffled": ((1, 30, 50), (2, 16), 64, {"spans": True, "shuffle": True}),
     }
-    found = [
-        case for name, kind in kinds.items() for case in SHORT.cases(name, partial(_short, *kind))
-    ]
-    long: dict[str, tuple[Sequence[int], int | None]] = {
-        "long numbers": ((1, 30, 30), None),
-        "a frame, 16 channels": (FRAME, 800 * 704),
-    }
-    for name, (size, items) in long.items():
-        found += LONG.cases(name, partial(_long, size), items=items)
+    found = []
+    for name, kind in kinds.items():
+        how = kind[-1]
+        learned = ["parts", "weight", "bias", *(["plus"] if "plus" in how else [])]
+        learns = replace(SHORT, gradients=dict.fromkeys(learned, EXACT))
+        found += (SHORT if "spans" in how else learns).cases(name, partial(_short, *kind))
+    found += LONG.cases("long numbers, ReLU", partial(_long, (1, 30, 30), relu=True))
+    found += LEARNED.cases("long numbers", partial(_long, (1, 30, 30)))
+    frame, patch = (partial(_long, size) for size in (FRAME, PATCH))
+    found += LONG.cases("a frame, 16 channels", partial(frame, relu=True), items=800 * 704)
+    found += LEARNED.cases("a patch, 16 channels", patch, items=300 * 300)
     pictures: dict[str, tuple[Sequence[int], int | None]] = {
         "2 x 2": ((1, 3, 2, 2), None),
         "several": ((2, 16, 6, 10), None),
@@ -146,14 +191,15 @@ def _short(
     return given | kept | ({"spans": SPANS} if how.get("spans") else {})
 
 
-def _long(size: Sequence[int]) -> Given:
+def _long(size: Sequence[int], relu: bool = False) -> Given:
+    """Without ReLU where gradients are compared: of a result near 0, it may pass one or not."""
     batch, height, width = size
     generator = torch.Generator().manual_seed(height)
     return {
         "parts": [_pictures((batch, CHANNELS, height, width))["pictures"]],
         "weight": uniform(generator, (CHANNELS, CHANNELS, 3, 3)),
         "bias": uniform(generator, (CHANNELS,)),
-        "relu": True,
+        "relu": relu,
     }
 
 

@@ -32,6 +32,11 @@ G24 = torch.tensor(
 )
 """24 G, in whole numbers."""
 
+BOTH = torch.kron(G24, G24)
+"""24^2 G g G^T: from 9 taps to 36 numbers."""
+
+SHARES = 8  # of the tiles, summed apart from each other
+
 GOLDEN = (math.sqrt(5) - 1) / 2
 """Steps of this share of a row of things visit all parts of it alike."""
 
@@ -48,16 +53,60 @@ def convolution(
     spans: Spans | None,
 ) -> Tensor:
     given = [*parts, weight, bias, *([] if plus is None else [plus])]
+    learns = torch.is_grad_enabled() and any(x.requires_grad for x in given)
     half = torch.is_autocast_enabled("cpu") or all(x.dtype == torch.bfloat16 for x in parts)
-    if half or _learns(*given):
+    if half or (learns and spans is not None):
         return reference.convolution(parts, weight, bias, plus, relu, shuffle, spans)
     check_float32(*given)
+    if learns:
+        return _Convolution.apply(relu, shuffle, weight, bias, plus, *parts)
+    return _computed(parts, weight, bias, plus, relu, shuffle, spans)
+
+
+class _Convolution(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, relu, shuffle, weight, bias, plus, *parts):
+        out = _computed(parts, weight, bias, plus, relu, shuffle, None)
+        ctx.shuffle = shuffle
+        ctx.save_for_backward(out if relu else None, weight, *parts)
+        return out
+
+    @staticmethod
+    def backward(ctx, grad):
+        out, weight, *parts = ctx.saved_tensors
+        _, _, *learns = ctx.needs_input_grad
+        if out is not None:
+            grad = torch.ops.aten.threshold_backward(grad, out, 0)
+        if ctx.shuffle:  # one pixel of each 2 x 2 after the other, as `_by_pixel` orders channels
+            four = [grad[..., row::2, column::2] for row in (0, 1) for column in (0, 1)]
+            grad, weight = torch.cat(four, dim=1), _by_pixel(weight)
+        of_weight = torch.cat([_of_taps(part, grad) for part in parts], 1) if learns[0] else None
+        of_bias = grad.sum((0, 2, 3)) if learns[1] else None
+        if ctx.shuffle:
+            of_weight, of_bias = (x if x is None else _by_channel(x) for x in (of_weight, of_bias))
+        of_parts, none = [], (None, False, False, None)
+        of_each = weight.split([part.shape[1] for part in parts], dim=1)
+        for taps, wanted in zip(of_each, learns[3:], strict=True):
+            back = taps.transpose(0, 1).flip(2, 3)
+            found = _computed([grad], back, back.new_zeros(len(back)), *none) if wanted else None
+            of_parts.append(found)
+        return None, None, of_weight, of_bias, grad if learns[2] else None, *of_parts
+
+
+def _computed(
+    parts: Sequence[Tensor],
+    weight: Tensor,
+    bias: Tensor,
+    plus: Tensor | None,
+    relu: bool,
+    shuffle: bool,
+    spans: Spans | None,
+) -> Tensor:
     pictures, outputs = [_last(part) for part in parts], len(weight)
     batch, height, width, _ = pictures[0].shape
     together = shuffle and outputs % (4 * LANES) == 0  # a vector goes to one pixel
     if together:  # the channels that go to one pixel lie side by side
-        weight = weight.view(-1, 4, *weight.shape[1:]).transpose(0, 1).flatten(0, 1)
-        bias = bias.view(-1, 4).T.flatten()
+        weight, bias = _by_pixel(weight), _by_pixel(bias)
         out = torch.empty(batch, 2 * height, 2 * width, outputs // 4)
     else:
         out = torch.empty(batch, height, width, outputs)
@@ -77,7 +126,8 @@ def convolution(
 
 
 def halved(pictures: Tensor, spans: Spans | None) -> Tensor:
-    if pictures.dtype != torch.float32 or _learns(pictures):
+    learns = torch.is_grad_enabled() and pictures.requires_grad
+    if pictures.dtype != torch.float32 or learns:
         return reference.halved(pictures, spans)
     batch, channels, height, width = pictures.shape
     out = torch.empty(batch, height // 2, width // 2, channels)
@@ -87,10 +137,28 @@ def halved(pictures: Tensor, spans: Spans | None) -> Tensor:
     return out.permute(0, 3, 1, 2)
 
 
-def _learns(*given: Tensor) -> bool:
-    """Whether a gradient is wanted: the reference computes faster what a training needs, as half of
-    its time goes to the gradients of the weights."""
-    return torch.is_grad_enabled() and any(x.requires_grad for x in given)
+def _by_pixel(x: Tensor) -> Tensor:
+    """The outputs of a shuffled convolution, of which four follow each other on 2 x 2 pixels, in
+    another order: all of the first pixel, then all of the second."""
+    return x.unflatten(0, (-1, 4)).transpose(0, 1).flatten(0, 1)
+
+
+def _by_channel(x: Tensor) -> Tensor:
+    """The opposite of `_by_pixel`."""
+    return x.unflatten(0, (4, -1)).transpose(0, 1).flatten(0, 1)
+
+
+def _of_taps(part: Tensor, grad: Tensor) -> Tensor:
+    """The gradient of the weight of one part, [O, C, 3, 3], of that of the result, `grad` [B, O, H,
+    W]: G^T [sum of (A Y A^T) . (B^T d B) over all tiles] G."""
+    (batch, channels, height, width), outputs = part.shape, grad.shape[1]
+    given, grad = _last(part), _last(grad, outputs + -outputs % LANES)
+    sizes = given.shape[3], grad.shape[3]
+    sums = torch.zeros(SHARES, 36 * math.prod(sizes))
+    of_rows = ends(None, height, width).numpy()
+    _weigh(*flat(given, grad), *sizes, batch, height, width, of_rows, sums.numpy())
+    taps = BOTH.T @ sums.sum(0).view(36, -1).double() / 24**2
+    return taps.view(3, 3, *sizes).permute(3, 2, 0, 1)[:outputs, :channels].float()
 
 
 def _stride(strips: int) -> int:
@@ -102,9 +170,9 @@ def _stride(strips: int) -> int:
     return stride
 
 
-def _last(part: Tensor) -> Tensor:
-    """`part` [B, C, H, W] with the channels last and, at least, `LANES` of them."""
-    missing, part = LANES - part.shape[1], part.permute(0, 2, 3, 1)
+def _last(part: Tensor, least: int = LANES) -> Tensor:
+    """`part` [B, C, H, W] with the channels last and `least` of them, or more."""
+    missing, part = least - part.shape[1], part.permute(0, 2, 3, 1)
     return functional.pad(part, (0, missing)) if missing > 0 else part
 
 
@@ -113,12 +181,13 @@ def _transformed(
 ) -> Tensor:
     """G g G^T of `weight`, [36, all `channels`, `outputs`]: of the `given` channels of each part,
     and of `outputs` filled up with 0."""
-    both = torch.kron(G24, G24) / 24**2  # [36, 9]
-    found = weight.new_zeros(len(both), sum(channels), outputs)
+    found = weight.new_zeros(len(BOTH), sum(channels), outputs)
     at = 0
     for part, size in zip(weight.split(list(given), dim=1), channels, strict=False):
         taps = part.double().permute(2, 3, 1, 0).reshape(9, -1)
-        found[:, at : at + part.shape[1], : len(weight)] = (both @ taps).view(36, -1, len(weight))
+        found[:, at : at + part.shape[1], : len(weight)] = (BOTH @ taps / 24**2).view(
+            36, -1, len(weight)
+        )
         at += size
     return found
 
@@ -184,8 +253,22 @@ def _out_of(o: _Lanes, m: Sequence[ir.Value]) -> list[ir.Value]:
     ]
 
 
-def _along(how: Callable[[_Lanes, Sequence[ir.Value]], list[ir.Value]]):
-    """An intrinsic: reads six vectors from `at` on, `step` apart, writes `how` of them."""
+def _back(o: _Lanes, y: Sequence[ir.Value]) -> list[ir.Value]:
+    """A y."""
+    even, odd = o.add(y[0], y[2]), o.add(y[1], y[3])
+    far, far_odd = o.fma(4, y[2], y[0]), o.fma(4, y[3], y[1])
+    return [
+        y[0],
+        o.add(even, odd),
+        o.sub(even, odd),
+        o.fma(2, far_odd, far),
+        o.fma(-2, far_odd, far),
+        y[3],
+    ]
+
+
+def _along(how: Callable[[_Lanes, Sequence[ir.Value]], list[ir.Value]], inputs: int = 6):
+    """An intrinsic: reads `inputs` vectors from `at` on, `step` apart, writes `how` of them."""
 
     @intrinsic
     def transform(typing, source, at, step, target, to, apart):
@@ -196,7 +279,7 @@ def _along(how: Callable[[_Lanes, Sequence[ir.Value]], list[ir.Value]]):
                 ahead = builder.mul(values[array + 2], ir.Constant(ir.IntType(64), number))
                 return o.place(array, builder.add(values[array + 1], ahead))
 
-            given = [builder.load(place(0, number), align=4) for number in range(6)]
+            given = [builder.load(place(0, number), align=4) for number in range(inputs)]
             for number, result in enumerate(how(o, given)):
                 builder.store(result, place(3, number), align=4)
             return context.get_dummy_value()
@@ -207,7 +290,7 @@ def _along(how: Callable[[_Lanes, Sequence[ir.Value]], list[ir.Value]]):
     return transform
 
 
-_to_tile, _from_tile = _along(_into), _along(_out_of)
+_to_tile, _from_tile, _to_sums = _along(_into), _along(_out_of), _along(_back, 4)
 
 
 @intrinsic
@@ -330,6 +413,57 @@ def _pixels(results, at, step, space, square):
         _from_tile(results, at + j * step, 6 * step, space, j * LANES, 6 * LANES)
     for i in range(4):
         _from_tile(space, 6 * i * LANES, LANES, square, 4 * i * LANES, LANES)
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _weigh(given, grad, channels, outputs, batch, height, width, ends, sums):
+    """Sums over tiles of (A Y A^T) . (B^T d B): `sums` [SHARES, 36 * channels * outputs]. Arrays
+    are flat, with channels last."""
+    down, across, pixels = (height + 3) // 4, (width + 3) // 4, height * width
+    size, square = min(across, TILES), channels * outputs
+    for share in prange(len(sums)):
+        total = sums[share]
+        tiles, wanted = np.empty(36 * size * channels, f32), np.empty(36 * size * outputs, f32)
+        patch, space = np.zeros(36 * max(channels, outputs), f32), np.empty(36 * LANES, f32)
+        product, none = np.empty(square, f32), np.zeros(outputs, f32)
+        for strip in range(share, batch * down, len(sums)):
+            picture, top = strip // down, 4 * (strip % down)
+            for first in range(0, across, size):
+                count = min(size, across - first)
+                for t in range(count):
+                    left = 4 * (first + t)
+                    _tile(given, picture * pixels * channels, channels, height, width, top, left,
+                          ends, patch, space, tiles, t * channels, count * channels)  # fmt: skip
+                    _square(grad, picture * pixels * outputs, outputs, height, width, top, left,
+                            patch, space, wanted, t * outputs, count * outputs)  # fmt: skip
+                for n in range(36):
+                    w = wanted[n * count * outputs : (n + 1) * count * outputs]
+                    multiply(channels, tiles, n * count * channels, 1, channels, w, outputs, none,
+                             product, 0, count, False)  # fmt: skip
+                    for k in range(square):
+                        total[n * square + k] += product[k]
+
+
+@njit(cache=True, error_model="numpy")
+def _square(
+    source, start, channels, height, width, top, left, patch, space, tiles, to, step
+):  # fmt: skip
+    """A Y A^T of the 4 x 4 pixels from `top`, `left` on, into 36 places of `tiles` that are `step`
+    apart."""
+    at, row = start + (top * width + left) * channels, width * channels
+    if top + 4 > height or left + 4 > width:
+        for i in range(4):
+            for j in range(4):
+                there = top + i < height and left + j < width
+                for c in range(channels):
+                    seen = source[at + i * row + j * channels + c] if there else f32(0)
+                    patch[(4 * i + j) * channels + c] = seen
+        source, at, row = patch, 0, 4 * channels
+    for c in range(0, channels, LANES):
+        for j in range(4):
+            _to_sums(source, at + j * channels + c, row, space, j * LANES, 4 * LANES)
+        for i in range(6):
+            _to_sums(space, 4 * i * LANES, LANES, tiles, to + c + 6 * i * step, step)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
