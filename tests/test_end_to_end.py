@@ -91,13 +91,6 @@ def test_the_same_seed_gives_the_same_rows(first, tmp_path, lpips_weights):
     pd.testing.assert_frame_equal(*kept, check_exact=True)
 
 
-def test_what_was_measured_is_not_measured_again(first, lpips_weights):
-    before = rows(first[0])
-    again = demo(first[0], lpips_weights)
-    assert "already measured" in again.stderr
-    pd.testing.assert_frame_equal(rows(first[0]), before, check_exact=True)
-
-
 def test_training_is_shared_by_methods_and_runs_that_render_differently(first, lpips_weights):
     done = demo(first[0], lpips_weights, "method=ngp", "method.stop=1e-3")
     assert "trained field found" in done.stderr
@@ -153,14 +146,6 @@ def test_parity_compares_every_engine_with_torch_in_fp32(tmp_path):
     assert found["openvino, int8"]["bytes"] < 0.5 * standard["bytes"]
     for row in found.values():
         assert 0 < row["network_ms"] < row["frame_ms"]
-
-
-def test_skips_lists_the_work_of_a_frame_with_and_without_each_switch(first):
-    found, _ = study(first[0], "skips", "--frames", "3", "scene=totem", *SMALL)
-    dense = found.pop("nothing")
-    assert dense["cells"] == 16 * 16
-    assert found["empty space"]["samples"] < dense["samples"]
-    assert found["all of these"]["samples"] <= found["empty space"]["samples"]
 
 
 def test_breakdown_divides_the_frame_and_names_every_line(first):

@@ -1,6 +1,6 @@
 """The pretended GPU: it refuses what CUDA refuses, and waits where CUDA waits.
 
-The last tests plant bugs in the project, each of a kind that only a GPU shows.
+The last test plants a bug that only a GPU shows.
 """
 
 from __future__ import annotations
@@ -12,17 +12,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from bench.cameras import place_camera
 from bench.probes import device_waits
-from bench.types import NullProbe
 from methods.engines.torch_engine import TorchEngine
-from methods.kernels import dispatch
 from methods.kernels.encode import HashGrid, encode
-from methods.kernels.types import Occupancy
-from methods.rendering.frame import everywhere, render_frame
-from methods.rendering.sampling import Sampling
-from tests.methods.conftest import look_at_the_middle
-from tests.methods.models import misty_field, shell
 from tests.pretended_gpu import pretended_gpu
 
 
@@ -187,26 +179,6 @@ def test_afterwards_there_is_none():
     assert not torch.cuda.is_available()
     with pytest.raises(RuntimeError, match="is gone"):
         x + 1
-
-
-def draw(background: Tensor) -> Tensor:
-    """A frame of a field on the GPU."""
-    field = misty_field(backend="reference").to("cuda")
-    occupancy = Occupancy(shell().cells.cuda())
-    camera = place_camera(look_at_the_middle(0.1, 0.2), "cuda")
-    render = everywhere(field, occupancy, NullProbe(), Sampling(step=0.05))
-    return render_frame(camera, occupancy, background, NullProbe(), render).values
-
-
-def test_planted_a_background_on_the_cpu_is_found(gpu):
-    with pytest.raises(RuntimeError, match="same device"):
-        draw(torch.ones(4))
-
-
-def test_planted_a_kernel_of_the_cpu_is_found(gpu, monkeypatch):
-    monkeypatch.setattr(dispatch, "resolve", lambda backend, device: "cpu")
-    with pytest.raises(TypeError, match="numpy"):
-        draw(torch.ones(4, device="cuda"))
 
 
 class Asking(nn.Module):

@@ -54,11 +54,6 @@ def test_choices_come_with_what_they_are():
     assert "totem" in steerbench.scenes()
 
 
-def test_a_wrong_setting_is_an_error_with_the_nearest_name():
-    with pytest.raises(steerbench.SteerbenchError, match="Did you mean ngp"):
-        steerbench.run("method=npg")
-
-
 def cells() -> list[str]:
     notebook = json.loads((DOCS / "tour.ipynb").read_text(encoding="utf-8"))
     return ["".join(c["source"]) for c in notebook["cells"] if c["cell_type"] == "code"]

@@ -203,6 +203,7 @@ def test_a_backbone_that_cannot_be_had_leaves_nan_and_its_reason(run, offset_met
     assert value(measured.rows, "lpips_alex") == 0.5
     assert math.isnan(value(measured.rows, "lpips_vgg"))
     assert measured.record["missing"] == loaded[1]
+    assert list(measured.frames)[3:7] == ["psnr", "ssim", "lpips_alex", "lpips_vgg"]
 
 
 def test_frames_without_ground_truth_are_timed_but_not_scored(run, offset_method, tiny_scene):

@@ -6,12 +6,11 @@ import json
 import platform
 import subprocess
 import sys
-from contextlib import nullcontext
 
 import pytest
 import torch
 
-from bench.threads import WORKERS, in_parallel
+from bench.threads import in_parallel
 
 
 def test_results_keep_their_order_and_are_counted(log) -> None:
@@ -19,32 +18,19 @@ def test_results_keep_their_order_and_are_counted(log) -> None:
     assert log.done == 100
 
 
-def test_the_first_fault_ends_it(log) -> None:
-    def work(item: int) -> None:
-        if item >= 3:
-            raise ValueError(f"item {item}")
-
-    with pytest.raises(ValueError, match=r"^item 3$"):
-        in_parallel(work, range(50), "fail", log)
-    assert log.done == 3
-
-
-@pytest.mark.parametrize("fails", [False, True])
-def test_torch_has_its_threads_back(log, fails) -> None:
-    before = torch.get_num_threads()
+def test_the_first_fault_ends_it_and_torch_has_its_threads_back(log) -> None:
+    before, inside = torch.get_num_threads(), []
     torch.set_num_threads(2)
-    inside = []
 
     def work(item: int) -> None:
         inside.append(torch.get_num_threads())
-        if fails:
-            raise ValueError("stop")
+        if item >= 3:
+            raise ValueError(f"item {item}")
 
     try:
-        with pytest.raises(ValueError, match="stop") if fails else nullcontext():
-            in_parallel(work, range(WORKERS), "work", log)
-        assert set(inside) == {1}
-        assert torch.get_num_threads() == 2
+        with pytest.raises(ValueError, match=r"^item 3$"):
+            in_parallel(work, range(50), "fail", log)
+        assert (log.done, set(inside), torch.get_num_threads()) == (3, {1}, 2)
     finally:
         torch.set_num_threads(before)
 

@@ -20,7 +20,6 @@ from reports.claims import (
     OPEN,
     OPPOSITE,
     SMALLER,
-    UNKNOWN,
     Claim,
     Comparison,
     Gap,
@@ -137,13 +136,6 @@ def test_a_pair_has_the_same_scene_and_seed_and_each_is_a_replicate(run, scenes,
     assert (alone.over, alone.by) == ("6 frames of one seed", pytest.approx(0.1))
 
 
-def test_means_over_scenes_are_not_compared_but_the_runs_behind_them(run):
-    runs = {name: [of_scene(run, name, 0, by)] for name, by in (("a", 1.0), ("b", 2.0))}
-    one = Repeated("one", [run], by_scene={name: [of_scene(run, name, 0, 0.0)] for name in "ab"})
-    found = gap("psnr", one, Repeated("two", [run], by_scene=runs))
-    assert (found.over, found.by) == ("2 scenes", pytest.approx(1.5))
-
-
 def test_a_figure_without_frames_alone_tells_nothing_but_bytes_are_computed(run):
     larger = changed(run, {"size_bytes.total": 2 * run.values["size_bytes.total"]})
     assert math.isnan(between([run], [larger], "fps").half)
@@ -182,13 +174,6 @@ def test_neighbours_are_compared_if_both_were_measured_and_the_paper_gives_both_
     assert len(unknown) == 2
     assert all(math.isnan(x.paper) for x in unknown)
     assert compared(run, {}, {"one": 0.0, "three": 1.0}) == []
-
-
-def test_a_line_without_runs_is_not_measured(run):
-    lines = {"one": Repeated("one", [run]), "two": Repeated("two", [])}
-    (found,) = compare(RISING, lines, {})
-    assert found.verdict == UNKNOWN
-    assert claim_table([found]).lines[0][2:4] == (ABSENT, "")
 
 
 def test_a_claim_is_turned_round_where_the_paper_has_the_opposite_order(run):

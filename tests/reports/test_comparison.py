@@ -58,12 +58,6 @@ def test_one_run_or_runs_of_different_kinds_have_no_best(make):
     assert bold(comparison(runs, {})) == set()
 
 
-def test_a_failure_is_a_line_with_its_reason(make):
-    table = comparison([make("a")], {"b (level=7)": "expected 0 to 1"})
-    assert table.lines[1][0] == "b (level=7): failed: expected 0 to 1"
-    assert {len(line) for line in table.lines} == {len(table.columns)}
-
-
 def test_cold_frames_have_a_line_of_their_own_and_compete_among_themselves(make, rows_with_cold):
     table = comparison([make("a"), *(make(label, rows_with_cold) for label in "bc")], {})
     assert [line[0] for line in table.lines] == ["a", "b", "b, cold", "c", "c, cold"]

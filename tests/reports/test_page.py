@@ -11,7 +11,7 @@ from PIL import Image
 
 from bench.types import SteerbenchError
 from reports import figures, images
-from reports.images import Part, Picture
+from reports.images import Part
 from reports.page import write_page
 from reports.publish import publish
 from reports.tables import Table
@@ -48,18 +48,6 @@ def test_a_page_is_written_in_both_forms(tmp_path):
     page = (tmp_path / "report.html").read_text()
     assert "<title>Title &amp; more</title>" in page
     assert "1 &lt; 2</td>" in page
-
-
-def test_a_page_that_cannot_be_made_leaves_the_earlier_one(tmp_path):
-    publish(["# First"], tmp_path)
-    before = files(tmp_path)
-
-    def full(path: Path) -> None:
-        raise OSError(28, "No space left on device", str(path))
-
-    with pytest.raises(SteerbenchError, match=r"plot\.png: No space left"):
-        publish([*PARTS, Picture("plot", "nothing", full)], tmp_path)
-    assert files(tmp_path) == before
 
 
 @pytest.mark.parametrize("form", ["report.md", "report.html"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import pandas as pd
 import pytest
 from omegaconf import OmegaConf
 
@@ -197,23 +196,6 @@ def test_a_cell_of_figures_is_measured_or_absent(run):
     assert shown.columns == ("measured", *labels)
     assert shown.lines[0] == ("here: seed 1 failed", "30.46", "12.0", ABSENT, "8.00")
     assert shown.lines[1] == ("elsewhere", *[ABSENT] * 4)
-
-
-def test_a_stage_holds_the_stages_inside_it(run):
-    inside = run.rows[run.rows["metric"] == "stage_ms.other"]
-    inside = inside.assign(metric="stage_ms.other/march", value=3.0)
-    whole = replace(run, rows=pd.concat([run.rows, inside]))
-    shown = figure_table(TABLE, {"here": Repeated("here", [whole])})
-    assert shown.lines[0][4] == "11.00"
-
-
-def test_several_seeds_give_their_mean_and_its_interval(run):
-    shown = figure_table(
-        TABLE, {"here": Repeated("here", [changed(run, {"psnr": x}) for x in (29.0, 31.0)])}
-    )
-    # Half of a t-interval of two values that are 2 apart: t(0.975, 1) * sqrt(2) / sqrt(2).
-    assert shown.lines[0][1] == "30.00 ± 12.71"
-    assert shown.lines[0][2] == "12.0"
 
 
 def test_the_best_is_bold_and_the_second_of_three_italic(run):

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.errors import SteerbenchError
 from bench.intervals import half_interval, path_interval
 from reports.regression import LIMITS, Change, Figures, Limit, changes
 
@@ -123,11 +122,6 @@ def test_a_metric_or_a_frame_that_is_gone_is_missing():
     assert change("psnr", [old], [new]).verdict == "missing"
 
 
-def test_figures_of_other_frames_are_not_compared():
-    with pytest.raises(SteerbenchError, match=r"of other frames, .*: views; another scene"):
-        list(changes([OLD], [replace(OLD, views="another scene")]))
-
-
 def test_a_baseline_can_have_limits_of_its_own():
     new = replace(OLD, values={**OLD.values, "psnr": 29.0})
     (wide,) = changes([OLD], [new], {"psnr": Limit(1, absolute=2.0)})
@@ -142,7 +136,3 @@ def test_frames_are_those_that_the_headline_is_the_mean_of(run):
     assert list(figures.frames["frame_ms"].values()) == table["frame_ms"].tolist()
     assert "peak_bytes" in figures.values
     assert "peak_bytes" not in figures.frames  # its headline was the largest of older runs
-
-
-def test_a_metric_that_only_the_baseline_has_a_limit_for_is_kept(run):
-    assert set(Figures.of(run, {"train_s": Limit(-1)}).values) == {"train_s"}

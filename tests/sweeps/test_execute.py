@@ -110,12 +110,6 @@ def test_a_job_that_fails_is_left_out_and_the_others_are_measured_in_turns(
     assert capsys.readouterr().err.count("failed: broken") == 2
 
 
-def test_a_line_alone_is_another_run_than_the_same_in_turns(elsewhere):
-    (alone,), _ = obtain(in_turns(0.5, turns=""))
-    assert alone not in obtain(in_turns(0.5, 0.75))[0]
-    assert not measured(0.5, turns="")
-
-
 def test_a_failure_is_kept_for_its_job_until_that_succeeds(elsewhere):
     (job,), (other,) = in_turns(0.5, turns=""), in_turns(0.75, turns="")
     job.keep_failure("no room")
@@ -143,10 +137,13 @@ def test_what_is_chosen_afterwards_is_no_training_of_its_own():
 
 def test_nothing_is_trained_for_a_line_whose_fellow_is_measured(monkeypatch):
     """Say one that fails each time, at a precision that this CPU does not have."""
-    jobs = plan(replace(TABLES["table5"], beyond=None), ["budget=paper", "seed=0,1"])
+    table = replace(TABLES["table1"], beyond=None, beside=())
+    jobs = [job for job in plan(table, ["budget=paper"]) if "int8" in job.name]
+    assert len(jobs) > len({execute._training(job) for job in jobs}) > 1
+    measured = {execute._training(job): job.key for job in jobs}  # one of each training
     monkeypatch.setattr(execute, "room", lambda config: 2)
     monkeypatch.setattr(execute, "processes", None)  # it would be called
-    execute.train_ahead(jobs, {job.key for job in jobs})
+    execute.train_ahead(jobs, set(measured.values()))
 
 
 def test_a_method_that_declares_nothing_is_trained_for_each_of_its_settings(monkeypatch):

@@ -83,17 +83,6 @@ def test_the_worker_of_the_document_is_a_row_of_ten_lines(steerbench, documented
     assert json.loads(record.read_text())["times"].startswith("read by the process that rendered")
 
 
-def test_a_worker_that_fails_is_one_line_and_the_others_of_a_sweep_run(run, write, tmp_path):
-    write()
-    write("raise SystemExit('no model here')", "broken.py")
-    done = run("-m", "method=external", "method.command=broken.py,worker.py")
-    assert done.status == 2
-    failed = [line for line in done.err.splitlines() if "failed: " in line]
-    assert len(failed) == 1
-    assert "ended with status 1, 'hello' not answered; its last words: no model here" in failed[0]
-    assert set(rows(tmp_path)["method"]) == {"Grey"}
-
-
 def test_another_worker_or_another_option_is_another_run(run, write, tmp_path):
     counts = []
     for lines, option in (("", 0.5), ("", 0.25), ("'changed'", 0.25), ("'changed'", 0.25)):

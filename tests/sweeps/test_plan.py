@@ -107,22 +107,6 @@ def test_turns_are_of_one_seed_and_one_scene():
     assert all(of[job.turns] == (job.config.seed, job.scene) for job in jobs)
 
 
-def test_settings_hold_for_every_job():
-    for job in plan(TABLES["table3"], ["budget=tiny", "seed=3"]):
-        assert job.config.budget.name == "tiny"
-        assert job.config.seed == 3
-        assert job.line == f"L = {job.config.method.model.frames}"
-        assert job.config.trajectory._target_ == "bench.trajectories.orbit"
-
-
-@pytest.mark.parametrize("name", [name for name, table in TABLES.items() if table.beyond])
-def test_a_table_is_of_the_papers_method_and_then_of_ours(name):
-    configs = [job.config for job in with_one_seed(name)]
-    methods = [config.method.name for config in configs if "engine" in config.method]
-    half = len(methods) // 2
-    assert methods == ["steernerf"] * half + ["steernerf_lean"] * half
-
-
 def test_the_lines_of_table_3_differ_in_l_alone():
     settings = [described(job.config) for job in with_one_seed("table3")]
     assert len(settings) == 4

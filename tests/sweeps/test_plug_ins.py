@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -14,8 +13,6 @@ from types import MappingProxyType
 import pytest
 
 from bench import provenance
-from sweeps import execute
-from sweeps.measurement import JobFailed, obtain
 from sweeps.overrides import PLUG_INS, plug_ins
 
 from .test_documents import WITHOUT_LPIPS, mine  # noqa: F401 (a fixture)
@@ -101,43 +98,6 @@ def test_a_word_that_leads_nowhere_is_answered(call, argv, said):
     refused = call(*argv.split())
     assert refused.status == 2
     assert said in refused.err
-
-
-@pytest.fixture
-def only_mine(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Measure nothing but the plug-in; the methods of what is measured."""
-    names = []
-
-    def some(jobs):
-        error = RuntimeError("not measured here")
-        for job in jobs:
-            if job.config.method._target_ != "mine.renderer.Mine":
-                raise error if len(jobs) == 1 else JobFailed(job) from error
-        names.extend(job.config.method._target_ for job in jobs)
-        return obtain(jobs)
-
-    monkeypatch.setattr(execute, "obtain", some)
-    return names
-
-
-def line_of(err: str) -> str:
-    """The line of the plug-in in the table on the page that was written."""
-    page = Path(re.search(r"report: (.*)", err)[1]).read_text()
-    table = page.partition("| measured |")[2].partition("\n\n")[0]
-    (line,) = [line for line in table.splitlines() if line.startswith("| mine |")]
-    return line
-
-
-@pytest.mark.slow
-def test_table_1_has_a_line_for_it_that_is_measured_and_reported(call, only_mine, tmp_path):
-    words = ("--table", "table1", "--with", "mine", *SMALL)
-    measured = call("paper", *words)
-    assert measured.status == 1  # the others failed
-    assert only_mine.count("mine.renderer.Mine") == 1
-    line = line_of(measured.err)
-    assert re.search(r"\d\.\d\d", line)
-    assert line_of(call("report", *words).err) == line
-    assert len(keys(tmp_path)) == 1
 
 
 # Packages from pip

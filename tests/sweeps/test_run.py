@@ -237,16 +237,6 @@ def test_a_signal_ends_a_run_through_its_clean_up(hanging, tmp_path, sent, statu
     assert list(tmp_path.glob("outputs/runs/*")) == []
 
 
-def test_a_run_that_was_killed_can_be_run_again(hanging, run, tmp_path):
-    hanging.kill()
-    hanging.wait()
-    assert list(tmp_path.glob("outputs/runs/*")) == []
-    outcome = run()
-    assert outcome.status == 0
-    assert "6.05" in outcome.out
-    assert len(list(tmp_path.glob("outputs/runs/*"))) == 1
-
-
 @pytest.mark.slow
 def test_a_reader_that_goes_away_ends_the_run_quietly(spawn):
     process = spawn()

@@ -39,15 +39,6 @@ def test_a_run_scores_what_it_did_not_learn_from(run, learned_from, tmp_path):
     assert len(frames) == 8
 
 
-@pytest.mark.parametrize(("lead", "phase"), [(3, "steady"), (2, "cold")])
-def test_a_view_is_steady_after_enough(run, learned_from, monkeypatch, tmp_path, lead, phase):
-    monkeypatch.setattr("stand_ins.Grey.memory", 3)
-    assert run(*SIXTEEN, "trajectory=validation", f"trajectory.lead={lead}").status == 0
-    rows = Store(tmp_path / "outputs").rows()
-    scored = rows[(rows["metric"] == "psnr") & (rows["n"] > 0)]
-    assert list(zip(scored["phase"], scored["n"], strict=True)) == [(phase, 2)]
-
-
 @pytest.mark.parametrize("command", ["accuracy", "skips", "parity", "breakdown", "scaling"])
 def test_a_study_scores_what_it_did_not_learn_from(steerbench, learned_from, monkeypatch, command):
     monkeypatch.setattr("methods.checks.found", lambda name: [])
@@ -85,9 +76,3 @@ def test_the_split_is_its_trajectory_unless_that_was_asked_for():
     assert described(composed([SPLIT])) == described(composed(["trajectory=validation"]))
     assert described(composed([SPLIT])) != described(composed([]))
     assert composed([SPLIT, "budget.frames=5"]).trajectory.limit == 5  # of the budget
-
-
-def test_a_scene_with_too_few_training_pictures_is_refused(run):
-    outcome = run(SPLIT)
-    assert outcome.status == 2
-    assert "expected at least 8 training pictures" in outcome.err

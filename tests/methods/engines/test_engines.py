@@ -106,18 +106,6 @@ def test_int8_weights_take_a_quarter(build: Callable[..., Built]) -> None:
     assert 0.25 * exact <= quarter < 0.27 * exact  # biases and scales stay as they are
 
 
-@pytest.mark.slow
-def test_what_was_built_is_found_again(build: Callable[..., Built], tmp_path: Path) -> None:
-    network, inputs = lean()
-    first = build(OpenVino("int8"), network, inputs)
-    before = {path.name for path in tmp_path.iterdir()}
-    again = build(OpenVino("int8"), network, None)
-    for got, want in zip(again.run(*inputs[0]), first.run(*inputs[0]), strict=True):
-        assert torch.equal(got, want)
-    assert {path.name for path in tmp_path.iterdir()} == before
-    assert not any(path.is_dir() for path in tmp_path.iterdir())  # it was built in one
-
-
 def test_sizes_that_may_come_are_compiled_before_a_frame_is_timed(
     build: Callable[..., Built], tmp_path: Path
 ) -> None:

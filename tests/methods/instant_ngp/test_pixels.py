@@ -14,17 +14,6 @@ from methods.instant_ngp.pixels import RUN, STRIP, UNSEEN, ErrorMap, PixelBatche
 CPU = torch.device("cpu")
 
 
-def test_rays_go_through_the_pixels_whose_colours_they_carry(ball_scene: Scene) -> None:
-    batches = PixelBatches(ball_scene.splits["train"], CPU)
-    rays, colours = batches.draw(500, torch.Generator().manual_seed(0))
-    towards = torch.nn.functional.normalize(rays.directions, dim=-1)
-    offset = 0.5 - rays.origins
-    along = (offset * towards).sum(dim=-1, keepdim=True)
-    hit = (offset - along * towards).norm(dim=-1) < 0.3
-    assert torch.equal(colours[:, 3] == 1, hit)
-    assert 0.1 < hit.float().mean() < 0.6
-
-
 def test_rays_of_pictures_of_several_sizes_are_those_of_their_cameras(ball_scene: Scene) -> None:
     split = ball_scene.splits["train"]
     whole, other = split.cameras[:2]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -12,7 +11,6 @@ import torch
 from torch import Tensor
 
 from bench.console import ConsoleLog
-from bench.sharing import locked
 from bench.types import Budget, Log, Rays, Scene, Split, SteerbenchError, Unavailable, composite
 from methods.instant_ngp.cases import cases
 from methods.instant_ngp.field import HashField
@@ -127,32 +125,6 @@ def test_a_killed_training_ends_as_if_it_had_never_stopped_and_is_then_loaded(
         assert torch.equal(field.packed, whole.packed)
         assert all(torch.equal(field.layers[name], x) for name, x in whole.layers.items())
     assert (folder / "field.safetensors").stat().st_mtime_ns == written
-
-
-def test_who_finds_the_same_training_under_way_waits_and_loads_its_result(
-    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    first = trained(ball_scene, tmp_path / "first")
-    monkeypatch.delattr(PixelTraining, "advance")
-    made = stage(ball_scene, tmp_path / "first") / "field.safetensors"
-    folder = stage(ball_scene, tmp_path / "shared")
-
-    class Waiting(ConsoleLog):
-        """A log whose first line, that of waiting, lets the other one end."""
-
-        def info(self, message: str) -> None:
-            if not said:
-                made.rename(folder / "field.safetensors")
-                other.close()
-            said.append(message)
-
-    said: list[str] = []
-    other = ExitStack()
-    other.enter_context(locked(folder / "lock", "", quiet_log))
-    log = Waiting(tmp_path / "shared", quiet=True)
-    second = train_field(TEACHER, ball_scene, BUDGET, log).field
-    assert f"waits for another process that makes the same: {folder}" in said[0]
-    assert torch.equal(first.table, second.table)
 
 
 def test_a_loss_that_is_no_number_stops_and_keeps_the_last_good_checkpoint(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from methods.kernels.corner_gather import corner_gather, trilinear
+from methods.kernels.corner_gather import corner_gather
 from methods.plenoctree.kernels.voxel_light import shade_voxels
 
 RANDOM = torch.Generator().manual_seed(0)
@@ -13,17 +13,6 @@ WEIGHTS = torch.rand(9, 8, generator=RANDOM)
 VOXEL, RAY = (torch.randint(4, (9,), generator=RANDOM).int() for _ in range(2))
 CORNERS = torch.randint(20, (4, 8), generator=RANDOM).int()
 DIRECTIONS = torch.nn.functional.normalize(torch.randn(4, 3, generator=RANDOM), dim=1)
-
-
-def test_weights_are_0_and_1_at_corners_and_those_of_a_product_between() -> None:
-    bits = torch.arange(8)[:, None] >> torch.arange(3) & 1
-    assert torch.equal(trilinear(bits.double()), torch.eye(8, dtype=torch.float64))
-    x, y, z = place = torch.tensor([0.25, 0.5, 0.125])  # products are exact
-    want = [
-        (x if c & 1 else 1 - x) * (y if c & 2 else 1 - y) * (z if c & 4 else 1 - z)
-        for c in range(8)
-    ]
-    assert torch.equal(trilinear(place[None])[0], torch.stack(want))
 
 
 def test_weights_have_a_gradient_by_the_reference_only() -> None:

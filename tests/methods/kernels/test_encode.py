@@ -57,16 +57,6 @@ def test_gradients_of_samples_are_collected_whether_or_not_the_table_asks_for_it
     assert table.grad is None
 
 
-def test_the_backward_pass_gives_the_same_bits_twice() -> None:
-    table = random_table(GRID, torch.float32).requires_grad_()
-    positions = torch.rand(5000, 3, generator=torch.Generator().manual_seed(0))
-    twice = [
-        torch.autograd.grad(encode(positions, table, GRID, backend="cpu").square().sum(), table)[0]
-        for _ in range(2)
-    ]
-    assert torch.equal(*twice)
-
-
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_a_position_that_is_not_a_number_spoils_its_own_features_alone(backend: str) -> None:
     table = random_table(GRID, torch.float32).requires_grad_()

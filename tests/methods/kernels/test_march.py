@@ -128,18 +128,6 @@ def test_rays_that_miss_or_make_no_sense_have_no_samples(backend: str) -> None:
     assert samples.resume.tolist() == [-1] * 5
 
 
-def test_the_front_of_a_ray_is_its_first_samples() -> None:
-    samples = march(rays_through_the_cube(30), dust(3), STEP)
-    counts = torch.minimum(samples.offsets.diff(), torch.arange(30) % 5)
-    front = samples.front(counts)
-    assert torch.equal(front.offsets.diff(), counts)
-    assert (front.resume == -1).all()
-    number = torch.arange(len(samples)) - samples.offsets[samples.ray.long()]
-    kept = number < counts[samples.ray.long()]
-    for name in ("ray", "t", "delta", "positions"):
-        assert torch.equal(getattr(front, name), getattr(samples, name)[kept])
-
-
 def test_clearance_is_the_distance_to_the_nearest_brick_along_the_farthest_axis() -> None:
     cells = torch.zeros(32, 32, 32, dtype=torch.bool)
     cells[3, 17, 30] = cells[21, 20, 31] = True  # in the bricks (0, 4, 7) and (5, 5, 7)

@@ -46,6 +46,8 @@ def test_networks_begin_alike_and_nothing_is_where_there_is_none() -> None:
     field = KiloField(grid, "auto", torch.Generator().manual_seed(0))
     for parameter in field.parameters():
         assert (parameter == parameter[:1]).all()
+    networks = grid.count * 6212 * 4  # bytes of float32 of the published size
+    assert field.sizes() == {"networks": networks, "network_grid": 2 * grid.networks.numel()}
     with torch.no_grad():
         field.biases["density"].fill_(5.0)
         positions = torch.rand(4000, 3, generator=torch.Generator().manual_seed(1))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -94,20 +93,6 @@ def test_its_products_are_those_that_torch_counts(height: int, width: int, chann
     with FlopCounterMode(display=False) as counter:
         network(inputs)
     assert 2 * network.products(inputs) == counter.get_total_flops()
-
-
-def test_frames_that_are_missing_after_a_cold_start_show_nothing() -> None:
-    renderer = shaken(unet(6, 2, 4)).double()
-    warm = doubled(observe_paper())
-    index = warm.preceding.index
-    one, none = (replace(warm.preceding, index=index[:count]) for count in (1, 0))
-    empty = replace(one, index=torch.stack((index[0], torch.full_like(index[1], -1))))
-    pictures = renderer([replace(warm, preceding=one)])
-    unseen = renderer([replace(warm, preceding=empty)])
-    assert torch.equal(pictures, unseen)
-    cold = renderer([replace(warm, preceding=none)])
-    assert cold.isfinite().all()
-    assert (cold - pictures).abs().max() > 1e-3
 
 
 def test_a_batch_of_two_is_one_after_the_other() -> None:

@@ -16,7 +16,6 @@ from bench.types import Budget, Log, NullProbe, Scene, Unavailable
 from methods.diver.method import Diver
 from methods.diver.training import DiverLessons
 from methods.instant_ngp.stage1 import train_field
-from methods.kilonerf.kernels.grouped_mlp import SHAPES
 from methods.kilonerf.method import KiloLessons, KiloNerf
 from methods.nerf.method import Nerf
 from methods.nsvf.method import Nsvf
@@ -115,17 +114,6 @@ def test_a_training_is_found_again(name: str, ball_scene: Scene, shared_log: Log
     camera = ball_scene.splits["test"].cameras[0]
     pictures = [method.render(camera, NullProbe()).rgb for method in (first, again)]
     assert torch.equal(*pictures)
-
-
-def test_sizes_of_kilonerf_are_those_of_its_networks(ball_scene: Scene, shared_log: Log) -> None:
-    student = fitted("kilonerf", ball_scene, shared_log)
-    parameters = sum(i * o + o for i, o in SHAPES.values())
-    assert parameters == 6212  # of the publication
-    assert student.sizes() == {
-        "networks": student.grid.count * parameters * 4,
-        "network_grid": student.grid.networks.numel() * 2,
-        "occupancy": 128**3 // 8,
-    }
 
 
 @names

@@ -8,8 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from bench.errors import SteerbenchError, Unavailable
 from bench.study import Study
@@ -167,12 +165,6 @@ def test_scaling_fits_the_axes_of_the_method(study):
 def test_scaling_has_pixels_and_threads_for_every_method(study):
     found = rows(study("scaling", "grey"))
     assert {row["axis"] for row in found} == {"pixels", "threads"}
-
-
-@given(power=st.floats(-3, 3), factor=st.floats(1e-3, 1e3))
-def test_the_exponent_of_a_power_is_found(power, factor):
-    rows = [{"value": value, "ms": factor * value**power} for value in (1.0, 4.0, 9.0, 100.0)]
-    assert growth(rows, "ms") == pytest.approx(power, abs=1e-9)
 
 
 def test_a_value_of_0_is_left_out_and_a_single_one_has_no_exponent():

@@ -6,7 +6,6 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from methods.steernerf.kernels.drawing import corrected, shown
 from methods.steernerf.kernels.spans import Spans
@@ -97,20 +96,6 @@ def test_gradients_of_a_picture_in_float64(aligned: bool) -> None:
         return corrected(*given, (1, 6), SCALE, aligned, backend="reference")
 
     assert torch.autograd.gradcheck(picture, (rgb, correction))
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_ramp_stays_a_ramp_and_the_correction_is_added_in_its_place(backend: str) -> None:
-    """Bilinear interpolation has no error on a linear function, except at the border, where the
-    nearest pixel is repeated."""
-    column = torch.arange(8.0)
-    rgb = torch.stack((column, 2 * column, 8 - column), dim=1).expand(3, 8, 3) / 16
-    correction = torch.full((4, 5, 3), 0.25)
-    got = corrected(rgb, correction, (2, 3), 2, True, backend=backend)
-    place = ((torch.arange(16.0) + 0.5) / 2 - 0.5).clamp(0, 7)
-    want = torch.stack((place, 2 * place, 8 - place), dim=1).expand(6, 16, 3) / 16
-    want = want + functional.pad(correction, (0, 0, 3, 8, 2, 0))
-    torch.testing.assert_close(got, want, rtol=0, atol=4 * 2.0**-24)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

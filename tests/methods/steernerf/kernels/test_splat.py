@@ -89,14 +89,6 @@ def test_frames_have_a_picture_each_and_their_points_one_numbering(backend: str)
     assert torch.equal(got[2], torch.where(last[0] < 0, -1, last[0] + 100))
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_what_is_strided_is_read_as_it_stands(backend: str) -> None:
-    pixels, depth = scatter_points(400, 9, 9)
-    table = torch.cat((depth[:, None], pixels), dim=1)  # a row of three, used in two parts
-    index = one(pixels, depth, 9, 9, backend)
-    assert torch.equal(one(table[:, 1:], table[:, 0], 9, 9, backend), index)
-
-
 def test_the_number_of_threads_does_not_change_the_picture() -> None:
     pixels, depth = scatter_points(5000, 50, 3)  # three rows: a thread may be left without any
     pictures = []

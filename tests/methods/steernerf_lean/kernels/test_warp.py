@@ -163,22 +163,6 @@ def test_an_enlarged_depth_is_the_definition(scale: int, backend: str, dtype: to
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_some_cells_are_those_of_the_to_picture(backend: str) -> None:
-    depth, scale = uneven_depth(), 4
-    camera = straight(9 * scale, 7 * scale, focal=8.0 * scale)
-    source = elsewhere(camera)
-    picture = noise(source.height, source.width)
-    cells = torch.tensor([40, 0, 17, 17, 62])
-    fine = enlarge_cells(depth, cells, scale, backend=backend)
-    assert torch.equal(fine, enlarge(depth, scale, backend=backend).view(63, -1)[cells])
-    got = warp_cells(picture, source, fine, cells, camera, scale, backend=backend)
-    want = warp(picture, source, depth, camera, scale, backend=backend)
-    assert 0 < got[1].mean() < 1
-    for some, all_of_them in zip(got, want, strict=True):
-        assert torch.equal(some, all_of_them.flatten(0, 1)[cells])
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_a_plane_moves_by_focal_length_times_offset_over_depth(backend: str) -> None:
     camera, depth = straight(24, 16), torch.full((4, 6), 2.0)
     picture = noise(16, 24)
@@ -203,15 +187,6 @@ def test_without_a_depth_and_behind_the_source_nothing_is_known(backend: str) ->
         values, valid = warp(noise(8, 12), source, z, camera, 4, backend=backend)
         assert not values.any()
         assert not valid.any()
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_what_is_strided_is_read_as_it_stands(backend: str) -> None:
-    camera, depth = straight(36, 28), uneven_depth()
-    picture = noise(36, 28).transpose(0, 1)
-    got = warp(picture, camera, depth.T.contiguous().T, camera, 4, backend=backend)
-    want = warp(picture.contiguous(), camera, depth, camera, 4, backend=backend)
-    assert all(torch.equal(*pair) for pair in zip(got, want, strict=True))
 
 
 def test_wrong_arguments_are_named() -> None:
