@@ -38,7 +38,7 @@ def set_up() -> None:
 
 @contextmanager
 def processes(count: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool of `count` processes that end with this one, however it ends.
+    """A pool of `count` processes that end with this one, however it ends: told to, at once.
 
     They are spawned, because threads do not survive a fork: for work on which threads would wait
     for Python's lock.
@@ -47,6 +47,10 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
     pool = ProcessPoolExecutor(count, mp_context=spawned, initializer=_begin)
     try:
         yield pool
+    except (KeyboardInterrupt, SystemExit):
+        for process in multiprocessing.active_children():
+            process.terminate()
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import queue
+import select
 import tempfile
 import threading
-from contextlib import nullcontext
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,7 +16,7 @@ import pytest
 import torch
 
 from bench.console import ConsoleLog
-from sweeps.processes import LOCKS, device_lock, lock_file
+from sweeps.processes import LOCKS, device_lock, lock_file, processes
 from tests.sweeps.conftest import PATH
 
 PATIENCE_S = 60.0
@@ -45,6 +47,15 @@ def test_a_device_that_is_locked_is_waited_for_until_its_work_ends_or_fails(tmp_
             raise ending
     thread.join(PATIENCE_S)
     assert had.is_set()
+
+
+def test_who_is_told_to_end_does_not_wait_for_its_processes():
+    with suppress(SystemExit), processes(1) as pool:
+        waiting = pool.submit(select.select, [], [], [], PATIENCE_S)
+        while not waiting.running():
+            os.sched_yield()
+        raise SystemExit
+    assert isinstance(waiting.exception(), BrokenProcessPool)
 
 
 def test_gpus_are_told_apart_by_their_uuid(tmp_path, monkeypatch):
