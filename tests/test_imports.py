@@ -48,21 +48,21 @@ SOURCES = sorted(
 )
 
 
-def imports(path: Path) -> Iterator[tuple[str, bool]]:
-    """Every absolute module name imported in a file, and whether at the top of the module."""
+def imports(path: Path) -> Iterator[str]:
+    """Every absolute module name imported in a file."""
     tree = ast.parse((ROOT / path).read_text())
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            yield from ((alias.name, node in tree.body) for alias in node.names)
+            yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            yield from ((f"{node.module}.{alias.name}", node in tree.body) for alias in node.names)
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=str)
 def test_a_module_imports_only_from_packages_below_it(path):
     package = path.parts[0]
-    for name, _ in imports(path):
+    for name in imports(path):
         target = name.split(".")[0]
         if target in PACKAGES and target not in MAY_IMPORT[package]:
             assert str(path) in REACHES, f"{path} imports {name}"
@@ -75,7 +75,7 @@ METHODS = [path for path in SOURCES if path.parts[0] == "methods" and len(path.p
 @pytest.mark.parametrize("path", METHODS, ids=str)
 def test_a_method_stands_on_the_floors_below_it(path):
     folder = path.parts[1]
-    for name, _ in imports(path):
+    for name in imports(path):
         package, *rest = name.split(".")
         if package == "methods" and rest[0] != folder:
             assert rest[0] in STANDS_ON[folder], f"{path} imports {name}"
@@ -89,7 +89,7 @@ def test_no_floor_stands_on_one_above_it():
 @pytest.mark.parametrize("path", METHODS, ids=str)
 def test_an_implementation_of_a_kernel_is_known_to_that_kernel_and_its_like_alone(path):
     """A kernel for the CPU may be made of functions of another one for the CPU."""
-    for name, _ in imports(path):
+    for name in imports(path):
         before, _, kernel = name.partition(".kernels.")
         kernel, *inside = kernel.split(".")
         if IMPLEMENTATIONS & set(inside):
@@ -100,7 +100,7 @@ def test_an_implementation_of_a_kernel_is_known_to_that_kernel_and_its_like_alon
 
 @pytest.mark.parametrize(("library", "home"), [("numba", "cpu.py"), ("triton", "gpu.py")])
 def test_a_compiler_is_imported_only_by_the_kernels_made_for_it(library, home):
-    users = {path for path in SOURCES for name, _ in imports(path) if name.split(".")[0] == library}
+    users = {path for path in SOURCES for name in imports(path) if name.split(".")[0] == library}
     assert {path.name for path in users} <= {home}
     assert all("kernels" in path.parts[1:3] for path in users)
 
@@ -109,7 +109,7 @@ def test_sweeps_has_six_floors_and_no_circle():
     """A file's floor is one above the highest it imports; the commands together are one file."""
     below: dict[str, set[str]] = {}
     for path in (path for path in SOURCES if path.parts[0] == "sweeps"):
-        names = {name.split(".")[1] for name, _ in imports(path) if name.startswith("sweeps.")}
+        names = {name.split(".")[1] for name in imports(path) if name.startswith("sweeps.")}
         below.setdefault(path.with_suffix("").parts[1], set()).update(names)
 
     def floor(file: str, above: tuple[str, ...] = ()) -> int:
@@ -118,16 +118,3 @@ def test_sweeps_has_six_floors_and_no_circle():
         return 1 + max((floor(other, (*above, file)) for other in others), default=0)
 
     assert max(map(floor, below)) <= 6
-
-
-def test_the_command_line_opens_without_loading_torch():
-    """Help and completion answer at once because nothing they need imports torch."""
-    seen, pending = set(), {Path("sweeps/cli.py"), Path("sweeps/commands/run.py")}
-    while pending:
-        path = pending.pop()
-        seen.add(path)
-        for name, at_top in imports(path):
-            if at_top:
-                assert name.split(".")[0] != "torch", f"{path} imports {name}"
-                module = Path(*name.split("."))  # or a name in a module
-                pending |= {Path(f"{module}.py"), Path(f"{module.parent}.py")} & set(SOURCES) - seen

@@ -35,30 +35,23 @@ def test_a_tensor_there_says_so_and_so_does_what_is_computed_from_it(gpu):
     assert x.new_zeros(2, device="cpu").device.type == "cpu"
 
 
-REFUSED: dict[str, tuple[type[Exception], Callable[[], object]]] = {
-    "a sum with the CPU": (RuntimeError, lambda: there(1, 2, 3) + HERE),
-    "one tensor of both": (RuntimeError, lambda: torch.stack((there(1).sum(), HERE.sum()))),
-    "a CPU tensor changed": (RuntimeError, lambda: torch.zeros(3).add_(there(1, 2, 3))),
-    "a CPU tensor's elements": (RuntimeError, lambda: HERE[there(1).long()]),
-    "a product by an output": (RuntimeError, lambda: torch.mul(there(1), 2, out=torch.zeros(1))),
-    "numpy": (TypeError, lambda: there(1).numpy()),
-    "an array": (TypeError, lambda: np.asarray(there(1))),
-    "random numbers of the CPU": (
-        RuntimeError,
-        lambda: torch.rand(2, generator=torch.Generator(), device="cuda"),
-    ),
-    "random numbers for the CPU": (
-        RuntimeError,
-        lambda: torch.rand(2, generator=torch.Generator("cuda")),
-    ),
+REFUSED: dict[str, Callable[[], object]] = {
+    "a sum with the CPU": lambda: there(1, 2, 3) + HERE,
+    "one tensor of both": lambda: torch.stack((there(1).sum(), HERE.sum())),
+    "a CPU tensor changed": lambda: torch.zeros(3).add_(there(1, 2, 3)),
+    "a CPU tensor's elements": lambda: HERE[there(1).long()],
+    "a product by an output": lambda: torch.mul(there(1), 2, out=torch.zeros(1)),
+    "numpy": lambda: there(1).numpy(),
+    "an array": lambda: np.asarray(there(1)),
+    "random numbers of the CPU": lambda: torch.rand(2, generator=torch.Generator(), device="cuda"),
+    "random numbers for the CPU": lambda: torch.rand(2, generator=torch.Generator("cuda")),
 }
 
 
 @pytest.mark.parametrize("what", REFUSED)
 def test_what_cuda_refuses_is_refused(gpu, what):
-    error, act = REFUSED[what]
-    with pytest.raises(error, match=r"same device|numpy|generator"):
-        act()
+    with pytest.raises((RuntimeError, TypeError), match=r"same device|to numpy|generator"):
+        REFUSED[what]()
 
 
 def test_a_triton_kernel_takes_no_tensor_of_the_cpu(gpu):

@@ -73,17 +73,13 @@ def test_a_quiet_log_says_nothing(tmp_path, clock, capsys):
     assert capsys.readouterr() == ("", "")
 
 
-@pytest.fixture
-def terminal(monkeypatch, tmp_path, clock) -> ConsoleLog:
-    """A log on a terminal of 120 columns."""
-    monkeypatch.setenv("TTY_COMPATIBLE", "1")
-    monkeypatch.setenv("TTY_INTERACTIVE", "1")
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setenv("COLUMNS", "120")
-    return ConsoleLog(tmp_path, clock=clock)
-
-
-def test_on_a_terminal_nested_bars_show_how_far_it_is_without_a_thread(terminal, clock, capsys):
+def test_on_a_terminal_nested_bars_show_how_far_it_is_without_a_thread(
+    monkeypatch, tmp_path, clock, capsys
+):
+    kind = {"TTY_COMPATIBLE": "1", "TTY_INTERACTIVE": "1", "TERM": "xterm", "COLUMNS": "120"}
+    for variable, value in kind.items():
+        monkeypatch.setenv(variable, value)
+    terminal = ConsoleLog(tmp_path, clock=clock)
     before = threading.active_count()
     with terminal.progress("outer [1]", 2) as outer:
         assert threading.active_count() == before

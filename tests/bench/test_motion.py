@@ -45,15 +45,6 @@ def camera_at(offset: list[float], aside: float = 0.0) -> Camera:
     return Camera(look_at(eye, target, up).float(), 61.0, 60.0, 20.0, 16.0, 40, 32)
 
 
-def sphere(count: int) -> list[Camera]:
-    """Cameras between 2 and 2.5 units from the target, on every side but straight above."""
-    generator = seeded(7)
-    offsets = torch.randn(count, 3, generator=generator)
-    distances = 2 + torch.rand(count, 1, generator=generator) / 2
-    offsets *= distances / offsets.norm(dim=1, keepdim=True)
-    return [camera_at(offset.tolist()) for offset in offsets]
-
-
 def offset(camera: Camera) -> Tensor:
     return camera.c2w[:, 3].double() - TARGET.double()
 
@@ -136,8 +127,13 @@ def test_a_motion_that_cannot_be_is_refused(count, degrees):
 
 @cache
 def zone(count: int) -> tuple[list[Camera], float, float, float]:
-    """Cameras, their least and largest distance, and how far the third nearest is in degrees."""
-    cameras = sphere(count)
+    """Cameras on every side but straight above, between 2 and 2.5 units from the target; their
+    least and largest distance, and how far the third nearest is in degrees."""
+    generator = seeded(7)
+    offsets = torch.randn(count, 3, generator=generator)
+    distances = 2 + torch.rand(count, 1, generator=generator) / 2
+    offsets *= distances / offsets.norm(dim=1, keepdim=True)
+    cameras = [camera_at(eye.tolist()) for eye in offsets]
     reach = [offset(camera).norm().item() for camera in cameras]
     apart = [
         sorted(angle_deg(offset(one), offset(other)) for other in cameras)[3] for one in cameras

@@ -50,11 +50,6 @@ def zipped(files: dict[str, bytes]) -> bytes:
     return content.getvalue()
 
 
-def download(web: Web, folder: Path, log) -> bytes:
-    digest = hashlib.sha256(CONTENT).hexdigest()
-    return fetch(web.address + "file", folder / "file", digest, log).read_bytes()
-
-
 @pytest.mark.parametrize(
     ("files", "end", "said"),
     [
@@ -67,8 +62,9 @@ def download(web: Web, folder: Path, log) -> bytes:
 def test_a_failed_download_says_why_and_leaves_nothing(web, tmp_path, quiet_log, files, end, said):
     web.files |= files
     web.breaks_after = end
+    digest = hashlib.sha256(CONTENT).hexdigest()
     with pytest.raises(Unavailable, match=said):
-        download(web, tmp_path, quiet_log)
+        fetch(web.address + "file", tmp_path / "file", digest, quiet_log)
     assert found(tmp_path) == {}
 
 
@@ -139,19 +135,13 @@ def test_of_single_files_the_wrong_ones_are_fetched_again(monkeypatch, web, tmp_
     assert web.asked == ["/mic/train/r_0.png"]
 
 
-@pytest.fixture
-def release(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of a release of two scenes, with nothing wrong."""
+def test_every_difference_is_named_and_no_link_out_is_followed(monkeypatch, tmp_path, quiet_log):
     files = {"chair/a.png": b"a", "chair/b.png": b"b", "mic/c.png": b"c"}
-    for name, content in files.items():
-        path = tmp_path / "release" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
     publish(monkeypatch, files)
-    return tmp_path / "release"
-
-
-def test_every_difference_is_named_and_no_link_out_is_followed(release, tmp_path, quiet_log):
+    release = tmp_path / "release"
+    for name, content in files.items():
+        (release / name).parent.mkdir(parents=True, exist_ok=True)
+        (release / name).write_bytes(content)
     for part, count in ((".", 3), ("chair", 2)):  # a release, or a scene of it
         report = verify(release / part, quiet_log)
         assert str(report) == f"{count} ok, 0 wrong, 0 missing, 0 extra"

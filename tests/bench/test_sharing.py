@@ -7,7 +7,6 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -31,15 +30,6 @@ with missing(path, Printed(path.parent)) as to_make:
     sys.stdin.readline()
     path.touch()
 """
-
-
-@pytest.fixture
-def maker(tmp_path: Path) -> Callable[[], subprocess.Popen[str]]:
-    """Start a process that makes a file of `tmp_path`, after a signal to go on."""
-    command = [sys.executable, "-c", MAKER, str(tmp_path / "made")]
-    return lambda: subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
 
 
 def test_a_file_that_two_write_at_a_time_is_whole_at_any_time(tmp_path):
@@ -71,10 +61,12 @@ def test_a_file_that_is_not_ended_leaves_the_earlier_one_and_nothing_else(tmp_pa
 
 
 @pytest.mark.parametrize(("killed", "then"), [(False, "there"), (True, "to make")])
-def test_of_two_processes_the_second_waits_for_the_first_or_its_end(maker, killed, then):
-    with maker() as first:
+def test_of_two_processes_the_second_waits_for_the_first_or_its_end(tmp_path, killed, then):
+    command = [sys.executable, "-c", MAKER, str(tmp_path / "made")]
+    how = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, **how) as first:
         assert first.stdout.readline() == "to make\n"
-        with maker() as second:
+        with subprocess.Popen(command, **how) as second:
             assert "waits for another process that makes the same" in second.stdout.readline()
             first.kill() if killed else first.communicate("go on\n")
             assert second.stdout.readline() == f"{then}\n"

@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from bench.cameras import scale_camera
-from bench.motion import rotation_between
 from bench.trajectories import (
     Step,
     approached,
@@ -34,6 +33,7 @@ from bench.trajectories import (
     write_path,
 )
 from bench.types import Camera, Scene, Split, SteerbenchError
+from tests.bench.test_motion import turn_deg
 from tests.conftest import camera_on_orbit
 
 CONFIGS = Path(__file__).parents[2] / "sweeps" / "configs" / "trajectory"
@@ -91,11 +91,6 @@ def orbit_of(degrees: list[float]) -> Scene:
     return Scene("orbit", {"test": split}, torch.ones(3), bounds, 1.0, "orbit")
 
 
-def turn_deg(first: Camera, second: Camera) -> float:
-    cosine = ((first.c2w[:, :3].T @ second.c2w[:, :3]).trace().item() - 1) / 2
-    return math.degrees(math.acos(min(cosine, 1.0)))
-
-
 def test_a_smooth_path_goes_through_the_cameras_in_even_steps():
     scene = orbit_of([0, 4, 7.5])
     path = smooth(scene)
@@ -103,8 +98,7 @@ def test_a_smooth_path_goes_through_the_cameras_in_even_steps():
     assert [step.truth for step in path.steps] == [0, None, None, None, 1, None, None, None, 2]
     assert [s.camera for s in path.steps if s.truth is not None] == list(cameras)
     turns = [turn_deg(a.camera, b.camera) for a, b in pairwise(path.steps)]
-    # acos of a float32 cosine near 1 resolves about 0.02 degrees at 1 degree.
-    assert turns == pytest.approx([1.0] * 4 + [3.5 / 4] * 4, abs=0.05)
+    assert turns == pytest.approx([1.0] * 4 + [3.5 / 4] * 4, abs=1e-3)
     for step in path.steps:
         distance = (step.camera.c2w[:, 3] - 0.5).norm().item()
         assert 2 * math.cos(math.radians(2)) - 1e-5 <= distance <= 2 + 1e-5
@@ -181,7 +175,7 @@ def test_a_loop_goes_there_and_back_until_its_frames_are_used_up():
     assert [step.truth for step in path.steps[::8]] == [0, 0]
     assert not any(step.cut for step in path.steps)
     turns = [turn_deg(a.camera, b.camera) for a, b in pairwise(path.steps)]
-    assert turns == pytest.approx([1.0] * 10, abs=0.05)
+    assert turns == pytest.approx([1.0] * 10, abs=1e-3)
     assert path.name == "test-loop11-1deg"
     scene = orbit_of([0, 1, 2])
     assert [step.truth for step in loop(scene, frames=5, limit=2).steps] == [0, 1, 0, 1, 0]
@@ -209,7 +203,7 @@ def test_each_camera_is_approached_once_after_a_cut_from_a_motion_of_its_own(tin
     starts = [turn_deg(step.camera, path.steps[0].camera) for step in path.steps[::3]]
     assert len({round(start, 1) for start in starts}) == 6
     turns = [turn_deg(a.camera, b.camera) for a, b in pairwise(path.steps) if not b.cut]
-    assert turns == pytest.approx([3.3] * 12, abs=0.05)
+    assert turns == pytest.approx([3.3] * 12, abs=1e-3)
     path = approached(tiny_scene, "test", lead=0, degrees=3.3, seed=0, limit=0)
     assert [(step.truth, step.cut) for step in path.steps] == [(n, True) for n in range(6)]
     limited = approached(tiny_scene, "test", lead=1, degrees=3.3, seed=0, limit=3)
@@ -354,10 +348,9 @@ def test_a_spline_goes_through_its_keys_in_even_steps():
     pieces = leading(keys, TARGET, degrees=2.0)
     assert [piece[-1] for piece in pieces] == keys[1:]
     for first, piece in zip(keys, pieces, strict=False):
-        turns = [rotation_between(*pair).norm() for pair in pairwise([first, *piece])]
-        degrees = torch.stack(turns).rad2deg()
-        assert degrees.max() <= 2.0 + 1e-2  # float32 poses
-        assert degrees.min() > 0.9 * degrees.max()
+        turns = [turn_deg(*pair) for pair in pairwise([first, *piece])]
+        assert max(turns) <= 2.0 + 1e-2  # float32 poses
+        assert min(turns) > 0.9 * max(turns)
 
 
 def test_a_spline_has_no_corners():

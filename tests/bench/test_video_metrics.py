@@ -20,8 +20,10 @@ from torch import Tensor
 from bench.cameras import cast, pixel_grid
 from bench.metrics import Lpips, _lpips_package, as_bytes, flicker, psnr
 from bench.protocol import EvaluationProtocol, Scoring
+from bench.run import Task, measure
 from bench.scenes import analytic
-from bench.types import Camera, SteerbenchError, Unavailable, composite
+from bench.trajectories import from_split
+from bench.types import Budget, Camera, SteerbenchError, Unavailable, composite
 from bench.video_metrics import View, flip, jod, tlpips, tpsnr, warping_error
 from tests.bench.test_metrics import noise, waves
 
@@ -156,14 +158,10 @@ def test_what_was_hidden_or_is_empty_or_out_of_the_picture_does_not_count():
     assert math.isnan(warping_error(now, view, *wall(24)))
 
 
-@pytest.fixture
-def ball(tmp_path, quiet_log):
-    """The scene `void`: a ball of radius 0.06 at (0.35, -0.2, 0.15) in its model's units."""
+def test_the_surface_of_an_embedded_scene_is_exact(tmp_path, quiet_log):
+    """`void` is a ball of radius 0.06 at (0.35, -0.2, 0.15) in its model's units."""
     sizes = {"width": 60, "train": 2, "test": 9, "bounds": [[-1.2] * 3, [1.2] * 3]}
-    return analytic.load("void", **sizes, root=tmp_path, log=quiet_log)
-
-
-def test_the_surface_of_an_embedded_scene_is_exact(ball):
+    ball = analytic.load("void", **sizes, root=tmp_path, log=quiet_log)
     camera = ball.splits["test"].cameras[0]
     depth = ball.surface(camera).flatten()
     rays, seen = cast(camera), torch.isfinite(depth)
@@ -172,11 +170,6 @@ def test_the_surface_of_an_embedded_scene_is_exact(ball):
     centre = (torch.tensor([0.35, -0.2, 0.15]) - ball.origin) / ball.unit_length
     radii = (points - centre).norm(dim=1) * ball.unit_length
     torch.testing.assert_close(radii, torch.full_like(radii, 0.06), atol=2e-5, rtol=0)
-
-
-def test_media_have_no_surface(tmp_path, quiet_log):
-    cloud = analytic.load("cloud", width=16, train=2, test=1, root=tmp_path, log=quiet_log)
-    assert cloud.surface is None
 
 
 def test_exact_flow_follows_the_true_pictures_of_a_path(tmp_path, quiet_log):
@@ -235,24 +228,13 @@ def test_the_flow_works_without_a_truth_and_a_gap_in_it_ends_a_film(monkeypatch)
     assert seen == [3, 3]
 
 
-def test_what_is_missing_says_what_it_needs(run_of_path):
-    rows, record = run_of_path
-    missing = record["missing"]
-    assert set(missing) == {"tpsnr", "warp_1_own", "warp_7_own"}  # the depths are infinite
-    assert missing["tpsnr"] == "needs the true pictures of two consecutive frames"
-    assert rows.set_index("metric")["n"][["tpsnr", "warp_7_own"]].tolist() == [0, 0]
-
-
-@pytest.fixture
-def run_of_path(tiny_scene, offset_method, quiet_log):
-    """Rows and record of a run along two cameras with a truth and one without between them."""
-    from bench.run import Task, measure
-    from bench.trajectories import from_split
-    from bench.types import Budget
-
+def test_what_is_missing_says_what_it_needs(tiny_scene, offset_method, quiet_log):
     whole = from_split(tiny_scene)
     steps = (whole.steps[0], replace(whole.steps[1], truth=None), whole.steps[2])
     trajectory = replace(whole, steps=steps)
     task = Task(tiny_scene, trajectory, PATH, Budget("tiny", steps=1, samples=1), seed=0)
     (measured,) = measure([offset_method], task, quiet_log)
-    return measured.rows, measured.record
+    missing = measured.record["missing"]
+    assert set(missing) == {"tpsnr", "warp_1_own", "warp_7_own"}  # the depths are infinite
+    assert missing["tpsnr"] == "needs the true pictures of two consecutive frames"
+    assert measured.rows.set_index("metric")["n"][["tpsnr", "warp_7_own"]].tolist() == [0, 0]

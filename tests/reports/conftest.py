@@ -89,6 +89,13 @@ def shifted(run: Run, by: float | list[float], **facts: object) -> Run:
     return replace(moved, read_frames=lambda: frames)
 
 
+def of_scene(run: Run, scene: str, by: float = 0.0, **facts: object) -> Run:
+    """`run` as that of another scene, with a PSNR larger by so much."""
+    other = shifted(run, by, scene=scene, **facts)
+    record = {**run.record, "scene": {**run.record["scene"], "digest": scene}}
+    return replace(other, key=f"{run.key}-{scene}", record=record)
+
+
 @pytest.fixture
 def run(store: Store, stored_run: str) -> Run:
     """A run of six scored frames, three of them pictured."""

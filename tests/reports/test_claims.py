@@ -32,7 +32,7 @@ from reports.claims import (
 )
 from reports.runs import Repeated, Run
 from reports.tables import ABSENT
-from tests.reports.conftest import changed, elsewhere, shifted
+from tests.reports.conftest import changed, elsewhere, of_scene, shifted
 
 RISING = Claim("psnr", ["one", "two"], 0.1)
 ALIKE = replace(RISING, alike=True)
@@ -113,11 +113,6 @@ def test_the_ratio_of_times_has_the_interval_of_its_frames(run):
     assert found.half == pytest.approx(path_interval(noise / noise.mean()))
 
 
-def of_scene(run: Run, scene: str, seed: int, by: float) -> Run:
-    record = {**run.record, "scene": {**run.record["scene"], "digest": scene}}
-    return replace(shifted(run, by, seed=seed), record=record)
-
-
 @pytest.mark.parametrize(
     ("scenes", "seeds", "over"),
     [("a", 3, "3 seeds"), ("abc", 1, "3 scenes"), ("ab", 2, "2 scenes × 2 seeds")],
@@ -126,8 +121,8 @@ def test_a_pair_has_the_same_scene_and_seed_and_each_is_a_replicate(run, scenes,
     """Scenes and seeds differ by decibels, the lines by about a tenth with each of them."""
     places = [(scene, seed) for scene in scenes for seed in range(seeds)]
     by = {place: 0.1 + 0.01 * number for number, place in enumerate(places)}
-    one = [of_scene(run, *place, 3.0 * number) for number, place in enumerate(places)]
-    two = [of_scene(run, *place, 3.0 * n + by[place]) for n, place in enumerate(places)]
+    one = [of_scene(run, x, 3.0 * n, seed=seed) for n, (x, seed) in enumerate(places)]
+    two = [of_scene(run, x, 3.0 * n + by[x, seed], seed=seed) for n, (x, seed) in enumerate(places)]
     found = between(one, two[::-1])
     assert (found.over, found.proves) == (over, True)
     assert found.by == pytest.approx(np.mean([*by.values()]))

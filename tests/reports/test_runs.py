@@ -13,7 +13,7 @@ from bench.run import phase_rows
 from reports.paper_tables import Line, PaperTable, section
 from reports.publish import markdown
 from reports.runs import Repeated, Run, over_common_frames, over_scenes
-from tests.reports.conftest import elsewhere, run_of, shifted
+from tests.reports.conftest import elsewhere, of_scene, run_of
 
 PSNR = [20.0, 26.0, 29.0, 30.0, 31.0, 30.0]
 """Of the frames of a path: the first are harder, for every method alike."""
@@ -72,13 +72,6 @@ def test_the_headline_is_steady_where_a_run_has_steady_frames(rows, rows_with_co
     cold = run_of(rows_with_cold[rows_with_cold["phase"] != "steady"])
     assert cold.values["psnr"] == pytest.approx(27.456)
     assert cold.values["train_s"] == 61
-
-
-def of_scene(run: Run, scene: str, by: float = 0.0, **facts: object) -> Run:
-    """`run` as that of another scene, with a PSNR larger by so much."""
-    other = shifted(run, by, scene=scene, **facts)
-    record = {**run.record, "scene": {**run.record["scene"], "digest": scene}}
-    return replace(other, key=f"{run.key}-{scene}", record=record)
 
 
 def test_figures_are_means_and_facts_that_differ_are_listed(run):

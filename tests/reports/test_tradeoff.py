@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import math
 
-from matplotlib.figure import Figure
-from PIL import Image
-
 from reports.figures import frontier_plot
 from reports.tradeoff import experiment_table, setting_table, write_tradeoff
 
@@ -73,15 +70,7 @@ def test_without_settings_the_page_is_that_of_the_kernels(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"report.md", "report.html", "kernels.csv"}
 
 
-def test_the_plot_of_a_single_setting_is_a_picture(tmp_path):
-    frontier_plot(SETTINGS[:1], tmp_path / "plot.png")
-    with Image.open(tmp_path / "plot.png") as picture:
-        assert min(picture.size) > 500
-
-
-def test_a_setting_far_slower_than_the_frontier_is_only_named(tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, path, dpi: drawn.append(figure))
+def test_a_setting_far_slower_than_the_frontier_is_only_named(tmp_path, drawn):
     frontier_plot([*SETTINGS, setting("empty space", 801.0, 20.0, "refined 0")], tmp_path)
     frontier_plot([*SETTINGS, setting("empty space", 799.0, 20.0, "refined 0")], tmp_path)
     assert [figure.get_suptitle() for figure in drawn] == ["not shown: empty space, 801 ms", ""]

@@ -109,12 +109,8 @@ def test_a_size_changes_settings_that_are_there(path):
     assert before[group] != after[group]
 
 
-@pytest.mark.parametrize(
-    ("words", "steps"),
-    [([], None), (["budget=paper"], 300), (["budget=paper", "method.steps=7"], 7)],
-)
-def test_a_budget_changes_a_setting_of_a_method_and_a_word_wins(words, steps):
-    assert composed(["method=nerf", *words]).method.steps == steps
+def test_a_word_wins_over_what_a_budget_sets_of_a_method():
+    assert composed(["method=nerf", "budget=paper", "method.steps=7"]).method.steps == 7
 
 
 # What our methods declare in their studies: the settings exist, and knobs need no training

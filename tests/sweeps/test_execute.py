@@ -14,10 +14,9 @@ from sweeps.commands.run import label
 from sweeps.execute import Ended, read
 from sweeps.measurement import Job, obtain, stored
 from sweeps.overrides import composed
-from sweeps.plan import chosen, plan
+from sweeps.plan import plan
 from tests.sweeps.conftest import HERE, STAND_INS
-
-TABLES = {table.name: replace(table, curve=False) for table in chosen(None, [])}
+from tests.sweeps.test_plan import TABLES
 
 
 def test_jobs_are_read_as_they_were_written_in_the_order_of_the_sweep(tmp_path):

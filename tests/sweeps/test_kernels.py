@@ -96,29 +96,25 @@ def test_what_a_kernel_brings_has_a_line_for_each_that_a_method_calls(steerbench
     assert rows["march"]["frame_ms_reference"] > 0
 
 
-@pytest.mark.parametrize(
-    ("error", "slow", "cells", "wrong"),
-    [
-        (0.0, False, [("cpu", "fp32")], []),  # what is not compiled is left out
-        (0.5, False, [("cpu", "fp32")], ["march: empty"]),
-        (0.5, True, [], []),
-        (Unavailable("no such products"), False, [("cpu", "fp32")], []),
-    ],
-)
-def test_compiled_kernels_compute_their_quick_cases(monkeypatch, error, slow, cells, wrong):
+def test_compiled_kernels_compute_their_quick_cases(monkeypatch):
+    tolerances = {("cpu", "fp32"): 0.1, ("reference", "fp32"): 0.1}
     computed = []
 
-    def measure(backend: str, device: str, precision: str) -> float:
-        computed.append((backend, precision))
-        if isinstance(error, Unavailable):
-            raise error
-        return error
+    def case(name: str, error: float | Unavailable, slow: bool = False) -> Case:
+        def measure(backend: str, device: str, precision: str) -> float:
+            computed.append((name, backend, precision))
+            if isinstance(error, Unavailable):
+                raise error
+            return error
 
-    tolerances = {("cpu", "fp32"): 0.1, ("reference", "fp32"): 0.1}
-    case = Case("march", "empty", "", "", tolerances, measure, slow=slow)
-    monkeypatch.setitem(sys.modules, "stand_in", SimpleNamespace(cases=lambda: [case]))
-    assert wrong_of("stand_in") == wrong
-    assert computed == cells
+        return Case("march", name, "", "", tolerances, measure, slow=slow)
+
+    cases = [case("right", 0.0), case("wrong", 0.5), case("slow", 0.5, slow=True)]
+    cases.append(case("unavailable", Unavailable("no such products")))
+    monkeypatch.setitem(sys.modules, "stand_in", SimpleNamespace(cases=lambda: cases))
+    assert wrong_of("stand_in") == ["march: wrong"]
+    # What is not compiled is left out.
+    assert computed == [(name, "cpu", "fp32") for name in ("right", "wrong", "unavailable")]
 
 
 @pytest.mark.slow

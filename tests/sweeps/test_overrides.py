@@ -6,12 +6,9 @@ import pytest
 
 UNKNOWN = [
     ("method=gery", "method", "gery", "grey"),
-    ("scene=blendr", "scene", "blendr", "blender"),
     ("budgt=none", "setting", "budgt", "budget"),
-    ("sed=1", "setting", "sed", "seed"),
     ("method.lvl=1", "setting", "method.lvl", "method.level"),
     ("+experiment=dmo", "experiment", "dmo", "demo"),
-    ("trajectory.limt=2", "setting", "trajectory.limt", "trajectory.limit"),
     ("+scene.fraems=2", "setting", "scene.fraems", "scene.frames"),
     ("scene=blender scene.downscal=2", "setting", "scene.downscal", "scene.downscale"),
 ]
@@ -33,7 +30,6 @@ UNKNOWN = [
         ("seed=-1", "seed: expected 0 or more, got -1\n"),
         ("threads=0", "threads: expected 1 or more, or null, got 0\n"),
         ("device=gpu", "device: expected auto, cpu, cuda or cuda:N, got gpu\n"),
-        ("report=3", "report: expected str | None, got 3\n"),
         ("scene.frames=many", "scene.frames: expected int, got 'many'\n"),
         ("budget.steps=true", "budget.steps: expected int, got True\n"),
     ],

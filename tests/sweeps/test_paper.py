@@ -21,16 +21,12 @@ from sweeps import configured, execute
 from sweeps.commands import paper
 from sweeps.commands.paper import gather, newest
 from sweeps.measurement import Job, JobFailed, described
-from sweeps.plan import DataSet, Planned, chosen, plan
+from sweeps.plan import DataSet, Planned, plan
 from tests.reports.conftest import rewrite
 from tests.sweeps.conftest import CONFIGS, HERE
-from tests.sweeps.test_plan import blender
+from tests.sweeps.test_plan import TABLES, blender
 
-TABLE3, TABLE5 = (
-    replace(table, curve=False, beyond=None)
-    for table in chosen(None, [])
-    if table.name in ("table3", "table5")
-)
+TABLE3, TABLE5 = (replace(TABLES[name], beyond=None) for name in ("table3", "table5"))
 
 
 @pytest.fixture

@@ -51,14 +51,3 @@ def test_every_frame_of_a_run_is_written_and_its_path_can_be_followed_and_timed(
     timed = rows[rows["run"] != run].set_index("metric")
     assert timed["n"]["frame_ms"] == 2
     assert timed["n"]["psnr"] == 0  # without ground truth
-
-
-def test_scored_pictures_are_no_run_to_render(steerbench):
-    for name in ("a", "b"):
-        Path(name).mkdir()
-        Image.fromarray(np.zeros((16, 16, 3), np.uint8)).save(f"{name}/0.png")
-    assert steerbench("score", "a", "--truth", "b", *PROTOCOL[:2]).status == 0
-    (run,) = Store(Path("outputs")).rows()["run"].unique()
-    outcome = steerbench("render", "--run", run)
-    assert outcome.status == 2
-    assert "got pictures that were scored" in outcome.err

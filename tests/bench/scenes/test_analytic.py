@@ -11,24 +11,12 @@ import pytest
 import torch
 
 from bench.scenes import analytic
-from bench.scenes.analytic import VIEWS, find, orbit_poses, train_poses
+from bench.scenes.analytic import MOST, VIEWS, find, orbit_poses, train_poses
 from bench.scenes.models import MODELS
 from bench.scenes.raytrace import render
 from bench.types import Camera, SteerbenchError, Unavailable
 
 SMALL = {"width": 24, "height": 18, "train": 4, "test": 2}
-
-
-@pytest.fixture(params=[*MODELS, "medley-0"])
-def name(request: pytest.FixtureRequest) -> str:
-    """Every embedded scene in turn."""
-    return request.param
-
-
-@pytest.fixture(scope="module")
-def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder in which the tests share what they draw."""
-    return tmp_path_factory.mktemp("scenes")
 
 
 def test_a_scene_is_written_once_in_the_layout_of_nerf_synthetic(tmp_path, log):
@@ -64,9 +52,11 @@ def test_who_finishes_second_accepts_the_scene_of_the_first(tmp_path, log, monke
     assert not (folder / "scene").exists()
 
 
-def test_a_scene_knows_its_picture_at_any_camera_as_its_splits_have_it(drawn, log, name):
-    scene = analytic.load(name, **SMALL, root=drawn, log=log)
+@pytest.mark.parametrize("name", [*MODELS, "medley-0"])
+def test_a_scene_knows_its_picture_at_any_camera_as_its_splits_have_it(tmp_path, log, name):
+    scene = analytic.load(name, **SMALL, root=tmp_path, log=log)
     assert scene.exact is not None
+    assert (scene.surface is None) == (name == "cloud")
     test = scene.splits["test"]
     for camera, image in zip(test.cameras, test.images, strict=True):
         exact = scene.exact(camera)
@@ -96,34 +86,27 @@ def test_the_orbit_is_smooth_and_closes():
     assert steps.max() <= one_degree * math.hypot(math.cos(math.radians(17)), 16 / 57.3) * 1.001
 
 
-def test_training_poses_look_at_the_middle_from_one_distance():
-    poses = torch.stack(train_poses(50, seed=3))
-    eyes = poses[:, :, 3]
-    assert eyes.norm(dim=1).tolist() == pytest.approx([analytic.DISTANCE] * 50)
-    height = eyes[:, 2] / analytic.DISTANCE
-    assert math.sin(math.radians(-10)) <= height.min() < 0
-    assert 0.9 < height.max() <= math.sin(math.radians(80))
-    torch.testing.assert_close(poses[:, :, 2], -eyes / analytic.DISTANCE)
-    first, again, other = train_poses(5, 0), train_poses(5, 0), train_poses(5, 1)
+@pytest.mark.parametrize("views", [MOST, VIEWS["mill"]], ids=["most", "mill"])
+def test_poses_look_at_the_middle_from_the_heights_and_the_distance_of_their_scene(views):
+    train, orbit = map(torch.stack, (train_poses(200, 3, views), orbit_poses(360, views)))
+    for poses in (train, orbit):
+        torch.testing.assert_close(poses[:, :, 2], -poses[:, :, 3] / views.distance)
+    low, high = (math.sin(math.radians(x)) for x in (views.lowest, views.highest))
+    height = train[:, 2, 3] / views.distance
+    assert low <= height.min() < low + 0.01 < high - 0.01 < height.max() <= high
+    height = (orbit[:, 2, 3] / views.distance).asin().rad2deg()
+    assert height.min().item() == pytest.approx(views.middle - views.swing, abs=0.01)
+    assert height.max().item() == pytest.approx(views.middle + views.swing, abs=0.01)
+
+
+def test_training_poses_are_those_of_their_seed():
+    first, again, other = (train_poses(5, seed) for seed in (0, 0, 1))
     assert all(map(torch.equal, first, again))
     assert not any(map(torch.equal, first, other))
 
 
-def test_a_scene_can_have_heights_and_a_distance_of_its_own():
-    assert VIEWS.keys() <= MODELS.keys()
-    views = VIEWS["mill"]
-    low, high, distance = views.lowest, views.highest, views.distance
-    eyes = torch.stack(train_poses(200, 0, views))[:, :, 3]
-    assert eyes.norm(dim=1).tolist() == pytest.approx([distance] * 200)
-    heights = (eyes[:, 2] / distance).asin().rad2deg()
-    assert low <= heights.min() < low + 1 < high - 1 < heights.max() <= high
-    orbit = torch.stack(orbit_poses(360, views))[:, :, 3]
-    heights = (orbit[:, 2] / distance).asin().rad2deg()
-    assert heights.min().item() == pytest.approx(views.middle - views.swing, abs=0.01)
-    assert heights.max().item() == pytest.approx(views.middle + views.swing, abs=0.01)
-
-
 def test_the_pictures_of_a_folder_have_the_views_of_their_scene(tmp_path, log):
+    assert VIEWS.keys() <= MODELS.keys()
     analytic.load("mill", **SMALL, root=tmp_path, log=log)
     (file,) = tmp_path.glob("mill-*/transforms_train.json")
     frames = json.loads(file.read_text())["frames"]

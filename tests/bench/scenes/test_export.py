@@ -12,20 +12,13 @@ import torch
 from bench.errors import SteerbenchError
 from bench.scenes import blender, transforms
 from bench.scenes.export import write_blender
-from bench.types import Camera, Scene
+from bench.types import Scene
 
 
 @pytest.fixture
 def moved_scene(tiny_scene: Scene) -> Scene:
     """The unit cube is [-1.5, 1.5]^3 of the data set."""
     return replace(tiny_scene, origin=torch.full((3,), -1.5))
-
-
-def changed(scene: Scene, *cameras: Camera) -> Scene:
-    """The scene with other first cameras in its training split."""
-    train = scene.splits["train"]
-    several = [*cameras, *train.cameras[len(cameras) :]]
-    return replace(scene, splits={**scene.splits, "train": replace(train, cameras=several)})
 
 
 def test_a_scene_that_was_written_is_read_bit_by_bit(moved_scene, quiet_log, tmp_path: Path):
@@ -43,19 +36,17 @@ def test_a_scene_that_was_written_is_read_bit_by_bit(moved_scene, quiet_log, tmp
             assert (camera.cx, camera.cy, camera.width) == (20.0, 16.0, 40)
 
 
-def test_what_is_not_named_is_not_written(moved_scene, quiet_log, tmp_path: Path):
-    write_blender(moved_scene, tmp_path, {"train": "train", "test": "train"}, quiet_log)
-    assert len(list(tmp_path.rglob("*.png"))) == len(moved_scene.splits["train"])
-    found = blender.load(tmp_path, bounds="full", log=quiet_log)
-    assert found.splits["test"].names == found.splits["train"].names
-
-
-def test_pictures_without_alpha_are_opaque(moved_scene, quiet_log, tmp_path: Path):
+def test_pictures_without_alpha_are_opaque_and_a_split_not_named_has_none(
+    moved_scene, quiet_log, tmp_path: Path
+):
     train = moved_scene.splits["train"]
     opaque = replace(train, images=[image[..., :3] for image in train.images])
-    scene = replace(moved_scene, splits={"train": opaque})
+    scene = replace(moved_scene, splits={**moved_scene.splits, "train": opaque})
     write_blender(scene, tmp_path, {"train": "train", "test": "train"}, quiet_log)
-    (image, *_) = blender.load(tmp_path, bounds="full", log=quiet_log).splits["train"].images
+    assert len(list(tmp_path.rglob("*.png"))) == len(train)
+    found = blender.load(tmp_path, bounds="full", log=quiet_log)
+    assert found.splits["test"].names == found.splits["train"].names
+    (image, *_) = found.splits["train"].images
     assert (image[..., 3] == 255).all()
     assert torch.equal(image[..., :3], opaque.images[0])
 
@@ -66,9 +57,10 @@ def test_pictures_without_alpha_are_opaque(moved_scene, quiet_log, tmp_path: Pat
 def test_lenses_that_one_angle_does_not_describe_are_in_other_fields(
     lens, moved_scene, quiet_log, tmp_path: Path
 ):
-    cameras = moved_scene.splits["train"].cameras
-    count = len(cameras) if "cx" in lens or len(lens) == 1 else 1
-    scene = changed(moved_scene, *(replace(camera, **lens) for camera in cameras[:count]))
+    train = moved_scene.splits["train"]
+    count = len(train) if "cx" in lens or len(lens) == 1 else 1
+    cameras = [replace(c, **lens) if n < count else c for n, c in enumerate(train.cameras)]
+    scene = replace(moved_scene, splits={"train": replace(train, cameras=cameras)})
     write_blender(scene, tmp_path, {"train": "train", "test": "train"}, quiet_log)
     with pytest.raises(SteerbenchError, match="camera_angle_x"):
         blender.load(tmp_path, bounds="full", log=quiet_log)
@@ -78,6 +70,6 @@ def test_lenses_that_one_angle_does_not_describe_are_in_other_fields(
     (tmp_path / "transforms.json").write_text(json.dumps(record))
     found = transforms.load(tmp_path, split_every=4, log=quiet_log)
     (camera, *_) = found.splits["test"].cameras
-    wanted = scene.splits["train"].cameras[0]
+    wanted = cameras[0]
     shown = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
     assert shown == (wanted.fx, wanted.fy, wanted.cx, wanted.cy, wanted.width, wanted.height)

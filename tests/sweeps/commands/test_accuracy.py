@@ -95,15 +95,7 @@ def test_the_kernels_alone_train_and_render_nothing(steerbench, measured, monkey
     assert json.loads(outcome.out.splitlines()[-1]) == {"kernels": [ERROR], "settings": []}
 
 
-@pytest.mark.parametrize(
-    ("argv", "message"),
-    [
-        (["--within", "much"], "--within: expected decibels, 0.1dB for example, got 'much'"),
-        (["--filter", "colour"], "no knob has 'colour' in its name; expected part of one of share"),
-        (["budget=demmo"], "Did you mean demo?"),
-    ],
-)
-def test_what_is_wrong_is_said_before_anything_is_computed(steerbench, measured, argv, message):
-    outcome = steerbench("accuracy", *argv)
+def test_a_filter_that_fits_no_knob_is_refused(steerbench, measured):
+    outcome = steerbench("accuracy", "--filter", "colour")
     assert outcome.status == 2
-    assert message in outcome.err
+    assert "no knob has 'colour' in its name; expected part of one of share" in outcome.err
