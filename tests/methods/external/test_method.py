@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from textwrap import dedent
 
-import psutil
 import pytest
 import torch
 
@@ -223,14 +222,6 @@ def test_a_training_that_failed_leaves_nothing_to_load(
     with pytest.raises(SteerbenchError, match="ValueError: too bad"):
         external(worker(lines, after="serve(Stores)\n")).fit(tiny_scene, BUDGET, quiet_log)
     assert [path.name for path in tmp_path.glob("outputs/stages/external-*/*")] == ["lock"]
-
-
-def test_it_ends_with_the_method(worker, external):
-    method = external(worker())
-    assert method.name == "Grey"
-    process = psutil.Process(method._worker._process.pid)
-    del method
-    assert not process.is_running()
 
 
 # Our own renderers in another process

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from bench.console import ConsoleLog
-from bench.types import Budget, Log, Rays, Scene, Split, SteerbenchError, Unavailable, composite
+from bench.types import Budget, Rays, Scene, Split, SteerbenchError, Unavailable, composite
 from methods.instant_ngp.cases import cases
 from methods.instant_ngp.field import HashField
 from methods.instant_ngp.pixels import RUN, UNSEEN
@@ -208,13 +208,7 @@ def test_options_that_make_no_sense_are_refused(name: str, value: float) -> None
         TrainingOptions(**{name: value})
 
 
-def test_a_checkpoint_that_cannot_be_written_says_so(
-    ball_scene: Scene, tmp_path: Path, quiet_log: Log
-) -> None:
-    training = new_training(ball_scene)
-    with pytest.raises(SteerbenchError, match=r"cannot write to .*gone"):
-        loop.train(training, tmp_path / "gone" / "field.safetensors", "training", quiet_log)
-    assert training.step == 0  # before it is trained
+def test_a_checkpoint_that_cannot_be_written_says_so(tmp_path: Path) -> None:
     with pytest.raises(SteerbenchError, match=r"gone.*cannot write the checkpoint"):
         checkpoint.write(tmp_path / "gone" / "field.safetensors", {}, {})
 

@@ -5,13 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pytest
 import torch
 from torch import Tensor
 
 from methods.kernels.spherical import CHANNELS, spherical_harmonics
-
-BACKENDS = ["reference", "cpu"]
 
 
 def sphere_quadrature() -> tuple[Tensor, Tensor]:
@@ -24,12 +21,11 @@ def sphere_quadrature() -> tuple[Tensor, Tensor]:
     return directions, torch.tensor(weights).repeat_interleave(16) * (2 * math.pi / 16)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_they_are_orthonormal(backend: str) -> None:
+def test_they_are_orthonormal() -> None:
     directions, weights = sphere_quadrature()
-    values = spherical_harmonics(directions.float(), backend=backend).double()
+    values = spherical_harmonics(directions, backend="reference")
     gram = (values * weights[:, None]).T @ values
-    torch.testing.assert_close(gram, torch.eye(CHANNELS).double(), rtol=0, atol=1e-5)
+    torch.testing.assert_close(gram, torch.eye(CHANNELS).double(), rtol=0, atol=1e-12)
 
 
 def test_degree_by_parity_and_order_by_rotation() -> None:

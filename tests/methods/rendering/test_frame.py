@@ -18,6 +18,7 @@ from methods.rendering.frame import everywhere, rays_at_matter, render_frame, re
 from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import FAINT, Sampling
 from tests.methods.conftest import GRID, Cloud, Work, look_at_the_middle
+from tests.methods.solids import Solid, wall
 
 
 @pytest.mark.parametrize(("turn", "lift"), [(0.0, 0.0), (0.13, 0.7), (0.6, -1.2)])
@@ -114,11 +115,7 @@ def test_at_once_rays_look_as_in_rounds(
 
 
 def test_samples_behind_the_early_stop_are_hardly_evaluated() -> None:
-    field = HashField(GRID, precision="fp32", generator=torch.Generator().manual_seed(0))
-    field.density = lambda positions: (  # type: ignore[method-assign]
-        torch.full((len(positions),), 1e5),
-        torch.zeros(len(positions), 16),
-    )
+    field = Solid(wall(0.0), density=1e5)
     occupancy = Occupancy(torch.ones(32, 32, 32, dtype=torch.bool))
     rays, work = cast(look_at_the_middle(0.0, 0.0)), Work()
     pixels = render_rays(field, rays, occupancy, work, Sampling())

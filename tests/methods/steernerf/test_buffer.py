@@ -25,7 +25,6 @@ from tests.methods.solids import Solid, ball, wall
 
 RELEASE = np.load(Path(__file__).parents[2] / "data" / "steernerf_release.npz")
 """Two frames of 10 x 12 pixels, brought into a third of 40 x 48 by the released code."""
-BACKENDS = ["reference", "cpu"]
 
 
 def frame_of(camera: Camera, depth: Tensor | None = None, alpha: float = 1.0) -> FeatureFrame:
@@ -45,40 +44,35 @@ def low_camera(scale: int) -> Camera:
     return scale_camera(replace(full, fx=9.0 * scale, fy=10.0 * scale), 8, 6)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("scale", [1, 2, 3, 4])
-def test_a_still_frame_is_shown_in_the_first_pixel_of_each_cell(scale: int, backend: str) -> None:
+def test_a_still_frame_is_shown_in_the_first_pixel_of_each_cell(scale: int) -> None:
     """Off by s / 2 - 1/2 pixels from the middle of the cell."""
     low = low_camera(scale)
     full = scale_camera(low, 8 * scale, 6 * scale)
     cloud = Cloud.of(frame_of(low))
-    index, depth = cloud.splat(full, backend)
+    index, depth = cloud.splat(full, "auto")
     assert torch.equal(index[::scale, ::scale].flatten(), torch.arange(48).int())
     assert (index >= 0).sum() == 48
     # Coordinates up to 2 are rounded a dozen times.
     torch.testing.assert_close(depth, frame_of(low).depth.flatten(), rtol=0, atol=24 * 2.0**-24)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_frame_of_nothing_is_shown_nowhere_else(backend: str) -> None:
+def test_a_frame_of_nothing_is_shown_nowhere_else() -> None:
     """Its points lie at its camera: behind, or in front of, any other."""
     low = low_camera(2)
     cloud = Cloud.of(frame_of(low, torch.full((6, 8), math.inf), alpha=0.0))
     torch.testing.assert_close(cloud.points, low.c2w[:, 3].expand(48, 3), rtol=0, atol=1e-11)
     ahead = replace(low, c2w=low.c2w.clone())
     ahead.c2w[:, 3] += 0.1 * low.c2w[:, 2]
-    index, _ = cloud.splat(ahead, backend)
+    index, _ = cloud.splat(ahead, "auto")
     assert (index == -1).all()
-    index, _ = cloud.expected().splat(low, backend)
+    index, _ = cloud.expected().splat(low, "auto")
     assert (index == -1).all()
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("age", [1, 2])
 @pytest.mark.parametrize("which", ["zero_upsampling", "direct"])
-def test_features_land_where_the_released_code_puts_them(
-    which: str, age: int, backend: str
-) -> None:
+def test_features_land_where_the_released_code_puts_them(which: str, age: int) -> None:
     """`warp_zero_upsampling`, with which it trains, and `warp_direct`, with which it renders. Six
     pixels of one frame are empty: they must write nothing that is seen."""
     given = {name: torch.from_numpy(RELEASE[f"warp.{name}"]) for name in ("poses", "depth")}
@@ -87,7 +81,7 @@ def test_features_land_where_the_released_code_puts_them(
     depth, values = given["depth"][age], torch.from_numpy(features).permute(1, 2, 0)
     seen = depth > 0
     frame = FeatureFrame(cameras[age], values, depth.where(seen, math.inf), seen.float())
-    points = reproject([Cloud.of(frame)], scale_camera(cameras[0], 48, 40), 6, backend)
+    points = reproject([Cloud.of(frame)], scale_camera(cameras[0], 48, 40), 6, "auto")
     # Features are moved, not computed: no rounding at all.
     wanted = torch.from_numpy(RELEASE[f"warp.{which}"][age]).permute(1, 2, 0)
     nothing = torch.zeros(1, points.values.shape[1])

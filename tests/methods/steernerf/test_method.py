@@ -18,11 +18,8 @@ from methods.engines.openvino_engine import OpenVino
 from methods.engines.torch_engine import TorchEngine
 from methods.steernerf.method import SteerNerf
 from methods.steernerf.options import RangeReduction, Skips
-from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.unet import UNet
-from methods.steernerf.views import Views
 from tests.methods.models import (
-    new_pipeline,
     small_joint,
     small_model,
     small_motion,
@@ -190,32 +187,3 @@ def test_settings_that_do_not_fit_are_refused() -> None:
         new_method(after=0.3)
     with pytest.raises(ValueError, match=r"range.mode: expected off without .* got paper"):
         new_method(frames=0, range=RANGED)
-
-
-def recorded(scene: Scene, log: Log, frames: int, seed: int = 0) -> list[torch.Tensor]:
-    """The inputs of the network in three views."""
-    pipeline = new_pipeline(small_model(frames=frames))
-    views = Views(pipeline, scene, small_joint(), seed, log)
-    return [inputs for (inputs,) in views.inputs(3)]
-
-
-def test_a_frame_is_recorded_behind_as_many_as_the_buffer_holds_and_one_more(
-    ball_scene: Scene, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rendered, features = [], Pipeline.features
-
-    def counted(self, view, preceding, *rest):
-        rendered.append((view.full.c2w, len(preceding)))
-        return features(self, view, preceding, *rest)
-
-    monkeypatch.setattr(Pipeline, "features", counted)
-    frames = recorded(ball_scene, quiet_log, 1)
-    assert [preceding for _, preceding in rendered] == 3 * [0, 1, 1]
-    train = ball_scene.splits["train"].cameras
-    views = [train[place].c2w for place in (0, 8, 16)]
-    assert all(map(torch.equal, [c2w for c2w, _ in rendered[2::3]], views))
-    assert [inputs.shape for inputs in frames] == 3 * [(1, 2 * 4, 32, 32)]
-    assert not torch.equal(frames[0], frames[1])
-    # The seed decides the motions.
-    assert torch.equal(recorded(ball_scene, quiet_log, 1)[0], frames[0])
-    assert not torch.equal(recorded(ball_scene, quiet_log, 1, seed=1)[0], frames[0])

@@ -140,17 +140,13 @@ def test_what_is_not_skipped_is_more_work_and_longer_steps_and_earlier_stops_are
         ((30, 33), (40, 42), (slice(19, 43), slice(29, 53))),  # 3 + 16 rows, 2 + 16 columns: 24
         ((0, 1), (97, 100), (slice(0, 24), slice(76, 100))),  # it stays inside the picture
         ((5, 85), (20, 84), (slice(0, 90), slice(12, 92))),  # no larger than the picture
+        ((0, 0), (0, 0), (slice(0, 24), slice(0, 24))),  # a view of nothing has one, too
     ],
 )
 def test_the_part_that_is_drawn_surrounds_matter(rows, columns, part) -> None:
     seen = torch.zeros(90, 100, dtype=torch.bool)
     seen[slice(*rows), slice(*columns)] = True
     assert near_matter(seen) == part
-
-
-def test_a_view_of_nothing_has_a_part_too() -> None:
-    part = near_matter(torch.zeros(90, 100, dtype=torch.bool))
-    assert [side.stop - side.start for side in part] == [24, 24]
 
 
 @pytest.mark.parametrize("scale", [1, 3, 4, 8])
@@ -178,9 +174,10 @@ def test_far_from_matter_a_picture_is_background_and_near_it_that_of_the_whole()
     lens = {"fx": 500.0, "fy": 500.0, "cx": 400.0, "cy": 400.0}
     camera, pipeline = replace(CAMERA, width=800, height=800, **lens), new_pipeline()
     whole = replace(USUAL, skip=replace(USUAL.skip, background=False))
+    work = Work(), Work()
     some, every = (
-        pipeline.render(camera, Buffer(maxlen=2), rendering, NullProbe())
-        for rendering in (USUAL, whole)
+        pipeline.render(camera, Buffer(maxlen=2), rendering, probe)
+        for rendering, probe in zip((USUAL, whole), work, strict=True)
     )
     assert torch.equal(every.alpha, some.alpha)
     seen = every.alpha[::4, ::4] > 0
@@ -196,6 +193,9 @@ def test_far_from_matter_a_picture_is_background_and_near_it_that_of_the_whole()
     # Float32, sums of a few hundred products, in another order where the size is another.
     torch.testing.assert_close(some.rgb[inner], every.rgb[inner], rtol=0, atol=1e-5)
     assert not torch.equal(some.rgb, every.rgb)
+    less, more = (probe.done["products"] for probe in work)
+    left_out = (~drawn).float().mean() * pipeline.renderer.network.products(drawn[None, None])
+    assert more - less == pytest.approx(left_out.item(), rel=1e-4)
 
 
 def test_an_engine_gets_a_network_that_draws_everything() -> None:
@@ -208,13 +208,3 @@ def test_an_engine_gets_a_network_that_draws_everything() -> None:
         pipeline.render(camera, Buffer(maxlen=2), USUAL, NullProbe())
         (after,) = readable(network)(inputs)
     assert torch.equal(before, after)
-
-
-def test_drawing_less_is_less_work() -> None:
-    camera = replace(CAMERA, width=800, height=800, cx=400.0, cy=400.0)
-    products = []
-    for background in (False, True):
-        work, skip = Work(), replace(USUAL.skip, background=background)
-        new_pipeline().render(camera, Buffer(maxlen=2), replace(USUAL, skip=skip), work)
-        products.append(work.done["products"])
-    assert products[1] < 0.1 * products[0]

@@ -13,8 +13,8 @@ from methods.steernerf.views import COMPARED, Views
 from tests.methods.models import new_pipeline, small_joint, small_model
 
 
-def views_of(scene: Scene, log: Log) -> Views:
-    return Views(new_pipeline(small_model(frames=1)), scene, small_joint(), 0, log)
+def views_of(scene: Scene, log: Log, seed: int = 0) -> Views:
+    return Views(new_pipeline(small_model(frames=1)), scene, small_joint(), seed, log)
 
 
 @torch.no_grad()
@@ -65,3 +65,28 @@ def test_frames_are_rendered_as_in_training(
     monkeypatch.setattr(Pipeline, "render", watched)
     views.inputs(2)
     assert seen == 2 * [views.joint.rendering(views.pipeline.model)]
+
+
+def test_a_frame_is_recorded_behind_as_many_as_the_buffer_holds_and_one_more(
+    ball_scene: Scene, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rendered, features = [], Pipeline.features
+
+    def counted(self, view, preceding, *rest):
+        rendered.append((view.full.c2w, len(preceding)))
+        return features(self, view, preceding, *rest)
+
+    monkeypatch.setattr(Pipeline, "features", counted)
+    frames, again, other = (
+        [inputs for (inputs,) in views_of(ball_scene, quiet_log, seed).inputs(3)]
+        for seed in (0, 0, 1)
+    )
+    assert [preceding for _, preceding in rendered] == 9 * [0, 1, 1]
+    train = ball_scene.splits["train"].cameras
+    views = [train[place].c2w for place in (0, 8, 16)]
+    assert all(map(torch.equal, [c2w for c2w, _ in rendered[2::3]], 3 * views))
+    assert [inputs.shape for inputs in frames] == 3 * [(1, 2 * 4, 32, 32)]
+    assert not torch.equal(frames[0], frames[1])
+    # The seed decides the motions.
+    assert torch.equal(again[0], frames[0])
+    assert not torch.equal(other[0], frames[0])

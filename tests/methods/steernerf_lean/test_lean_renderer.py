@@ -15,7 +15,6 @@ from torch.nn import functional
 from torch.utils.flop_counter import FlopCounterMode
 
 from methods.steernerf_lean import lean_renderer
-from methods.steernerf_lean.cells import REACH
 from methods.steernerf_lean.lean_renderer import (
     LEAK,
     PRETRAINED,
@@ -30,6 +29,7 @@ from tests.methods.observations import (
     before,
     doubled,
     enlarged,
+    everywhere,
     new_renderer,
     observe,
     shaken,
@@ -40,20 +40,10 @@ BLENDING = 6 * 2.0**-24
 """Error of base + share (other - base), less the background and with it again, of size 1."""
 
 
-def reached(observation: LeanObservation) -> Tensor:
-    """[h, w] bool: cells within REACH of matter, a cell at a time."""
-    seen = observation.frame.alpha > 0
-    active = torch.zeros_like(seen)
-    for row, column in seen.nonzero().tolist():
-        above, left = max(row - REACH, 0), max(column - REACH, 0)
-        active[above : row + REACH + 1, left : column + REACH + 1] = True
-    return active
-
-
 def dense(renderer: LeanRenderer, observation: LeanObservation) -> Tensor:
     """The same network on all cells, with dense convolutions of pictures that are masked."""
     scale, background = renderer.layout.scale, observation.background
-    active = reached(observation)
+    active = everywhere(torch.ones(len(observation.cells)), observation) > 0
     drawn_at = active.repeat_interleave(scale, 0).repeat_interleave(scale, 1)[..., None]
     base = enlarged(observation, scale) - background[:3]
 
@@ -113,7 +103,7 @@ def test_cells_are_drawn_as_by_a_dense_network(
     matter = torch.rand(12, 14, generator=torch.Generator().manual_seed(2)) < share
     observation = observe(12, 14, channels=channels, scale=scale, matter=matter)
     renderer = shaken(new_renderer(channels, scale, history=history, blocks=blocks))
-    assert (reached(observation).float().mean() < 0.9) == (share < 1)
+    assert (len(observation.cells) < 0.9 * 12 * 14) == (share < 1)
     want = dense(renderer.double(), doubled(observation))
     assert (want != 1).any()
     got = renderer([doubled(observation)]).pictures[0]

@@ -184,13 +184,9 @@ def test_the_weights_of_several_scenes_are_what_a_renderer_starts_from(
         assert written[name].isfinite().all(), name
         assert written[name].any(), name  # the last three were 0 before the training
     monkeypatch.setattr(renderers, "PRETRAINED", output)
-    started = RENDERER(3, 1, 4)
-    assert started.network.state_dict().keys() == written.keys()
-    for name, weight in started.network.state_dict().items():
-        assert torch.equal(weight, written[name].float()), name
-    for channels, frames in ((6, 1), (3, 0), (4, 0)):
-        other = RENDERER(channels, frames, 4)
-        assert torch.equal(other.network.trunk[0].spread, started.network.trunk[0].spread)
+    for channels, frames in ((3, 1), (6, 1), (3, 0), (4, 0)):
+        started = RENDERER(channels, frames, 4)
+        assert torch.equal(started.network.trunk[0].spread, written["trunk.0.spread"].float())
 
 
 def test_features_that_mean_something_else_in_every_scene_are_refused(
