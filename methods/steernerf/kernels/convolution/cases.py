@@ -94,7 +94,7 @@ def _weight_off(given: Given) -> Tensor:
     most = A_T.sum(0)  # |A| 1
     sums = torch.einsum("niyxab,a,b->iab", tiles, most, most)
     count = given["parts"][0][:, 0].numel()
-    return (2 * count + 2 * count + 24) * U32 * (G24.T @ sums @ G24 / 24**2)
+    return (4 * count + 24) * U32 * (G24.T @ sums @ G24 / 24**2)
 
 
 def _bias_off(given: Given) -> float:
