@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from bench.metrics import psnr
 from bench.motion import preceding, viewing_target
@@ -34,16 +35,18 @@ class Views:
     log: Log
 
     def inputs(self, count: int) -> list[Inputs]:
-        """The inputs of the network in `count` views."""
-        network, recorded = self.pipeline.renderer.network, list[Inputs]()
+        """The inputs of the network in `count` views, as an engine gets them: drawn whole."""
+        renderer, recorded = self.pipeline.renderer, list[Inputs]()
 
-        def keep(_: object, inputs: Inputs) -> None:
+        def record(*inputs: Tensor) -> Inputs:
             recorded.append(tuple(x.clone() for x in inputs))  # the next frame overwrites them
+            return renderer.network(*inputs)
 
-        self.pipeline.renderer.engine = None  # which would be called instead
+        renderer.engine = None  # the network itself draws the frames before
         for _, camera, buffer in self._spread(count, "frames to build the network on"):
-            with network.register_forward_pre_hook(keep):
-                self._render(camera, buffer, NullProbe())
+            renderer.engine = Built(record, 0)
+            self._render(camera, buffer, NullProbe())
+            renderer.engine = None
         return recorded
 
     def compare(self, networks: Sequence[Built]) -> list[Figures]:
