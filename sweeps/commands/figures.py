@@ -47,7 +47,7 @@ HEADING = re.compile(r"^#{1,2} (.*)$", re.MULTILINE)
 PICTURE = re.compile(r"^!\[(.*)\]\((.+)\)$", re.MULTILINE)
 CELL = re.compile(r"(?<!\\)\|")  # what is between two cells of a table
 UNIT = re.compile(r",| [↑↓]")  # begins what a heading says after its name
-TABLE = re.compile(r"(?:^\|.*\|\n?)+", re.MULTILINE)
+TABLE = re.compile(r"^\|.*\|$(?:\n^\|.*\|$)*", re.MULTILINE)
 
 COLOURS_OF_A_PLOT = 2**14  # at most; a picture with more shows renderings
 QUALITY = 90  # of WebP

@@ -128,6 +128,14 @@ def test_a_document_shows_some_columns_of_a_table(steerbench, checkout):
     assert "unknown column 'PSRN'. Did you mean PSNR?" in outcome.err
 
 
+def test_what_follows_a_table_is_not_a_line_of_it(steerbench, checkout):
+    (checkout / "README.md").write_text(region("run", "", "all"))
+    assert steerbench("figures", "--only", "run").status == 0
+    shown = (checkout / "README.md").read_text()
+    table = [place for place, x in enumerate(shown.splitlines()) if x.startswith("|")]
+    assert shown.splitlines()[table[-1] + 1] == ""
+
+
 # The documents of this checkout
 
 
