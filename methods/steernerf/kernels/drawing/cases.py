@@ -89,9 +89,10 @@ def _frames(
 ) -> Given:
     """A frame and points of `preceding` ones, which a sixteenth of the pixels show."""
     generator = torch.Generator().manual_seed(height + width)
-    points = max(height * width * preceding, 1)
+    each, points = height * width, max(height * width * preceding, 1)
     shape = preceding, height * scale, width * scale
-    index = torch.randint(0, points, shape, generator=generator, dtype=torch.int32)
+    index = torch.randint(0, each, shape, generator=generator, dtype=torch.int32)
+    index += each * torch.arange(preceding, dtype=torch.int32)[:, None, None]  # of each frame
     seen = torch.rand(shape, generator=generator) < 1 / 16
     return {
         "present": torch.rand(height, width, channels, generator=generator),
