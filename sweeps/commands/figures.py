@@ -47,7 +47,7 @@ HEADING = re.compile(r"^#{1,2} (.*)$", re.MULTILINE)
 PICTURE = re.compile(r"^!\[(.*)\]\((.+)\)$", re.MULTILINE)
 CELL = re.compile(r"(?<!\\)\|")  # what is between two cells of a table
 UNIT = re.compile(r",| [↑↓]")  # begins what a heading says after its name
-TABLE = re.compile(r"^\|.*\|$(?:\n^\|.*\|$)*", re.MULTILINE)
+TABLE = re.compile(r"^\|.*\|$(?:\n\|.*\|$)*", re.MULTILINE)
 
 COLOURS_OF_A_PLOT = 2**14  # at most; a picture with more shows renderings
 QUALITY = 90  # of WebP
@@ -188,11 +188,11 @@ def _region(
         found = (PICTURE if part == "picture" else TABLE).search(text)
         if not found:
             raise SteerbenchError(f"{document}: figures {name} | {heading}: it has no {part}")
-        text = found[0].strip()
+        text = found[0]
     to_results = RESULTS if document.parent == Path() else RESULTS.relative_to(document.parent)
 
     def shorter(table: re.Match[str]) -> str:
-        head, rule, *lines = table[0].strip().splitlines()
+        head, rule, *lines = table[0].splitlines()
         kept = [x for x in lines if part != "bold" or x.startswith("| **")][:most]
         if part == "bold":  # where all lines are, none stands out
             kept = [re.sub(r"\*\*(.*?)\*\*", r"\1", x, count=1) for x in kept]
