@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
@@ -10,7 +11,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-from bench.errors import SteerbenchError, unexpected, unknown
+from bench.errors import SteerbenchError, Unavailable, unexpected, unknown
 from bench.scenes.blender import camera_file, picture_path
 from bench.scenes.files import data_folder, frames_of, read_json
 from bench.scenes.nsvf import picture_files
@@ -95,8 +96,8 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
     fixed = [f"+experiment={table.name}", *words, *([f"scene={data.layout}"] if data else [])]
     first = [] if single or data else [f"scene={scenes[0]}"]
     experiment = composed([*fixed, *first])
-    if on_gpu(str(experiment.get("device"))):
-        fixed.insert(1, "engine=torch")  # Table 1 uses OpenVINO, which computes on a CPU
+    if replaced := _engine_here(experiment):
+        fixed[1:1] = replaced
         experiment = composed([*fixed, *first])
     build(experiment, "budget")  # refuses a wrong one before anything runs
     several, beyond = build(experiment, "tables")
@@ -135,6 +136,17 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
             where = {"table": table.name, "block": title, "line": line.label, "scene": scene}
             jobs.append(Planned(config, command, told, turns, **where))
     return jobs
+
+
+def _engine_here(experiment: DictConfig) -> list[str]:
+    """What replaces the engine of an experiment, which is OpenVINO for some tables, where that
+    cannot compute: on a GPU, or in half precision on a CPU without it."""
+    if on_gpu(str(experiment.get("device"))):
+        return ["engine=torch"]
+    with suppress(Unavailable):
+        build(experiment, "engine")
+        return []
+    return ["engine=torch", "precision=fp32"] if experiment.precision == "bf16" else []
 
 
 def _lines(table: PaperTable, beyond: bool) -> Iterator[tuple[str, PaperTable, Line, bool]]:

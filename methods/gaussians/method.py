@@ -37,6 +37,7 @@ class GaussianSplatting:
     training: TrainingOptions
     fitting: Fitting
     count: int
+    steps: int | None = None  # None: `budget.renderer_steps`
     degree: int = 3
     start: Literal["field", "scratch"] = "field"
     checkpoint: str | None = None
@@ -64,6 +65,7 @@ class GaussianSplatting:
 
     def __post_init__(self) -> None:
         expect(self.count >= 1, "count", "1 or more", self.count)
+        expect(self.steps is None or self.steps >= 1, "steps", "1 or more, or none", self.steps)
         expect(self.degree in range(4), "degree", "0 to 3", self.degree)
         check_stop(self.stop)
         refuse_gpu(self.backend, self.name)
@@ -83,10 +85,10 @@ class GaussianSplatting:
         self.background = scene.background.to(self.setup.device)
 
     def _trained(self, scene: Scene, budget: Budget, log: Log) -> Gaussians:
-        setup, field = self.setup, None
+        setup, field, steps = self.setup, None, self.steps or budget.renderer_steps
         key = {
             "scene": scene.digest,
-            "steps": budget.renderer_steps,
+            "steps": steps,
             "fitting": asdict(self.fitting),
             "count": self.count,
             "degree": self.degree,
@@ -102,7 +104,7 @@ class GaussianSplatting:
         finished = log.stage_dir("gaussians", key) / "gaussians.safetensors"
         begun = time.monotonic()
         gaussians = self._untrained(field, scene, finished.exists())
-        work = GaussianTraining(gaussians, scene, budget.renderer_steps, self.fitting, setup)
+        work = GaussianTraining(gaussians, scene, steps, self.fitting, setup)
         work.seconds = time.monotonic() - begun
         loop.train(work, finished, "gaussians", log)
         self.train_s = work.seconds + (0.0 if field is None else field.train_s)

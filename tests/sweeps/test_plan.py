@@ -13,6 +13,7 @@ import torch
 from PIL import Image
 
 from bench.errors import SteerbenchError
+from methods.engines import openvino_engine
 from reports.paper_tables import DATA_SETS
 from sweeps.commands.breakdown import with_engine
 from sweeps.commands.paper import data_set
@@ -126,7 +127,8 @@ def test_tables_share_the_run_that_they_have_in_common():
         for name, line in (("table4", "K = 6"), ("table6", "T = 2^16"), ("table3", "L = 2"))
     ]
     assert jobs[0].key == jobs[1].key != jobs[2].key
-    assert described(jobs[2].config) == described(jobs[0].config)
+    of_training = [{**described(job.config)["method"], "engine": None} for job in jobs]
+    assert of_training[0] == of_training[2]
 
 
 def test_both_stages_of_table_5_march_with_the_same_step():
@@ -184,6 +186,22 @@ def test_the_engine_of_the_first_table_is_one_for_device_and_precision(
     assert every == {"methods.engines.openvino_engine.OpenVino"}
     words = with_engine([*asked, "device=auto"])
     assert composed(words).engine._target_.split(".")[-1] in targets
+
+
+@pytest.mark.parametrize(
+    ("cpu", "computed"),
+    [(["FP32", "BF16"], ("OpenVino", "bf16")), (["FP32"], ("TorchEngine", "fp32"))],
+)
+@pytest.mark.parametrize("name", ["table2", "table3"])
+def test_tables_of_times_are_in_half_precision_where_the_cpu_has_it(
+    name, cpu, computed, monkeypatch
+):
+    monkeypatch.setattr(openvino_engine, "_capabilities", lambda openvino: cpu)
+    jobs = plan(TABLES[name], ["seed=0", "device=cpu"])
+    engines = {(job.config.engine._target_.split(".")[-1], job.config.precision) for job in jobs}
+    assert engines == {computed}
+    (asked,) = {job.config.precision for job in plan(TABLES[name], ["seed=0", "precision=fp32"])}
+    assert asked == "fp32"
 
 
 # Scenes and data sets
