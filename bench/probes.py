@@ -114,7 +114,7 @@ class StageClock:
     def report(self, ns: int, stages_ns: Mapping[str, int], peak_bytes: int | None = None) -> None:
         """Take the times of another process's clock; see `bench.types.Probe`."""
         self._charge()
-        stages = dict(stages_ns) if self._stages else {}
+        stages = {name: of for name, of in stages_ns.items() if name != OTHER and self._stages}
         stages[OTHER] = ns - sum(stages.values())
         self._told.update(stages_ns=stages, wall_ns=sum(self._ns.values()), peak_bytes=peak_bytes)
 

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+import pandas as pd
 
 from bench.intervals import half_interval, path_interval
+from bench.results import STEADY
 from reports.comparison import metric_format
-from reports.regression import Figures, frames_apart
 from reports.runs import Repeated, Run
 from reports.tables import ABSENT, Table, decimal
 
@@ -149,7 +150,7 @@ def gap(metric: str, one: Repeated, other: Repeated) -> Gap:
     if metric.startswith("size_bytes"):
         return Gap(by, 0.0, "computed, not sampled", True)
     if len(pairs) == 1:
-        return _over_frames(metric, *pairs[0][:2]) or Gap(by, math.nan, "one figure each", False)
+        return Gap(by, *_over_frames(metric, *pairs[0][:2]), False)
     kinds = zip(*(_identity(run, metric)[:2] for run, *_ in pairs), strict=True)
     counts = zip((len(set(kind)) for kind in kinds), ("scenes", "seeds"), strict=True)
     over = " × ".join(f"{count} {kind}" for count, kind in counts if count > 1)
@@ -162,22 +163,30 @@ def _identity(run: Run, metric: str) -> tuple[object, ...]:
     return (run.record["scene"]["digest"], run.facts["seed"], machine)
 
 
-def _over_frames(metric: str, run: Run, twin: Run) -> Gap | None:
-    """The gap between two runs over their common frames; None if these have no figures."""
-    figures = Figures.of(run), Figures.of(twin)
-    one, other = (of.frames.get(metric, {}) for of in figures)
-    common = [name for name in one if name in other]
+def _over_frames(metric: str, run: Run, twin: Run) -> tuple[float, str]:
+    """Half the interval of the gap between two runs, from the frames that both have, and over what;
+    nan if the frames have no figures."""
+    one, other = _of_frames(metric, run), _of_frames(metric, twin)
+    common = one.index.intersection(other.index)
     if len(common) < 2:
-        return None
-    over = f"{len(common)} frames of one seed"
-    if not _by_ratio(metric):
-        by_frame = frames_apart(metric, *figures)
-        return Gap(float(by_frame.mean()), path_interval(by_frame), over, False)
-    below, above = (np.array([of[name] for name in common]) for of in (one, other))
-    # A mean that is wrong by a small share shifts the logarithm by this share.
-    shares = above / above.mean() - below / below.mean()
-    by = apart(metric, below.mean(), above.mean())
-    return Gap(by, path_interval(shares), over, False)
+        return math.nan, "one figure each"
+    below, above = one[common].to_numpy(), other[common].to_numpy()
+    if _by_ratio(
+        metric
+    ):  # a mean that is wrong by a small share shifts the logarithm by this share
+        by_frame = above / above.mean() - below / below.mean()
+    else:  # of equal pictures, both are infinite
+        by_frame = np.array([apart(metric, *pair) for pair in zip(below, above, strict=True)])
+    return path_interval(by_frame), f"{len(common)} frames of one seed"
+
+
+def _of_frames(metric: str, run: Run) -> pd.Series:
+    """The figures of the steady frames of a run, if it has any, otherwise of all; those of a stage
+    include the stages inside it."""
+    steady = run.frames[run.frames["phase"] == STEADY]
+    frames = (steady if len(steady) else run.frames).set_index("frame")
+    parts = [name for name in frames if name == metric or name.startswith(f"{metric}/")]
+    return frames[parts].sum(axis=1, min_count=1).dropna()
 
 
 def _by_ratio(metric: str) -> bool:

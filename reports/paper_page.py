@@ -66,7 +66,7 @@ def write_paper_page(
 
 def _conclusions(found: Sequence[Comparison]) -> Iterator[Part]:
     """The main findings of the paper beside what was measured here, and how to read verdicts."""
-    sampled = sum(each.here.half > 0 for each in found)
+    sampled = sum(each.here.proves and each.here.half > 0 for each in found)
     words = {"count": len(found), "tally": tally(found), "sampled": sampled}
     if found:
         yield from (f"## {PAGE['conclusions']}", finding_table(found))

@@ -70,9 +70,7 @@ class Figures:
         for metric in values:
             if metric not in steady or metric == "peak_bytes":  # older runs have that column
                 continue
-            averaged = steady.dropna(subset=["psnr"]) if metric in QUALITY else steady
-            if metric == "flicker":  # the first frame of a path has none
-                averaged = averaged.dropna(subset=[metric])
+            averaged = steady.dropna(subset=[metric]) if metric in QUALITY else steady
             names = averaged["frame"].astype(str) + ": " + averaged["name"].fillna("")
             if averaged[metric].notna().all():
                 frames[metric] = dict(zip(names, averaged[metric].astype(float), strict=True))

@@ -47,6 +47,7 @@ examples
 """
 
 # Errors of the file system that deserve a plain sentence rather than a traceback.
+INTERRUPTED = 130  # an exit status, as of a shell
 REFUSALS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR}
 
 
@@ -67,7 +68,7 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
     except SteerbenchError as error:
         return _fail(str(error), 2)
     except KeyboardInterrupt:
-        return _fail("interrupted", 130)
+        return _fail("interrupted", INTERRUPTED)
     except BrokenPipeError:
         # Python flushes standard output again at exit; redirect that to /dev/null.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -75,7 +76,7 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
     except OSError as error:
         if error.errno not in REFUSALS:
             raise
-        return _fail(f"{error.filename}: {error.strerror}", 2)
+        return _fail(": ".join(map(str, filter(None, (error.filename, error.strerror)))), 2)
 
 
 def _fail(message: str, status: int) -> int:
@@ -106,7 +107,8 @@ class Parser(argparse.ArgumentParser):
 def parsed(argv: Sequence[str]) -> argparse.Namespace:
     """The arguments of a command other than `run`.
 
-    Among them are the name of the `command`, None if there was none, and the innermost `parser`.
+    Among them are the name of the `command`, None if there was none, the innermost `parser`, and
+    what was `typed`.
     """
     overview: dict[str, str] = {}
     for name, about in COMMANDS.items():
@@ -123,7 +125,7 @@ def parsed(argv: Sequence[str]) -> argparse.Namespace:
     commands = parser.add_subparsers(prog=parser.prog, help=argparse.SUPPRESS)
     for name, about in COMMANDS.items():
         below = commands.add_parser(name, description=about["description"])
-        below.set_defaults(command=name, parser=below)
+        below.set_defaults(command=name, parser=below, typed=list(argv))
         for argument, given in _arguments(about):
             below.add_argument(argument, **given)
     if argv and not argv[0].startswith("-") and argv[0] not in COMMANDS:

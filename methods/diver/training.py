@@ -39,7 +39,7 @@ class DiverLessons(PixelOptions):
         super().__post_init__()
         expect(self.corner_rate > 0, "corner_rate", "more than 0", self.corner_rate)
         expect(self.sparsity >= 0, "sparsity", "0 or more", self.sparsity)
-        expect(self.prune_rays >= 0, "prune_rays", "0 or more", self.prune_rays)
+        expect(self.prune_rays >= 1, "prune_rays", "1 or more", self.prune_rays)
         expect(0 <= self.prune_at <= 1, "prune_at", "a share in [0, 1]", self.prune_at)
         expect(0 <= self.prune_below < 1, "prune_below", "a weight in [0, 1)", self.prune_below)
 

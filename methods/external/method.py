@@ -113,9 +113,15 @@ class External:
         """The versions of what its environment holds."""
         if self.lock is None:
             return self._about["packages"]
-        done = subprocess.run(shlex.split(self.lock), capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise SteerbenchError(f"method.lock: {self.lock}: {done.stderr.strip()[-200:]}")
+        try:
+            done = subprocess.run(
+                shlex.split(self.lock), capture_output=True, text=True, check=True
+            )
+        except OSError as error:
+            raise SteerbenchError(f"method.lock: {self.lock}: {error.strerror}") from error
+        except subprocess.CalledProcessError as error:
+            why = error.stderr.strip()[-200:]
+            raise SteerbenchError(f"method.lock: {self.lock}: {why}") from error
         return {"lock": done.stdout}
 
     def settings(self) -> dict[str, str]:
@@ -145,10 +151,11 @@ class External:
         folder = log.stage_dir("external", self._key(job))
         finished = folder / "trained.json"
         with missing(finished, log) as untrained:
-            if untrained or "load" not in can:
+            if untrained:
                 self.train_s = self._train(folder, job, log)
-                with whole(finished) as new:
-                    new.write_text(json.dumps({"train_s": self.train_s}) + "\n")
+                if "load" in can:  # otherwise the next process trains again, alone
+                    with whole(finished) as new:
+                        new.write_text(json.dumps({"train_s": self.train_s}) + "\n")
             else:
                 log.info(f"{self.name}: found in {folder}")
                 stored = {**job, "state": str(folder / "state")}
@@ -162,7 +169,7 @@ class External:
             "scene": self._scene.digest,
             "name": self.name,
             "options": {name: value for name, value in self.options.items() if name not in knobs},
-            "files": [sha256(file) for file in self.reads],
+            "files": [sha256(file) for file in self.reads if file.is_file()],
             "environment": self._environment,
             "device": self._about["device"],
             **computed_by(write_blender),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -25,7 +24,7 @@ from methods.kernels.dispatch import refuse_gpu
 from methods.kernels.encode import HashGrid
 from methods.kernels.types import expect
 from methods.rendering.frame import FeatureFrame
-from methods.training import loop
+from methods.training import checkpoint, loop
 
 
 @dataclass(kw_only=True, eq=False)
@@ -66,6 +65,8 @@ class GaussianSplatting:
     def __post_init__(self) -> None:
         expect(self.count >= 1, "count", "1 or more", self.count)
         expect(self.steps is None or self.steps >= 1, "steps", "1 or more, or none", self.steps)
+        expect(self.start in ("field", "scratch"), "start", "field or scratch", self.start)
+        expect(self.stored in ("fp32", "int8"), "stored", "fp32 or int8", self.stored)
         expect(self.degree in range(4), "degree", "0 to 3", self.degree)
         check_stop(self.stop)
         refuse_gpu(self.backend, self.name)
@@ -96,33 +97,33 @@ class GaussianSplatting:
             "backend": setup.backend,
             "device": setup.device.type,
             "seed": setup.seed,
-            **computed_by(GaussianTraining),
+            **computed_by(type(self)),
         }
         if self.start == "field":
             field = train_field(setup, scene, budget, log)
             key["field"] = setup.key(scene, budget)
         finished = log.stage_dir("gaussians", key) / "gaussians.safetensors"
-        begun = time.monotonic()
-        gaussians = self._untrained(field, scene, finished.exists())
-        work = GaussianTraining(gaussians, scene, steps, self.fitting, setup)
-        work.seconds = time.monotonic() - begun
-        loop.train(work, finished, "gaussians", log)
-        self.train_s = work.seconds + (0.0 if field is None else field.train_s)
+
+        def begin() -> GaussianTraining:
+            return GaussianTraining(
+                self._untrained(field, scene), scene, steps, self.fitting, setup
+            )
+
+        tensors, seconds = loop.trained(begin, finished, "gaussians", log)
+        with checkpoint.restoring(finished):
+            gaussians = Gaussians(**tensors).to(setup.device)
+        self.train_s = seconds + (0.0 if field is None else field.train_s)
         if not (exported := finished.with_suffix(".ply")).exists():
             ply.write(gaussians, scene, exported)
             log.info(f"Gaussians for other programs: {exported}")
         return gaussians
 
-    def _untrained(self, field: TrainedField | None, scene: Scene, blank: bool) -> Gaussians:
-        """The Gaussians before training; with `blank`, placeholders of the same shape."""
+    def _untrained(self, field: TrainedField | None, scene: Scene) -> Gaussians:
+        """The Gaussians before training."""
         device = self.setup.device
-        if blank:
-            points = colours = torch.zeros(self.count, 3, device=device)
-            scales = torch.ones(self.count, device=device)
-        else:
-            given = scene, self.count, torch.Generator(device).manual_seed(self.setup.seed)
-            points, colours = anywhere(*given) if field is None else on_surfaces(field, *given)
-            scales = self.fitting.size * spacing(points)
+        given = scene, self.count, torch.Generator(device).manual_seed(self.setup.seed)
+        points, colours = anywhere(*given) if field is None else on_surfaces(field, *given)
+        scales = self.fitting.size * spacing(points)
         return Gaussians.at(points, colours, scales, self.fitting.opacity, self.degree)
 
     def reset(self) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -35,16 +35,12 @@ SKIPS = {
 }
 TABLES = (14, 16, 17, 19)  # sizes of the hash table, log2 T
 
-
-def not_skipped(skips: Mapping[str, str]) -> list[Variant]:
-    """Variants that each switch off one of `skips`."""
-    return [Variant(f"{name} not skipped", (f"{word}=false",)) for name, word in skips.items()]
-
-
 RANGES = turned("range", f"{HOW}.range.epsilon", (0.01, 0.03, 0.1), f"{HOW}.range.mode=paper")
 STUDY = Study(
     knobs={
-        "skips": not_skipped(SKIPS),
+        "skips": [
+            Variant(f"{name} not skipped", (f"{word}=false",)) for name, word in SKIPS.items()
+        ],
         "step length": turned("step", f"{HOW}.step", (1.5, 2, 3)),
         "stop": turned("stop", f"{HOW}.stop", ("1e-1", "3e-2", "1e-3", "1e-4")),
         "range reduction": RANGES,
@@ -116,6 +112,7 @@ class SteerNerf:
     ) -> None:
         mode, possible = rendering.range.mode, "off without preceding frames (L = 0)"
         expect(model.frames > 0 or mode == "off", "rendering.range.mode", possible, mode)
+        expect(steps is None or steps >= 1, "steps", "1 or more, or none", steps)
         self.stage2 = self.kind(model, renderer, joint, after)
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
         engine.check(self.setup.device)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from bench.study import Variant, turned
 from bench.types import Budget, Log, Scene
-from methods.steernerf.method import SKIPS, STUDY, SteerNerf, not_skipped
+from methods.steernerf.method import STUDY, SteerNerf
 from methods.steernerf_lean.training import LeanStage2
 
 HOW = "method.rendering"
@@ -19,7 +19,10 @@ SHARES = [REFINED[0], *REFINED[2:]]
 SCRATCH = "method.renderer.init=scratch"
 REFINED_AS_IT_IS = "method.joint.refined_step=2"  # it would follow the step
 PARTS = {"feature_reprojection/surface": "surface", "refinement": "refinement"}
-PAPERS = ("method=steernerf", "method.renderer.width=64", "budget.renderer_steps=8")
+PAPERS = (
+    *("method=steernerf", "method.renderer.width=64"),
+    *("method.steps=null", "budget.renderer_steps=8"),
+)
 """The release's network; its cost does not depend on how well it is trained."""
 
 
@@ -36,7 +39,6 @@ class SteerNerfLean(SteerNerf):
         STUDY,
         knobs={
             **STUDY.knobs,
-            "skips": not_skipped(SKIPS),
             "step length": STEPS,
             "refined step length": REFINED_STEPS,
             "refined share": REFINED,

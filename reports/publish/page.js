@@ -14,8 +14,8 @@ document.querySelectorAll(".hint").forEach((hint) => { hint.hidden = false; });
 
 /** The number that a cell begins with, or its text; null for an empty cell or one without a figure. */
 function valueOf(cell) {
-  const text = cell.textContent.trim();
-  if (["", "–", "n/a"].includes(text.split(" / ")[0])) return null;
+  const text = cell.textContent.trim().replace(/^×/, "");
+  if (["", "–", "n/a"].includes(text.split(" (")[0])) return null;
   const number = /^[-+]?[\d,]*\.?\d+(e[-+]?\d+)?(?![\w/])/i.exec(text);
   return number ? Number(number[0].replaceAll(",", "")) : text;
 }

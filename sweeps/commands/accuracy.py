@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import re
 import shlex
-import sys
 from collections.abc import Mapping, Sequence
 
 from omegaconf import DictConfig
@@ -54,7 +53,7 @@ def main(options: argparse.Namespace) -> int:
     with device_lock("cpu", log):
         experiments = experiment_rows(checks.found("experiments"), options.repeats, log)
     show(experiment_table(experiments))
-    command = shlex.join(["steerbench", *sys.argv[1:]])
+    command = shlex.join(["steerbench", *options.typed])
     folder = options.report or launcher.outputs / "accuracy"
     page = write_tradeoff(experiments, rows, folder, command)
     log.info(f"report: {page}")

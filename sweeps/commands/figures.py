@@ -105,7 +105,9 @@ def _measure(words: Sequence[str], folder: Path, made: Made) -> bool:
     """Run a command and keep its page in `folder`; whether it succeeded."""
     folder.mkdir(parents=True, exist_ok=True)
     terminal.shown.clear()
-    if cli.guard(cli.dispatch, words):
+    if status := cli.guard(cli.dispatch, words):
+        if status == cli.INTERRUPTED:
+            raise KeyboardInterrupt
         return False
     if "{folder}" not in made.command:
         parts = (f"## {table.title}\n\n{table.markdown()}\n" for table in terminal.shown)
@@ -256,14 +258,14 @@ def _copy(picture: Path, name: str) -> str:
 
 def _rows(text: str) -> Iterator[list[str]]:
     """The cells of all tables of a page, below the heading of each, an empty line between them."""
+    heading, inside = "", False
     for line in text.splitlines():
         if line.startswith("#"):
             heading = line.lstrip("# ")
-        elif line.startswith("|---"):
-            continue
         elif line.startswith("| "):
-            cells = [cell.strip() for cell in CELL.split(line)[1:-1]]
-            if heading:
-                yield from ([], [heading])
+            if not inside:
+                yield from ([], [heading]) if heading else ([],)
                 heading = ""
+            cells = [cell.strip() for cell in CELL.split(line)[1:-1]]
             yield [cell.replace("\\|", "|").strip("*") for cell in cells]
+        inside = line.startswith("|")

@@ -183,7 +183,7 @@ class Viewer:
             self._turned[place] = now
         except SteerbenchError as error:
             self._refuse(knob, error)
-        for browser in self.browsers.values():
+        for browser in list(self.browsers.values()):
             browser.drawn = None
 
     def _refuse(self, what: str, error: SteerbenchError) -> None:

@@ -13,8 +13,10 @@ sys.path.append(str(Path(__file__).parents[3]))
 import torch
 
 from bench.cameras import place_camera
+from bench.provenance import sources
 from bench.types import Camera, NullProbe, Scene
 from methods.gaussians import ply
+from methods.gaussians.model import Gaussians
 from methods.rendering.frame import FeatureFrame
 from steerbench_worker import serve
 
@@ -24,7 +26,8 @@ class Ply:
     precision = "fp32"
 
     def __init__(self, file: str, stop: float = 1e-4) -> None:
-        self.files, self.stop, self.knobs = [file], stop, {"stop": [1e-1, 1e-2, 1e-3]}
+        self.files = [file, *map(str, sources(Gaussians).values())]  # kernels are loaded later
+        self.stop, self.knobs = stop, {"stop": [1e-1, 1e-2, 1e-3]}
         self.device = "cuda" if torch.cuda.is_available() else "cpu"
 
     def load(self, job: Any) -> None:
