@@ -77,7 +77,7 @@ def test_a_time_of_another_clock_replaces_the_stages_and_leaves_that_until_then(
     readings = iter([100, 103, 110, 190, 191])
     clock = StageClock("worker's cuda", clock=lambda: next(readings), stages=stages)
     with clock.frame():  # 100
-        clock.report(50, {"march": 30}, peak_bytes=7)  # 103
+        clock.report(50, {"march": 30, "other": 5}, peak_bytes=7)  # 103
         clock.count("rays", 2)
     with clock.frame():  # 190 to 191
         pass

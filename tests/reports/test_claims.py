@@ -98,6 +98,12 @@ def test_one_run_of_each_line_is_compared_frame_by_frame(run, apart):
     assert found.half == pytest.approx(path_interval(np.array(apart)))
 
 
+def test_the_gap_of_one_seed_is_that_of_the_figures_shown(run):
+    """Which may be over fewer frames: those that all lines of a table have."""
+    shown = changed(shifted(run, 0.3), {"psnr": run.values["psnr"] + 1.0})
+    assert between([run], [shown]).by == pytest.approx(1.0)
+
+
 def with_times(run: Run, ms: np.ndarray) -> Run:
     frames = run.frames.assign(frame_ms=ms)
     return replace(changed(run, {"frame_ms": ms.mean()}), read_frames=lambda: frames)
@@ -143,7 +149,9 @@ def test_a_stage_includes_the_stages_inside_it(run):
     """The look-up has an inner stage; it takes as long as both."""
     whole = run.values["stage_ms.look-up"] + run.values["stage_ms.look-up/add"]
     slower = changed(run, {"stage_ms.look-up": run.values["stage_ms.look-up"] + whole})
-    assert between([run], [slower], "stage_ms.look-up").by == pytest.approx(math.log(2))
+    found = between([run], [slower], "stage_ms.look-up")
+    assert found.by == pytest.approx(math.log(2))
+    assert found.half == 0  # the frames are the same
 
 
 def test_a_line_not_measured_has_no_gap_nor_have_times_of_different_machines(run):

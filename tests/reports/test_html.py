@@ -77,6 +77,11 @@ def test_every_table_of_the_markdown_page_is_there_with_its_figures_and_marks(pa
     assert cells((page / "report.html").read_text()) == cells(markdown)
 
 
+def test_columns_of_figures_are_aligned_right():
+    page = publish.html_page(["# T", Table("t", ("name", "ms"), (("a", "1.5"),))], [])
+    assert re.findall(r"<t[hd]( [^>]*)?>", page) == 2 * ["", ' style="text-align:right"']
+
+
 def test_nothing_is_loaded_from_elsewhere(page, parsed):
     links = [*parsed.values("src"), *parsed.values("href"), *parsed.values("xlink:href")]
     assert all(link.startswith(("data:", "#")) for link in links)
@@ -186,9 +191,9 @@ return { sorted, left };
 @needs_browser
 def test_a_click_on_a_head_sorts_numbers_as_numbers_the_best_above_and_the_missing_below(tmp_path):
     lines = (
-        ("a", "9.50 / 1.00", "1,000.0"),
-        ("b", "– / 99.00", "n/a"),
-        ("c", "10.25 ± 0.10 / 1.00", "1,001.0"),
+        ("a", "×9.50 (×1.00)", "1,000.0"),
+        ("b", "– (-1.78)", "n/a"),
+        ("c", "10.25 ± 0.10 (+1.00)", "1,001.0"),
         ("d", "-3.00", "2e-3"),
         ("e", "**9.60**", "900.0"),
     )

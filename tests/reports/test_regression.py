@@ -130,9 +130,11 @@ def test_a_baseline_can_have_limits_of_its_own():
 
 
 def test_frames_are_those_that_the_headline_is_the_mean_of(run):
-    table = run.frames.assign(psnr=[30.0, *[math.nan] * (len(run.frames) - 1)], peak_bytes=1.0)
+    some = [30.0, *[math.nan] * (len(run.frames) - 1)]
+    table = run.frames.assign(psnr=30.0, ssim=some, peak_bytes=1.0)
     figures = Figures.of(replace(run, read_frames=lambda: table))
-    assert len(figures.frames["psnr"]) == 1  # the others have no truth
+    assert len(figures.frames["psnr"]) == len(table)
+    assert len(figures.frames["ssim"]) == 1  # as LPIPS that is not measured in every frame
     assert list(figures.frames["frame_ms"].values()) == table["frame_ms"].tolist()
     assert "peak_bytes" in figures.values
     assert "peak_bytes" not in figures.frames  # its headline was the largest of older runs

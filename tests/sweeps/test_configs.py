@@ -13,6 +13,7 @@ from hydra.utils import get_object
 from omegaconf import OmegaConf
 
 from bench.study import Study, Variant
+from methods.steernerf_lean.method import PAPERS
 from sweeps.overrides import CONFIGS, choices, composed, leaves
 from sweeps.variants import declared
 
@@ -107,6 +108,12 @@ def test_a_size_changes_settings_that_are_there(path):
     group = "tables" if owner == "tables" else word.partition("=")[0]
     assert set(leaves(before[group])) == set(leaves(after[group]))
     assert before[group] != after[group]
+
+
+@pytest.mark.parametrize("budget", ["quick", "paper"])
+def test_the_network_of_the_paper_is_timed_after_few_steps_whatever_a_budget_says(budget):
+    config = composed(["method=steernerf_lean", f"budget={budget}", *PAPERS])
+    assert (config.method.steps, config.budget.renderer_steps) == (None, 8)
 
 
 def test_a_word_wins_over_what_a_budget_sets_of_a_method():

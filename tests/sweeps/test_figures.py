@@ -7,6 +7,7 @@ import json
 import re
 import subprocess
 import tomllib
+from argparse import Namespace
 from pathlib import Path
 
 import pytest
@@ -85,6 +86,20 @@ def test_a_command_that_fails_leaves_its_region_and_the_others_are_measured(stee
     assert "nowhere" in outcome.err
     assert (checkout / "docs" / "wrong.md").read_text() == region("wrong", "", "all")
     assert "|run|PSNR, dB ↑|" in (checkout / "README.md").read_text()
+
+
+def test_an_interruption_ends_it(checkout, monkeypatch):
+    def interrupted(argv):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(figures.cli, "dispatch", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        figures.main(Namespace(only=["list"], check=False, data=None))
+
+
+def test_tables_of_a_page_stand_apart_in_its_csv_file():
+    page = "# One\n\n| a |\n|---|\n| 1 |\n\n| b |\n|---|\n| 2 |\n"
+    assert [*figures._rows(page)] == [[], ["One"], ["a"], ["1"], [], ["b"], ["2"]]
 
 
 @pytest.mark.parametrize(

@@ -69,11 +69,11 @@ def test_the_record_holds_the_command_that_was_typed(run, tmp_path):
 
 def test_a_job_that_says_nothing_of_threads_has_the_usual_ones(run, tmp_path):
     usual = torch.get_num_threads()
-    run("-m", "threads=1,null")
+    run("-m", "threads=2,null")
     records = [json.loads((folder / "record.json").read_text()) for folder in stored(tmp_path)]
     asked = [record["made_of"]["config"]["threads"] for record in records]
     had = [record["machine"]["threads"] for record in records]
-    assert dict(zip(asked, had, strict=True)) == {1: 1, None: usual}
+    assert dict(zip(asked, had, strict=True)) == {2: 2, None: usual}
 
 
 def test_a_run_is_sent_each_time_and_stands_where_that_cannot_be_done(run, tmp_path, monkeypatch):

@@ -114,6 +114,7 @@ def test_sizes_that_may_come_are_compiled_before_a_frame_is_timed(
     built = build(OpenVino("fp32"), network, [blanks(2 * quantum)])
     sizes = json.loads((tmp_path / "network.json").read_text())
     assert sizes == [quantum, 2 * quantum, 3 * quantum]
+    assert [shapes[0][0] for shapes in built.run._requests] == sizes
     nothing = cells(0)  # a view of nothing has no cells
     for got, want in zip(built.run(*nothing), network(*nothing), strict=True):
         assert got.shape == want.shape == (0, got.shape[1])

@@ -157,13 +157,14 @@ def test_the_density_grid_follows_the_field_if_it_is_to(ball_scene: Scene) -> No
     for visits in (0, 512):
         training = new_training(ball_scene, replace(OPTIONS, grid_samples=visits))
         before = training.trained.grid.density.clone()
+        occupancy = training.patches.pipeline.occupancy
         training.advance()
         changed = not torch.equal(training.trained.grid.density, before)
         assert changed == (visits > 0)
         kept = training.result()["grid.density"]
         assert torch.equal(kept, training.trained.grid.density)
         assert training.patches.pipeline.occupancy is (
-            training.trained.grid.occupancy if visits else training.patches.pipeline.occupancy
+            training.trained.grid.occupancy if visits else occupancy
         )
 
 
