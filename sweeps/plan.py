@@ -170,7 +170,7 @@ def scenes_of(words: Sequence[str], data: DataSet | None = None) -> list[str]:
     folders = [
         word.partition("=")[2] for word in words if word.lstrip("+").startswith("scene.path=")
     ]
-    return [Path(folders[-1]).name] if folders else _taken(words, "scene")[1] or [""]
+    return [Path(folders[-1].strip("'\"")).name] if folders else _taken(words, "scene")[1] or [""]
 
 
 def data_set_of(scene: str) -> str:

@@ -114,5 +114,5 @@ def words_of_run(key: str | None, words: Sequence[str]) -> list[str]:
     store = Store(Path(composed(words).outputs))
     _, command, *rest = shlex.split(str(store.record(store.whole_key(key))["command"]))
     if command != "run":
-        raise SteerbenchError(f"run {key}: expected one of a method, got pictures that were scored")
+        raise SteerbenchError(f"run {key}: expected one of `steerbench run`, got {command}")
     return [word for word in rest if not word.startswith("hydra.")]

@@ -236,6 +236,7 @@ def test_a_scene_is_compared_with_the_figures_of_its_data_set(monkeypatch):
         (["scene=totem"], ["totem"]),
         (["scene=totem,wires", "seed=1"], ["totem", "wires"]),
         (["scene=nsvf", "scene.path=/data/Barn"], ["Barn"]),
+        (["scene=nsvf", "scene.path='/my data/Barn'"], ["Barn"]),
     ],
 )
 def test_a_scene_is_known_by_its_choice_or_its_folder(words, found):

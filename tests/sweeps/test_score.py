@@ -50,7 +50,7 @@ def test_the_rows_stand_in_the_store_beside_those_of_runs(steerbench, folders, m
     assert {name.split("-")[0] for name in kept} == {"0000"}
     assert sent == ["theirs"]
     refused = steerbench("render", "--run", rows["run"].iloc[0])
-    assert "got pictures that were scored" in refused.err
+    assert "expected one of `steerbench run`, got score" in refused.err
 
 
 def test_the_same_pictures_are_the_same_run_and_others_are_another(steerbench, folders):
