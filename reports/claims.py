@@ -185,7 +185,7 @@ def _of_frames(metric: str, run: Run) -> pd.Series:
     include the stages inside it."""
     steady = run.frames[run.frames["phase"] == STEADY]
     frames = (steady if len(steady) else run.frames).set_index("frame")
-    parts = [name for name in frames if name == metric or name.startswith(f"{metric}/")]
+    parts = [name for name in map(str, frames) if name == metric or name.startswith(f"{metric}/")]
     return frames[parts].sum(axis=1, min_count=1).dropna()
 
 

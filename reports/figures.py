@@ -219,9 +219,9 @@ def frontier_plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Write a PNG: error of a frame against its time, log-log, one point per setting.
 
     The left panel shows the error against the ground truth, with the Pareto frontier as a
-    staircase; the right panel, the error against everything off. Settings on the frontier (those
-    whose `instead` is themselves) and the unchanged one, "as it is", are circled, and
-    named if there is room. What takes more than twice as long as any of the frontier is only named.
+    staircase; the right panel, the error against the first of `rows`. Settings on the frontier
+    (those whose `instead` is themselves) and the unchanged one, "as it is", are circled, and named
+    if there is room. What takes more than twice as long as any of the frontier is only named.
     """
     figure = Figure(figsize=(11, 6.5), layout="constrained")
     truth, off = figure.subplots(1, 2, sharex=True)
@@ -241,11 +241,11 @@ def frontier_plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         best["ms"], _rms(best["psnr"]), where="post", color="black", linewidth=1, label="frontier"
     )
     truth.set_title("against the ground truth: lower left is better")
-    off.set_title("against the same model with everything off")
+    off.set_title(f"against the same model, {rows[0]['setting']}")
     figure.legend(*truth.get_legend_handles_labels(), loc="outside lower center", ncols=6)
     figure.draw_without_rendering()  # fixes the positions of points on the page
     _circle(truth, pd.concat([unchanged, best]), "psnr")
-    _circle(off, unchanged, "psnr_to_first")
+    _circle(off, unchanged[np.isfinite(unchanged["psnr_to_first"])], "psnr_to_first")
     figure.savefig(path, dpi=100)
 
 
