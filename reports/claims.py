@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 
 from bench.intervals import half_interval, path_interval
-from bench.results import STEADY
 from reports.comparison import metric_format
 from reports.runs import Repeated, Run
 from reports.tables import ABSENT, Table, decimal
@@ -171,20 +170,17 @@ def _over_frames(metric: str, run: Run, twin: Run) -> tuple[float, str]:
     if len(common) < 2:
         return math.nan, "one figure each"
     below, above = one[common].to_numpy(), other[common].to_numpy()
-    if _by_ratio(
-        metric
-    ):  # a mean that is wrong by a small share shifts the logarithm by this share
+    if _by_ratio(metric):
+        # A mean that is wrong by a small share shifts the logarithm by this share.
         by_frame = above / above.mean() - below / below.mean()
-    else:  # of equal pictures, both are infinite
+    else:
         by_frame = np.array([apart(metric, *pair) for pair in zip(below, above, strict=True)])
     return path_interval(by_frame), f"{len(common)} frames of one seed"
 
 
 def _of_frames(metric: str, run: Run) -> pd.Series:
-    """The figures of the steady frames of a run, if it has any, otherwise of all; those of a stage
-    include the stages inside it."""
-    steady = run.frames[run.frames["phase"] == STEADY]
-    frames = (steady if len(steady) else run.frames).set_index("frame")
+    """The figures of the steady frames of a run; those of a stage include the stages inside it."""
+    frames = run.steady.set_index("frame")
     parts = [name for name in map(str, frames) if name == metric or name.startswith(f"{metric}/")]
     return frames[parts].sum(axis=1, min_count=1).dropna()
 

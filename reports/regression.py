@@ -10,7 +10,6 @@ import numpy as np
 
 from bench.errors import SteerbenchError
 from bench.intervals import half_interval, path_interval
-from bench.results import STEADY
 from reports.runs import Run
 from reports.tables import QUALITY, Table
 
@@ -49,7 +48,7 @@ class Figures:
     """The figures of a run that later runs are compared with: its headline `values`, by metric.
 
     `frames` has the figures that the headline averages, by metric and by number and name of the
-    frame, in the order of the path: of qualities the steady frames with ground truth, of other
+    frame, in the order of the path: of qualities the steady frames that have them, of other
     metrics all steady frames. `machine` names its processors. `views` is equal for the same frames
     of the same scene under one protocol.
     """
@@ -64,9 +63,7 @@ class Figures:
         """The figures of `run` that have a limit."""
         every = {metric: run.values.get(metric, math.nan) for metric in limits}
         values = {metric: value for metric, value in every.items() if not math.isnan(value)}
-        steady = run.frames[run.frames["phase"] == STEADY]
-        steady = steady if len(steady) else run.frames
-        frames = {}
+        steady, frames = run.steady, {}
         for metric in values:
             if metric not in steady or metric == "peak_bytes":  # older runs have that column
                 continue

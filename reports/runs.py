@@ -44,6 +44,12 @@ class Run:
         """One frame per row."""
         return self.read_frames()
 
+    @property
+    def steady(self) -> pd.DataFrame:
+        """Its steady frames, or all if none are."""
+        steady = self.frames[self.frames["phase"] == STEADY]
+        return steady if len(steady) else self.frames
+
     @cached_property
     def headline(self) -> pd.DataFrame:
         """One row per metric, for the steady frames, or the cold ones if there are no others."""

@@ -46,8 +46,9 @@ examples
 `steerbench COMMAND --help` explains a command.
 """
 
-# Errors of the file system that deserve a plain sentence rather than a traceback.
 INTERRUPTED = 130  # an exit status, as of a shell
+
+# Errors of the file system that deserve a plain sentence rather than a traceback.
 REFUSALS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR}
 
 

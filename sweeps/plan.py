@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
@@ -143,10 +142,13 @@ def _engine_here(experiment: DictConfig) -> list[str]:
     cannot compute: on a GPU, or in half precision on a CPU without it."""
     if on_gpu(str(experiment.get("device"))):
         return ["engine=torch"]
-    with suppress(Unavailable):
-        build(experiment, "engine")
+    if experiment.precision != "bf16":
         return []
-    return ["engine=torch", "precision=fp32"] if experiment.precision == "bf16" else []
+    try:
+        build(experiment, "engine")
+    except Unavailable:
+        return ["engine=torch", "precision=fp32"]
+    return []
 
 
 def _lines(table: PaperTable, beyond: bool) -> Iterator[tuple[str, PaperTable, Line, bool]]:

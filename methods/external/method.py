@@ -106,7 +106,7 @@ class External:
         words = (Path(word) for word in shlex.split(self.command))
         given = [file for path in self.files for file in _files_at(Path(path))]
         loaded = map(Path, self._about["files"])
-        return sorted({*loaded, *given, *(word for word in words if word.is_file())})
+        return sorted(file for file in {*loaded, *given, *words} if file.is_file())
 
     @cached_property
     def _environment(self) -> dict[str, object]:
@@ -169,7 +169,7 @@ class External:
             "scene": self._scene.digest,
             "name": self.name,
             "options": {name: value for name, value in self.options.items() if name not in knobs},
-            "files": [sha256(file) for file in self.reads if file.is_file()],
+            "files": [sha256(file) for file in self.reads],
             "environment": self._environment,
             "device": self._about["device"],
             **computed_by(write_blender),

@@ -49,9 +49,10 @@ class Point(NamedTuple):
 def main(options: argparse.Namespace) -> int:
     """Print a table with the fitted exponents, then its rows as JSON in the last line."""
     words, launcher = settings(options, METHOD, "trajectory=smooth", FEW_STEPS)
-    if "steps" in composed(words).method:  # they would win over those of the budget
-        words = ["method.steps=null", *words]
     config = composed(words, return_hydra_config=True)
+    if config.method.get("steps"):  # they would win over those of the budget
+        words = ["method.steps=null", *words]
+        config = composed(words, return_hydra_config=True)
     points = _points(config, options.axis)
     for point in points:
         composed([*words, *point.settings])  # refused before anything is measured

@@ -88,7 +88,7 @@ def test_a_command_that_fails_leaves_its_region_and_the_others_are_measured(stee
     assert "|run|PSNR, dB ↑|" in (checkout / "README.md").read_text()
 
 
-def test_an_interruption_ends_it(checkout, monkeypatch):
+def test_an_interruption_ends_all_commands(checkout, monkeypatch):
     def interrupted(argv):
         raise KeyboardInterrupt
 
