@@ -274,7 +274,8 @@ def _errors(got: Tensor, want: Tensor) -> Tensor:
         return torch.full((1,), torch.inf, dtype=torch.float64)
     got, want = got.detach().double(), want.detach().double()
     same = (got == want) | (got.isnan() & want.isnan())
-    return torch.where(same, 0, (got - want).abs()).nan_to_num(nan=torch.inf)
+    error = torch.where(same, 0, (got - want).abs())
+    return torch.where(error.isnan(), torch.inf, error)
 
 
 def run_cases(cases: Sequence[Case], devices: Sequence[str], log: Log) -> Iterator[dict[str, Any]]:

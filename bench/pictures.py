@@ -165,9 +165,10 @@ def score(
     table = pd.DataFrame(frames).reindex(columns=["frame", "name", "phase", *scoring.names])
     if times:
         table["frame_ms"] = times
-    summary = phase_rows(table) if times else score_rows(table, scoring.names)
+    of_frames = phase_rows(table) if times else score_rows(table, scoring.names)
+    summary = [{**row, "phase": STEADY} for row in of_frames]
     summary += [single(name, value) for name, value in scoring.whole().items()]
-    rows = pd.DataFrame([{"phase": STEADY, **row} for row in summary]).assign(
+    rows = pd.DataFrame(summary).assign(
         unit=lambda of: [UNITS.get(name.split(".")[0], "1") for name in of["metric"]],
         resolution=resolution(sizes),
         protocol=protocol.name,

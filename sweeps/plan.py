@@ -109,7 +109,12 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
         return composed([*fixed, *groups])
 
     jobs = []
-    for title, block, line, repeated in _lines(table, beyond):
+    lines = list(_lines(table, beyond))
+    if not precisions and any("precision" in line.job for _, _, line, _ in lines):
+        raise SteerbenchError(
+            f"engine: {table.name} has lines at several precisions, and this engine chooses one"
+        )
+    for title, block, line, repeated in lines:
         if "precision" in line.job and line.job["precision"] not in precisions:
             continue
         own_settings = {name: of for name, of in line.job.items() if name not in asked}

@@ -17,7 +17,7 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import as_completed
 from contextlib import AbstractContextManager, nullcontext
 from math import inf
@@ -31,7 +31,7 @@ from omegaconf import DictConfig
 from bench.accuracy import render_in_turns
 from bench.case import failed, timed_rows
 from bench.console import ConsoleLog
-from bench.errors import SteerbenchError
+from bench.errors import SteerbenchError, unexpected
 from bench.types import Camera, Frame, Method, NullProbe, Probe, Scene
 from methods import checks
 from methods.kernels import compiled
@@ -64,6 +64,8 @@ def main(options: argparse.Namespace) -> int:
     """Print a table, then its rows as JSON in the last line; return 1 if any kernel is wrong."""
     if options.command == "compile":
         return _compile()
+    if options.overrides and not options.worth:
+        raise unexpected("settings", "none without --worth", " ".join(options.overrides))
     if options.worth:
         rows = _worth(options)
         title = "What the fast version of a kernel brings"
@@ -73,9 +75,9 @@ def main(options: argparse.Namespace) -> int:
         cases = [case for case in checks.found("cases") if options.filter in case.subject]
         with device_lock("auto", log):
             rows = timed_rows(cases, device, compiled(device), options.repeats, log)
-        if not rows:
-            raise SteerbenchError(f"--filter: no kernel has {options.filter!r} in its name")
         table = Table("Kernels", COLUMNS, tuple(map(_line, _saving_most_first(rows))))
+    if not rows:
+        raise SteerbenchError(f"--filter: no kernel has {options.filter!r} in its name")
     show(table)
     print_rows(rows)
     return int(any(row.get("status", "ok") != "ok" for row in rows))
@@ -138,39 +140,42 @@ def _worth(options: argparse.Namespace) -> list[Row]:
     typed = [word.partition("=")[2] for word in words if word.startswith("method=")]
     names = swept(words).get("method", typed) or list(choices("method", words))
     rest = [*SETTINGS, *(word for word in words if not word.startswith("method="))]
-    each = (_rows_of_worth(name, rest, options.frames, options.repeats) for name in names)
-    return [row for rows in each for row in rows]
+    return [row for name in names for row in _rows_of_worth([*rest, f"method={name}"], options)]
 
 
-def _rows_of_worth(name: str, words: Sequence[str], frames: int, repeats: int) -> list[Row]:
-    """A row for each kernel that the method calls."""
-    config = composed([*words, f"method={name}"])
+def _rows_of_worth(words: Sequence[str], options: argparse.Namespace) -> list[Row]:
+    """A row for each kernel that the method in `words` calls."""
+
+    def wanted(calls: Collection[str]) -> set[str]:
+        return {kernel for kernel in calls if options.filter in kernel.rpartition(".")[2]}
+
+    config = composed(words)
     settings = checked_settings(config)
     log = ConsoleLog(Path(settings.outputs))
-    scene, path, protocol = common_ground(config, frames)
+    scene, path, protocol = common_ground(config, options.frames)
     with device_lock(settings.device, log):
         with kernel_calls() as in_training:
             method, _ = _trained(config, scene, AS_IT_IS)
         with kernel_calls() as in_frames, torch.no_grad():
             for step in path.steps:
                 method.render(step.camera, NullProbe())
-        lines: dict[str, Any] = {one: Forced(method, one) for one in (AS_IT_IS, *in_frames)}
-        rendered = render_in_turns(lines, scene, path, protocol, repeats, log)
-        trained: dict[str, list[float]] = {one: [] for one in (AS_IT_IS, *in_training)}
-        for _ in range(repeats):
+        lines: dict[str, Any] = {one: Forced(method, one) for one in (AS_IT_IS, *wanted(in_frames))}
+        rendered = render_in_turns(lines, scene, path, protocol, options.repeats, log)
+        trained: dict[str, list[float]] = {one: [] for one in (AS_IT_IS, *wanted(in_training))}
+        for _ in range(options.repeats):
             for kernel, seconds in trained.items():
                 seconds.append(_trained(config, scene, kernel)[1])
     frame_ms = {row["setting"]: row["ms"] for row in rendered}
     return [
         {
-            "method": name,
+            "method": method.name,
             "kernel": kernel.rpartition(".")[2],
             "frame_ms": frame_ms[AS_IT_IS],
             "frame_ms_reference": frame_ms.get(kernel),
             "training_s": median(trained[AS_IT_IS]),
             "training_s_reference": median(trained[kernel]) if kernel in trained else None,
         }
-        for kernel in sorted(in_frames | in_training)
+        for kernel in sorted(wanted(in_frames | in_training))
     ]
 
 

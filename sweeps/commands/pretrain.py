@@ -7,6 +7,7 @@ from pathlib import Path
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
+from bench.threads import torch_threads
 from sweeps.configured import build, checked_settings
 from sweeps.overrides import composed
 
@@ -22,6 +23,8 @@ SETTINGS = (
 def main(options: argparse.Namespace) -> int:
     """Fit a field to each of many random scenes, train one renderer on all of them, write it."""
     config = composed([*SETTINGS, *options.overrides])
+    if "variant" not in config.scene:
+        raise SteerbenchError("scene: expected one that differs in each variant, such as medley")
     log = ConsoleLog(Path(checked_settings(config).outputs))
     method, budget = build(config, "method"), build(config, "budget")
     if not hasattr(method, "pretrain_renderer"):
@@ -29,5 +32,6 @@ def main(options: argparse.Namespace) -> int:
     scenes = []
     for config.scene.variant in range(options.scenes):
         scenes.append(build(config, "scene", log=log))
-    method.pretrain_renderer(scenes, budget, options.output, log)
+    with torch_threads(budget.threads):
+        method.pretrain_renderer(scenes, budget, options.output, log)
     return 0

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import re
 import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from fractions import Fraction
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import torch
@@ -37,8 +39,10 @@ def main(options: argparse.Namespace) -> int:
     config = composed(words)
     log, scene = ConsoleLog(Path(config.outputs)), scene_of(config)
     trajectory = build(config, "trajectory", scene)
-    if options.video and trajectory.resolution == MIXED:
-        raise SteerbenchError("--video: expected frames of one size, the trajectory has several")
+    if options.video:
+        if trajectory.resolution == MIXED:
+            raise SteerbenchError("--video: expected frames of one size, the path has several")
+        pyav(options.video)  # before any training
     others = [composed(beside(name, words)) for name in options.beside]
     methods = [trained(each, log) for each in (config, *others)]
     cameras = [step.camera for step in trajectory.steps]
@@ -75,6 +79,15 @@ def _drawn(method: Method, camera: Camera, index: int) -> np.ndarray:
     return as_bytes(quantise(frame.rgb.cpu()))
 
 
+def pyav(path: Path) -> ModuleType:
+    """The library that writes the video `path`; raises Unavailable if it is not installed."""
+    try:
+        return importlib.import_module("av")
+    except ImportError as error:
+        how = f"{install_command('video')}; without --video the pictures alone are written"
+        raise Unavailable(f"{path}: videos need PyAV: {how}") from error
+
+
 @contextmanager
 def recorded(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
     """A function that appends a picture, uint8 [H, W, 3], to a video; all have the same size.
@@ -83,11 +96,7 @@ def recorded(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
     Raises Unavailable without PyAV, and SteerbenchError if the file cannot be written or its ending
     is not that of a video.
     """
-    try:
-        import av
-    except ImportError as error:
-        how = f"{install_command('video')}; without --video the pictures alone are written"
-        raise Unavailable(f"{path}: videos need PyAV: {how}") from error
+    av = pyav(path)
     try:
         with av.open(path, "w") as container:
             stream = container.add_stream("h264", rate=Fraction(fps).limit_denominator(1000))

@@ -6,6 +6,7 @@ The page is built on viser; it also has the knobs of the methods, and their figu
 from __future__ import annotations
 
 import argparse
+import importlib
 from collections.abc import Hashable, Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
@@ -13,6 +14,7 @@ from functools import partial
 from io import StringIO
 from itertools import chain, count
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -87,6 +89,7 @@ class Viewer:
     """
 
     def __init__(self, wanted: Sequence[Sequence[str]], host: str, port: int) -> None:
+        viser()  # before any training
         configs = [composed(words) for words in wanted]
         outputs = Path(configs[0].outputs)
         self.wanted, self.log, self.folder = wanted, ConsoleLog(outputs), outputs / "view"
@@ -245,14 +248,18 @@ class Viewer:
         return drawn[names.index(shown)].rgb if shown in names else first
 
 
-def _serve(host: str, port: int) -> ViserServer:
+def viser() -> ModuleType:
+    """The library that serves the page; raises Unavailable if it is not installed."""
     try:
-        import viser
+        return importlib.import_module("viser")
     except ImportError as error:
         raise Unavailable(f"view needs viser: {install_command('viewer')}") from error
+
+
+def _serve(host: str, port: int) -> ViserServer:
     try:
         with redirect_stdout(StringIO()):  # viser would print its address in a box
-            server = viser.ViserServer(host=host, port=port, label="steerbench", verbose=False)
+            server = viser().ViserServer(host=host, port=port, label="steerbench", verbose=False)
     except OSError as error:
         raise SteerbenchError(f"cannot serve {host}:{port}: {error}") from error
     server.gui.configure_theme(show_logo=False, show_share_button=False)

@@ -106,7 +106,8 @@ def test_the_number_nearest_to_its_tolerance_is_reported() -> None:
     assert nearest((off,), (zero,), (tolerance,)) == pytest.approx((0.02, 0.01))
     assert nearest((off, zero), (zero, off), (1.0, 0.1)) == (0.5, pytest.approx(0.1))
     assert nearest((zero[:2],), (zero,), (1.0,)).error == torch.inf
-    assert largest_error((torch.tensor([torch.nan]),), (torch.ones(1),)) == torch.inf
+    for wrong in (torch.nan, torch.inf):
+        assert largest_error((torch.tensor([wrong]),), (torch.ones(1),)) == torch.inf
     assert nearest((zero[:0],), (zero[:0],), (tolerance[:0],)) == (0.0, 0.0)
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from bench.results import Store
+from bench.results import STEADY, Store
 from reports.trackers import TRACKERS
 
 QUICK = ("protocol.name=quick", "protocol.lpips=[]")
@@ -101,6 +101,7 @@ def test_reported_times_are_in_the_rows_and_marked(steerbench, folders):
     rows = store.rows().set_index("metric")
     assert rows["value"][["frame_ms", "fps"]].tolist() == [20, 50]
     assert rows["unit"]["frame_ms.p50"] == "ms"
+    assert rows["phase"]["frame_ms.p50"] == rows["phase"]["frame_ms"] == STEADY
     assert set(rows["device"]) == {"reported"}
     assert store.frames(keys[0])["frame_ms"].tolist() == [10, 30]
     assert "reported" in steerbench("results").out

@@ -1,13 +1,14 @@
-"""Videos: as many pictures as were given, of their size and colours."""
+"""Videos: as many pictures as were given, of their size and colours; missing libraries."""
 
 from __future__ import annotations
 
+import re
 import sys
 
 import numpy as np
 import pytest
 
-from bench.errors import SteerbenchError, Unavailable
+from bench.errors import SteerbenchError
 from sweeps.commands.render import recorded
 
 
@@ -29,8 +30,15 @@ def test_a_video_shows_its_pictures_in_turn_and_what_is_no_video_is_one_line(tmp
         take(np.zeros((8, 8, 3), np.uint8))
 
 
-def test_without_pyav_it_says_how_to_get_it(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "av", None)
-    refused = pytest.raises(Unavailable, match=r"pip install .*\[video\]")
-    with refused, recorded(tmp_path / "a.mp4", fps=10):
-        pass
+@pytest.mark.parametrize(
+    ("library", "extra", "command"),
+    [("av", "video", ("render", "--video", "a.mp4")), ("viser", "viewer", ("view",))],
+)
+def test_a_missing_library_is_noticed_before_any_training(
+    steerbench, monkeypatch, library, extra, command
+):
+    monkeypatch.setitem(sys.modules, library, None)
+    monkeypatch.setattr(f"sweeps.commands.{command[0]}.trained", lambda *of: pytest.fail("trained"))
+    outcome = steerbench(*command, "scene=totem", "scene.width=16", "scene.train=2", "scene.test=2")
+    assert outcome.status == 2
+    assert re.search(rf"pip install .*\[{extra}\]", outcome.err)
