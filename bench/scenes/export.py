@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -46,17 +46,19 @@ def write_blender(scene: Scene, folder: Path, files: Mapping[str, str], log: Log
     """
     for split in sorted(set(files.values())):
         (folder / split).mkdir(parents=True)
-        paths = [folder / picture_file(split, n) for n in range(len(scene.splits[split]))]
-        pairs = list(zip(paths, scene.splits[split].images, strict=True))
-        in_parallel(_write_picture, pairs, f"write pictures of {scene.name}", log)
+        images = scene.splits[split].images
+
+        def write(number: int, split: str = split, images: Sequence[Tensor] = images) -> None:
+            _write_picture(folder / picture_file(split, number), images[number])
+
+        in_parallel(write, range(len(images)), f"write pictures of {scene.name}", log)
     for name, split in files.items():
         cameras = [data_camera(scene, camera) for camera in scene.splits[split].cameras]
         record = _transforms(cameras, split)
         (folder / camera_file(name)).write_text(json.dumps(record, indent=1) + "\n")
 
 
-def _write_picture(pair: tuple[Path, Tensor]) -> None:
-    path, pixels = pair
+def _write_picture(path: Path, pixels: Tensor) -> None:
     if pixels.shape[2] == 3:
         pixels = torch.cat((pixels, torch.full_like(pixels[..., :1], 255)), dim=2)
     Image.fromarray(pixels.numpy()).save(path, compress_level=1)  # quickly
