@@ -110,3 +110,6 @@ class KiloNerf(FieldStudent):
         parts = checkpoint.part(tensors, "field.")
         self.grid = Grid(parts["networks"], parts["corner"], parts["side"])
         super().restore(tensors)
+
+    def settings(self) -> dict[str, str]:
+        return super().settings() | {"precision": "fp32"}  # whatever that of the teacher is

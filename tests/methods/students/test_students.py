@@ -116,6 +116,11 @@ def test_a_training_is_found_again(name: str, ball_scene: Scene, shared_log: Log
     assert torch.equal(*pictures)
 
 
+def test_a_row_of_kilonerf_names_its_own_precision_not_that_of_the_teacher() -> None:
+    method = SMALL["kilonerf"](teacher=replace(TEACHER, precision="bf16"))
+    assert method.settings()["precision"] == "fp32"
+
+
 @names
 def test_by_triton_there_is_none(name: str) -> None:
     with pytest.raises(Unavailable, match=f"{name} has no Triton kernels: use backend=auto"):
