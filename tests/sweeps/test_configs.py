@@ -22,7 +22,7 @@ CHOICES = [f"{group}={name}" for group in GROUPS for name in choices(group)]
 SIZES = sorted((CONFIGS / "size").glob("*/*.yaml"))
 USERS = {
     **{"field": "method=ngp", "unet": "method=steernerf", "tables": "method=ngp"},
-    **{"totem": "scene=totem", "mill": "scene=mill"},
+    **{"totem": "scene=totem", "mill": "scene=mill", "student": "method=nerf"},
 }
 """Of sizes that are not of one method: a word that chooses what takes them in."""
 
@@ -72,10 +72,9 @@ def test_a_choice_says_what_it_is_and_composes_to_something_that_exists(choice):
 
 @pytest.mark.parametrize("name", choices("scene"))
 def test_a_scene_has_every_option_of_its_loader_and_no_other_default(name):
-    config = OmegaConf.to_container(OmegaConf.load(CONFIGS / "scene" / f"{name}.yaml"))
+    config = dict(node(f"scene={name}"))
     parameters = inspect.signature(get_object(config.pop("_target_"))).parameters
     assert config.pop("_convert_") == "all"  # loaders take plain lists
-    config.pop("defaults", None)  # sizes
     unused = {"log"} if name == "medley" else {"log", "variant"}  # of medley alone
     assert set(config) == set(parameters) - unused
     size = {"width", "height"} if name == "mill" else set()  # larger than the other pictures

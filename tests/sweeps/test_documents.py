@@ -204,9 +204,8 @@ def settings_there_are() -> set[str]:
     """Every setting, and every group of settings, of any choice."""
     found = set()
     for group in GROUPS:
-        for name, path in choices(group).items():
-            inherits = group == "method"
-            node = composed([f"method={name}"]).method if inherits else OmegaConf.load(path)
+        for name in choices(group):
+            node = composed([f"{group}={name}"])[group]
             settings: Any = OmegaConf.to_container(node, resolve=False)
             for leaf in overrides.leaves(settings, f"{group}."):
                 parts = leaf.split(".")
