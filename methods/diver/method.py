@@ -13,7 +13,7 @@ from torch.nn import functional
 from bench.study import Axis, Study, Variant, turned
 from bench.types import Budget, Probe, Rays, Scene
 from methods.diver.kernels.segments import Corners, Layers, render_segments
-from methods.diver.model import CornerModel, Decoder, encode_directions
+from methods.diver.model import CornerModel, Decoder
 from methods.diver.training import DiverLessons, DiverTraining
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.corner_gather import CORNERS
@@ -21,6 +21,7 @@ from methods.kernels.types import Occupancy, Pixels, expect
 from methods.rendering.compaction import to_host
 from methods.rendering.frame import Render
 from methods.students.method import Student
+from methods.students.networks import encode_directions
 
 Stored = Literal["bf16", "fp32"]
 

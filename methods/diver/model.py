@@ -15,20 +15,11 @@ from methods.kernels.corner_gather import corner_gather
 from methods.kernels.encode import encode
 from methods.kernels.types import expect
 from methods.kernels.voxel_walk import Crossings, Voxels
-from methods.students.networks import positional
+from methods.students.networks import DIRECTION_CHANNELS, Dense
 from methods.students.voxels import corners_of, occupied_voxels
 from methods.training import checkpoint
 
 CHANNELS = 32  # features of a corner, and width of every layer between input and output
-
-FREQUENCIES = 4
-DIRECTION_CHANNELS = 3 + 2 * 3 * FREQUENCIES
-
-
-def encode_directions(directions: Tensor) -> Tensor:
-    """Unit vectors of ray `directions` [R, 3], with sines and cosines of pi, 2 pi, 4 pi and 8 pi
-    times them: [R, 27]."""
-    return positional(functional.normalize(directions, dim=-1), FREQUENCIES)
 
 
 class Decoder(nn.Module):
@@ -38,11 +29,11 @@ class Decoder(nn.Module):
 
     def __init__(self, generator: torch.Generator | None = None) -> None:
         super().__init__()
-        self.first = _linear(CHANNELS, CHANNELS, generator)
-        self.second = _linear(CHANNELS, CHANNELS, generator)
-        self.third = _linear(1 + CHANNELS, CHANNELS, generator)
-        self.view = _linear(CHANNELS, CHANNELS + DIRECTION_CHANNELS, generator)
-        self.colour = _linear(3, CHANNELS, generator)
+        self.first = Dense(CHANNELS, CHANNELS, "fp32", generator)
+        self.second = Dense(CHANNELS, CHANNELS, "fp32", generator)
+        self.third = Dense(CHANNELS, 1 + CHANNELS, "fp32", generator)
+        self.view = Dense(CHANNELS + DIRECTION_CHANNELS, CHANNELS, "fp32", generator)
+        self.colour = Dense(CHANNELS, 3, "fp32", generator)
 
     def density(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Density [S], integrated over the segment, before its ReLU; and what `colours` needs
@@ -62,14 +53,6 @@ class Decoder(nn.Module):
         towards = functional.linear(encoded, across, self.view.bias)
         hidden = functional.linear(geometry, along) + towards.index_select(0, ray)
         return self.colour(hidden.relu()).sigmoid()
-
-
-def _linear(outputs: int, inputs: int, generator: torch.Generator | None) -> nn.Linear:
-    layer = nn.utils.skip_init(nn.Linear, inputs, outputs)
-    bound = (6 / (inputs + outputs)) ** 0.5
-    nn.init.uniform_(layer.weight, -bound, bound, generator=generator)
-    nn.init.zeros_(layer.bias)
-    return layer
 
 
 class CornerModel(nn.Module):

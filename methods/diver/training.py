@@ -10,13 +10,14 @@ from torch import Tensor
 
 from bench.types import Budget, Rays, Scene
 from methods.diver.kernels.segments import as_intervals
-from methods.diver.model import CornerModel, encode_directions
+from methods.diver.model import CornerModel
 from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import STOP, composite, visible, weights
 from methods.kernels.types import Pixels, expect
 from methods.kernels.voxel_walk import Crossings, walk
 from methods.rendering.field import pad
+from methods.students.networks import encode_directions
 from methods.students.voxels import largest_weights
 from methods.training import checkpoint
 from methods.training.loop import step_at

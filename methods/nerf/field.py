@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from bench.types import Probe
 from methods.instant_ngp.field import Precision
 from methods.students.fields import REACH
-from methods.students.networks import Dense, NetworkField, density_of, positional, products
+from methods.students.networks import (
+    DIRECTION_CHANNELS,
+    Dense,
+    NetworkField,
+    density_of,
+    encode_directions,
+    positional,
+    products,
+)
 
 WIDTH, LAYERS = 256, 8
 """Outputs of every layer of the trunk, and how many there are."""
@@ -19,7 +26,6 @@ SKIP = 5  # layers of the trunk after which the encoded position is concatenated
 VIEW_WIDTH = 128  # outputs of the layer that sees the direction
 
 POSITION_FREQUENCIES = 10
-DIRECTION_FREQUENCIES = 4
 
 DENSITY = 1 / REACH
 """Density at a network output of 1, chosen so that the weights are of the usual size."""
@@ -36,13 +42,13 @@ class NerfField(NetworkField):
         self, precision: Precision, backend: str, generator: torch.Generator | None = None
     ) -> None:
         super().__init__(backend)
-        position, direction = 3 + 6 * POSITION_FREQUENCIES, 3 + 6 * DIRECTION_FREQUENCIES
+        position = 3 + 2 * 3 * POSITION_FREQUENCIES
         inputs = [position if layer == 0 else WIDTH for layer in range(LAYERS)]
         inputs[SKIP] += position
         self.trunk = nn.ModuleList(Dense(size, WIDTH, precision, generator) for size in inputs)
         self.opacity = Dense(WIDTH, 1, precision, generator)
         self.bottleneck = Dense(WIDTH, WIDTH, precision, generator)
-        self.view = Dense(WIDTH + direction, VIEW_WIDTH, precision, generator)
+        self.view = Dense(WIDTH + DIRECTION_CHANNELS, VIEW_WIDTH, precision, generator)
         self.colour = Dense(VIEW_WIDTH, 3, precision, generator)
 
     def density_together(self, positions: Tensor) -> tuple[Tensor, Tensor]:
@@ -56,8 +62,7 @@ class NerfField(NetworkField):
         return DENSITY * density_of(raw), hidden
 
     def encode_directions(self, directions: Tensor) -> Tensor:
-        """Encoding [R, 27] of the unit directions."""
-        return positional(functional.normalize(directions, dim=-1), DIRECTION_FREQUENCIES)
+        return encode_directions(directions)
 
     def colours_together(self, geometry: Tensor, encoded: Tensor) -> Tensor:
         # No activation separates the bottleneck and the layer that sees the direction: one product

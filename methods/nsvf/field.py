@@ -29,17 +29,6 @@ ACROSS = 3.0
 measures lengths."""
 
 
-class Layer(nn.Sequential):
-    """A dense layer, LayerNorm over its outputs, ReLU."""
-
-    def __init__(
-        self, inputs: int, outputs: int, precision: Precision, generator: torch.Generator | None
-    ) -> None:
-        super().__init__(
-            Dense(inputs, outputs, precision, generator), Norm(outputs), nn.ReLU(inplace=True)
-        )
-
-
 class Norm(nn.LayerNorm):
     """LayerNorm in the dtype of its inputs; means and variances are float32 all the same."""
 
@@ -76,8 +65,12 @@ class NsvfField(NetworkField):
         first = torch.randn(len(vertices), EMBEDDING, generator=generator)
         self.embeddings = nn.Parameter(first * EMBEDDING**-0.5)
 
-        def layers(*widths: int) -> list[Layer]:
-            return [Layer(*pair, precision, generator) for pair in pairwise(widths)]
+        def layer(inputs: int, outputs: int) -> nn.Module:
+            dense = Dense(inputs, outputs, precision, generator)
+            return nn.Sequential(dense, Norm(outputs), nn.ReLU(inplace=True))
+
+        def layers(*widths: int) -> list[nn.Module]:
+            return [layer(*pair) for pair in pairwise(widths)]
 
         encoded, direction = EMBEDDING * (1 + 2 * EMBEDDING_FREQUENCIES), 6 * DIRECTION_FREQUENCIES
         self.trunk = nn.Sequential(*layers(encoded, WIDTH, WIDTH, WIDTH))

@@ -13,6 +13,9 @@ from methods.instant_ngp.field import Precision
 from methods.kernels import multiplies_bf16
 from methods.students.fields import StudentField
 
+DIRECTION_FREQUENCIES = 4  # of NeRF, and of what follows it
+DIRECTION_CHANNELS = 3 + 2 * 3 * DIRECTION_FREQUENCIES
+
 CHUNK = 1 << 14  # samples that go through a network together: 16 MiB of activations
 
 
@@ -34,6 +37,11 @@ def positional(
         # with 1 - 2 sin^2 for the cosine they would grow faster.
         sine, cosine = 2 * sine * cosine, (cosine - sine) * (cosine + sine)
     return torch.cat(parts, dim=-1)
+
+
+def encode_directions(directions: Tensor) -> Tensor:
+    """The encoding [R, 27] of ray `directions` [R, 3], made unit vectors."""
+    return positional(functional.normalize(directions, dim=-1), DIRECTION_FREQUENCIES)
 
 
 class Dense(nn.Linear):

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from bench.types import Rays
 from methods.instant_ngp.pixels import PixelBatches
@@ -32,14 +33,8 @@ def corners_of(coordinates: Tensor) -> tuple[Tensor, Tensor]:
 def occupied_voxels(occupancy: Occupancy, resolution: int) -> Tensor:
     """The voxels [V, 3] int32 of a grid of another resolution that overlap occupied cells, ordered
     by x, then y, then z."""
-    size, device = occupancy.resolution, occupancy.cells.device
-    voxel = torch.arange(resolution, device=device)
-    first, last = voxel * size // resolution, -(-(voxel + 1) * size // resolution)
-    counts = occupancy.cells.int()
-    for axis in range(3):  # how many occupied cells a voxel overlaps, axis by axis
-        sums = torch.cat((torch.zeros_like(counts.narrow(axis, 0, 1)), counts.cumsum(axis)), axis)
-        counts = (sums.index_select(axis, last) - sums.index_select(axis, first)).int()
-    return counts.nonzero().int()
+    cells = occupancy.cells[None].float()
+    return functional.adaptive_max_pool3d(cells, resolution)[0].nonzero().int()
 
 
 @torch.no_grad()

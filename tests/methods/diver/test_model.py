@@ -2,33 +2,22 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 
 from bench.types import NullProbe
 from methods.diver.kernels.segments import as_intervals
 from methods.diver.method import Baked
-from methods.diver.model import CornerModel, Decoder, encode_directions
+from methods.diver.model import CornerModel, Decoder
 from methods.kernels.composite import composite
 from methods.kernels.march.cases import some_rays
 from methods.kernels.voxel_walk import walk
+from methods.students.networks import encode_directions
 
 SIZE = 16
 
 
 def test_it_has_the_parameters_of_the_published_one() -> None:
     assert sum(parameter.numel() for parameter in Decoder().parameters()) == 5220
-
-
-def test_directions_are_encoded_by_sines_and_cosines() -> None:
-    encoded = encode_directions(torch.tensor([[0.0, 3.0, 4.0]]))
-    want = [0.0, 0.6, 0.8]
-    for k in range(4):
-        for function in (math.sin, math.cos):
-            want += [function(math.pi * 2**k * x) for x in (0.0, 0.6, 0.8)]
-    # Angles of up to 8 pi are rounded to 2^-20, and doubled three times.
-    torch.testing.assert_close(encoded, torch.tensor([want]), rtol=0, atol=8 * 2.0**-20)
 
 
 def test_rendered_rays_are_those_of_the_trained_model() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from bench.cameras import pixel_grid
-from methods.steernerf_lean.cells import REACH, cells_near, centres, paint, pixels_of
+from methods.steernerf_lean.cells import cells_near, centres, paint, pixels_of
 
 SCALE = 3
 HEIGHT, WIDTH = 4, 5
@@ -18,14 +18,14 @@ def picture() -> torch.Tensor:
     return pixels.view(HEIGHT * SCALE, WIDTH * SCALE, 2)
 
 
-def test_cells_near_matter_are_within_reach_of_it() -> None:
+def test_cells_near_matter_touch_it() -> None:
     seen = torch.zeros(9, 12, dtype=torch.bool)
     seen[0, 1] = seen[6, 11] = True
     want = [
         row * 12 + column
         for row in range(9)
         for column in range(12)
-        if any(max(abs(row - r), abs(column - c)) <= REACH for r, c in ((0, 1), (6, 11)))
+        if any(max(abs(row - r), abs(column - c)) <= 1 for r, c in ((0, 1), (6, 11)))
     ]
     assert cells_near(seen).flatten().nonzero().flatten().tolist() == want
     assert not cells_near(torch.zeros_like(seen)).any()

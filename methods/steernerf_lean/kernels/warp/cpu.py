@@ -41,9 +41,6 @@ def _enlarge(depth, cells, scale, tolerance, out):
     width = depth.shape[1]
     for n in prange(len(cells)):
         row, column = cells[n] // width, cells[n] % width
-        if not _anything_near(depth, row, column):
-            out[n] = math.inf
-            continue
         for sub in range(scale * scale):
             v = f32(row * scale + sub // scale) + f32(0.5)
             u = f32(column * scale + sub % scale) + f32(0.5)
@@ -72,15 +69,6 @@ def _warp(picture, depth, cells, width, scale, matrix, offset, values, valid):
             if 0 <= x < picture.shape[1] and 0 <= y < picture.shape[0]:
                 valid[n, sub] = f32(1)
                 _look_up(picture, y - f32(0.5), x - f32(0.5), values[n, sub])
-
-
-@njit(cache=True)
-def _anything_near(depth, row, column):
-    for y in range(max(row - 1, 0), min(row + 2, depth.shape[0])):
-        for x in range(max(column - 1, 0), min(column + 2, depth.shape[1])):
-            if -math.inf < depth[y, x] < math.inf:
-                return True
-    return False
 
 
 @njit(cache=True)

@@ -152,19 +152,6 @@ def test_an_enlarged_depth_is_the_definition(scale: int, backend: str, dtype: to
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_plane_moves_by_focal_length_times_offset_over_depth(backend: str) -> None:
-    camera, depth = straight(24, 16), torch.full((4, 6), 2.0)
-    picture = noise(16, 32)
-    # The camera has moved from the source: 32 * 0.1875 / 2 = 3 pixels right, 32 * 0.125 / 2 = 2 up.
-    source = replace(moved(camera, -0.1875, 0.125, 0.0), width=32)  # it sees more to the right
-    values, valid = warp(picture, source, depth, camera, 4, backend=backend)
-    want, seen = torch.zeros(16, 24, 3), torch.zeros(16, 24)
-    want[2:], seen[2:] = picture[:-2, 3:27], 1
-    assert torch.equal(to_picture(values, 4), want)
-    assert torch.equal(to_picture(valid[..., None], 4)[..., 0], seen)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_without_a_depth_and_behind_the_source_nothing_is_known(backend: str) -> None:
     camera = straight(12, 8)
     unknown = [(depth, 0.0, 1.0) for depth in (math.inf, -math.inf, math.nan, 0.0)]
