@@ -70,7 +70,7 @@ def _conclusions(found: Sequence[Comparison]) -> Iterator[Part]:
     words = {"count": len(found), "tally": tally(found), "sampled": sampled}
     if found:
         yield from (f"## {PAGE['conclusions']}", finding_table(found))
-        yield PAGE["verdicts"].format(**words, missed=f"{sampled / 20:.0f}").strip()
+        yield PAGE["verdicts"].format(**words).strip()
 
 
 def _every_comparison(found: Sequence[Comparison]) -> Iterator[Part]:
