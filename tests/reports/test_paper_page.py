@@ -82,7 +82,7 @@ def test_findings_come_first_all_comparisons_last(run, tmp_path):
     ]
     text = write_paper_page([table], {"table6": lines}, [], tmp_path).read_text()
     before, after = text.split("## The tables")
-    says = "PSNR gained by a hash table of 2^19 instead of 2^16"
+    says = "PSNR lost by a hash table of 2^16 against 2^19"
     assert f"| **{says} (dB)** | +0.02 | +0.11 | " in before
     assert "2 of all 4 comparisons have an interval" in before  # sizes are computed
     found = after.split("## All comparisons")[1]
