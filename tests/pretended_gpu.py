@@ -1,7 +1,7 @@
 """A pretended GPU: what is meant for CUDA runs here, with numbers that lie on the CPU.
 
-A tensor on `cuda:0` holds one on the CPU. Python is told the one device; torch's C++ sees the
-other, because a torch without CUDA cannot differentiate anywhere else. Every operation is computed
+A tensor on `cuda:0` holds one on the CPU. Python sees the GPU, torch's C++ code the CPU,
+because a torch without CUDA cannot differentiate anywhere else. Every operation is computed
 on what its tensors hold, after it was checked for what CUDA refuses: tensors or random numbers of
 two devices, `.numpy()`, a tensor of the CPU in a Triton kernel, and waiting while a graph is
 captured. `torch.cuda.set_sync_debug_mode` tells of every operation for which the host waits.

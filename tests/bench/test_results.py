@@ -30,7 +30,7 @@ PARTS = st.dictionaries(st.text(), JSON, max_size=4)
 
 
 def measurement(values: list[float], text: str = "plain") -> Measurement:
-    """One row per value; `text` stands in the columns of text."""
+    """One row per value; every column of text holds `text`."""
     metrics = [f"metric_{i}" for i in range(len(values))]
     figures = {"n": 1, "lo": math.nan, "hi": math.nan, "seed": 0}
     words = dict.fromkeys(set(COLUMNS) - {"run", "commit", "metric", "value", *figures}, text)

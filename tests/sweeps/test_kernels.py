@@ -91,14 +91,16 @@ def test_a_filter_that_fits_nothing_is_an_error(steerbench, asked, command, said
 def test_what_a_kernel_brings_has_a_line_for_each_that_a_method_calls(steerbench, tmp_path):
     small = ("scene.width=16", "scene.train=4", "scene.test=2", "budget.steps=2")
     few = ("budget.samples=64", "--frames", "2", "--repeats", "1", f"outputs={tmp_path}")
-    outcome = steerbench("kernels", "--worth", "--filter", "a", "method=ngp", *small, *few)
+    outcome = steerbench("kernels", "--worth", "method=ngp", *small, *few)
     assert outcome.status == 0, outcome.err
     rows = {row["kernel"]: row for row in json.loads(outcome.out.splitlines()[-1])}
-    assert set(rows) == {"adam", "march", "spherical"}  # of six, those with an "a"
+    assert set(rows) == {"adam", "composite", "encode", "march", "mlp", "spherical"}
     assert rows["adam"]["frame_ms_reference"] is None  # it is called in training alone
     for row in rows.values():
         assert row["method"] == "ngp"
         assert min(row["frame_ms"], row["training_s"], row["training_s_reference"]) > 0
+    outcome = steerbench("kernels", "--worth", "--filter", "ada", "method=ngp", *small, *few)
+    assert [row["kernel"] for row in json.loads(outcome.out.splitlines()[-1])] == ["adam"]
     assert rows["march"]["frame_ms_reference"] > 0
 
 
