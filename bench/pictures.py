@@ -179,7 +179,7 @@ def score(
         "pictures": seen.hexdigest(),
         "truths": truths.hexdigest(),
         "with_alpha": alphas,
-        "missing": scoring.path.missing([row["metric"] for row in summary if row["n"]]),
+        "missing": scoring.missing([row["metric"] for row in summary if row["n"]]),
     }
     return Measurement(rows, table, scoring.images, record)
 

@@ -64,7 +64,7 @@ class EvaluationProtocol:
     rounding: str = "8bit"
     ssim: str = "gaussian"  # the window, see `bench.metrics.ssim`
     lpips: tuple[str, ...] = ("alex", "vgg")  # backbones, each with a metric `lpips_<net>`
-    lpips_every: int = 1  # frames of which the last one is scored with them; they take most time
+    lpips_every: int = 1  # scored frames of which the last one has them; they take most time
     background: str = "white"  # onto which pictures with an opacity channel are composited
     warmup: int = 3  # frames before the timed sequence, spread over the trajectory
     memory: str = "steady"
@@ -202,7 +202,7 @@ class Scoring:
         surface: Callable[[Camera], Tensor] | None = None,
     ) -> None:
         self.images: dict[str, np.ndarray] = {}
-        self._protocol, self._lpips = protocol, lpips
+        self._protocol, self._lpips, self._scored = protocol, lpips, 0
         self._background, self._shown, self._surface = background, shown, surface
         self.path = video_metrics.PathScoring(
             protocol.columns, protocol.lpips, lpips, exact_flow=surface is not None
@@ -229,7 +229,8 @@ class Scoring:
         figures: dict[str, float] = {}
         true = None if truth is None else composite(truth.to(rgb.device), self._background)
         if truth is not None and true is not None and scored:
-            nets = {} if (index + 1) % self._protocol.lpips_every else self._lpips
+            self._scored += 1
+            nets = {} if self._scored % self._protocol.lpips_every else self._lpips
             figures |= self._protocol.score(rgb, truth, self._background, nets)
             if index in self._shown:
                 self.images |= _pictures(index, rgb, true)
@@ -240,6 +241,14 @@ class Scoring:
         # On a GPU these would count as memory of the method.
         kept = self._protocol.rounded(rgb).cpu(), None if true is None else true.cpu()
         return figures | self.path.add(video_metrics.Shot(*kept, view), cut, rgb.device)
+
+    def missing(self, found: Collection[str]) -> dict[str, str]:
+        """Why wanted metrics are not among those `found`, but for networks that are not there."""
+        every = self._protocol.lpips_every
+        if self._scored not in range(1, every):
+            return self.path.missing(found)
+        why = f"protocol.lpips_every is {every}, and the path has {self._scored} frames to score"
+        return {**self.path.missing(found), **{f"lpips_{net}": why for net in self._lpips}}
 
     def whole(self) -> dict[str, float]:
         """The figures of the whole sequence."""

@@ -226,7 +226,7 @@ def locate(net: str, weights_dir: Path | None, log: Log) -> Path:
     for path in (folder / file for folder in folders for file in (features, name)):
         if path.is_file():
             return _verified(path)
-    # After one failure no process tries again: every backbone would wait for the same connection.
+    # After one failure this process gives up: every backbone would wait for the same connection.
     if not _unreachable:
         try:
             cache.mkdir(parents=True, exist_ok=True)

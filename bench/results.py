@@ -95,6 +95,7 @@ class Store:
             "schema_version": SCHEMA_VERSION,
             "run": key,
             "commit": commit(),
+            "stored": time.time(),
             "machine": machine(),
             "made_of": parts,
             **measurement.record,

@@ -170,7 +170,7 @@ def _measurement(
         "protocol": asdict(protocol),
         "budget": asdict(budget),
         "scene": {"name": scene.name, "digest": scene.digest, "unit_length": scene.unit_length},
-        "missing": {**missing, **scoring.path.missing(known)},
+        "missing": {**missing, **scoring.missing(known)},
         "neighbours": neighbours._asdict(),
         "peak_bytes": source,
         "times": take.times,

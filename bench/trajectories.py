@@ -27,6 +27,7 @@ from torch import Tensor
 from bench.cameras import move_camera
 from bench.errors import unexpected
 from bench.motion import between, lens_between, preceding, rotation_between, viewing_target
+from bench.provenance import sha256
 from bench.scenes.files import (
     describe,
     entries_of,
@@ -167,7 +168,8 @@ def approached(
         before = preceding(cameras[index], target, lead, (degrees, degrees), generator)
         steps += [Step(camera, None, cut=n == 0) for n, camera in enumerate(before)]
         steps.append(Step(cameras[index], index, cut=not before))
-    return Trajectory(f"{split}-approached{lead}-{degrees:g}deg{part}", split, tuple(steps))
+    name = f"{split}-approached{lead}-{degrees:g}deg{part}{f'-seed{seed}' if seed else ''}"
+    return Trajectory(name, split, tuple(steps))
 
 
 def _kept(
@@ -243,7 +245,8 @@ def follow(scene: Scene, path: str, limit: int = 0) -> Trajectory:
     scale, offset = 1 / scene.unit_length, -scene.origin.double() / scene.unit_length
     moved = [move_camera(camera, scale, offset) for camera in cameras[: limit or None]]
     steps = tuple(Step(camera, truth=None) for camera in moved)
-    return Trajectory(file.stem, "test", steps, reads=(file,))
+    name = f"{file.stem}-{sha256(file)[:6]}"  # many files are called path.json
+    return Trajectory(name, "test", steps, reads=(file,))
 
 
 def spline(
@@ -274,13 +277,22 @@ def write_path(
     cameras: Sequence[Camera],
     scene: Scene,
     fps: float = 30.0,
-    form: Literal["nerfstudio", "nerfbaselines"] = "nerfstudio",
+    form: Literal["nerfstudio", "nerfbaselines"] | None = None,
 ) -> None:
     """Write `cameras` (scene units, all of one size) as a path that nerfstudio's viewer reads, or
-    NerfBaselines."""
+    NerfBaselines; without a `form`, the viewer unless it has no words for a lens."""
     moved = [move_camera(camera, scene.unit_length, scene.origin) for camera in cameras]
+    if form is None:
+        form = "nerfstudio" if all(map(_plain, cameras)) else "nerfbaselines"
     record = (_viewers if form == "nerfstudio" else _nerfbaselines)(moved, fps)
     path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+
+
+def _plain(camera: Camera) -> bool:
+    """Whether pixels are square and the principal point is at the centre."""
+    centre = (camera.width / 2, camera.height / 2)
+    pairs = ((camera.fx, camera.fy), *zip((camera.cx, camera.cy), centre, strict=True))
+    return all(math.isclose(*pair, rel_tol=1e-6) for pair in pairs)
 
 
 def _viewers(cameras: Sequence[Camera], fps: float) -> dict:

@@ -132,50 +132,76 @@ def apart(metric: str, one: float, other: float) -> float:
 def gap(metric: str, one: Repeated, other: Repeated) -> Gap:
     """How far `other` is above `one` here: the mean over pairs; NOT_MEASURED if there are none.
 
-    A pair has the same scene and the same seed. If there is only one, the frames are compared.
+    A pair has the same scene and the same seed. The interval is over scenes, of a single scene over
+    seeds. If there is only one pair, its frames are compared.
     """
     pairs = [
-        (run, twin, apart(metric, low, high))
-        for run in one.measured
-        for twin in other.measured
+        (run, twin)
+        for run in one.averaged
+        for twin in other.averaged
         if _identity(run, metric) == _identity(twin, metric)
-        and (low := run.figure(metric)) is not None
-        and (high := twin.figure(metric)) is not None
+        and None not in (run.figure(metric), twin.figure(metric))
     ]
     if not pairs:
         return NOT_MEASURED
-    by_pair = np.array([by for *_, by in pairs])
-    by = float(by_pair.mean())
+    of_scenes: dict[object, list[float]] = {}
+    for pair in pairs:
+        scene, *_ = _identity(pair[0], metric)
+        of_scenes.setdefault(scene, []).append(_apart(metric, *pair))
+    # The seeds of a scene share what is particular to it: of several scenes, each is one sample.
+    means = [float(np.mean(of)) for of in of_scenes.values()]
+    by = float(np.mean(means))
     if metric.startswith("size_bytes"):
         return Gap(by, 0.0, "computed, not sampled", True)
     if len(pairs) == 1:
-        return Gap(by, *_over_frames(metric, *pairs[0][:2]), False)
-    kinds = zip(*(_identity(run, metric)[:2] for run, *_ in pairs), strict=True)
-    counts = zip((len(set(kind)) for kind in kinds), ("scenes", "seeds"), strict=True)
-    over = " × ".join(f"{count} {kind}" for count, kind in counts if count > 1)
-    return Gap(by, half_interval(by_pair), over, True)
+        return Gap(by, *_over_frames(metric, *pairs[0]), False)
+    counts = {"scenes": len(means), "seeds": len({run.facts["seed"] for run, _ in pairs})}
+    over = " × ".join(f"{count} {kind}" for kind, count in counts.items() if count > 1)
+    samples = means if len(means) > 1 else next(iter(of_scenes.values()))
+    return Gap(by, half_interval(np.array(samples)), over, True)
 
 
 def _identity(run: Run, metric: str) -> tuple[object, ...]:
-    """Scene and seed of a run and, if the metric is a time, its machine: equal in a pair."""
-    machine = run.computer if metric.partition(".")[0] in TIMES else ()
-    return (run.record["scene"]["digest"], run.facts["seed"], machine)
+    """Scene and seed of a run and, if the metric is a time, its machine and the runs that were
+    measured in turns with it: equal in a pair."""
+    timed = metric.partition(".")[0] in TIMES
+    when = (run.computer, run.record["made_of"].get("beside")) if timed else ()
+    return (run.record["scene"]["digest"], run.facts["seed"], when)
+
+
+def _apart(metric: str, run: Run, twin: Run) -> float:
+    """How far the figure of `twin` is above that of `run`.
+
+    One perfect frame makes a mean PSNR infinite. If both are, the frames are compared.
+    """
+    low, high = run.figure(metric), twin.figure(metric)
+    assert low is not None
+    assert high is not None
+    if math.isinf(low) and low == high and len(pairs := _frame_pairs(metric, run, twin)):
+        return float(np.mean([apart(metric, *pair) for pair in pairs]))
+    return apart(metric, low, high)
+
+
+def _frame_pairs(metric: str, run: Run, twin: Run) -> np.ndarray:
+    """The figures [N, 2] of the frames that both runs have."""
+    one, other = _of_frames(metric, run), _of_frames(metric, twin)
+    common = one.index.intersection(other.index)
+    return np.stack([one[common].to_numpy(), other[common].to_numpy()], axis=1)
 
 
 def _over_frames(metric: str, run: Run, twin: Run) -> tuple[float, str]:
     """Half the interval of the gap between two runs, from the frames that both have, and over what;
     nan if the frames have no figures."""
-    one, other = _of_frames(metric, run), _of_frames(metric, twin)
-    common = one.index.intersection(other.index)
-    if len(common) < 2:
+    pairs = _frame_pairs(metric, run, twin)
+    if len(pairs) < 2:
         return math.nan, "one figure each"
-    below, above = one[common].to_numpy(), other[common].to_numpy()
     if _by_ratio(metric):
         # A mean that is wrong by a small share shifts the logarithm by this share.
-        by_frame = above / above.mean() - below / below.mean()
+        below, above = (pairs / pairs.mean(axis=0)).T
+        by_frame = above - below
     else:
-        by_frame = np.array([apart(metric, *pair) for pair in zip(below, above, strict=True)])
-    return path_interval(by_frame), f"{len(common)} frames of one seed"
+        by_frame = np.array([apart(metric, *pair) for pair in pairs])
+    return path_interval(by_frame), f"{len(pairs)} frames of one seed"
 
 
 def _of_frames(metric: str, run: Run) -> pd.Series:

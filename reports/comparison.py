@@ -101,9 +101,12 @@ def ranks(lines: Sequence[Repeated], metric: str, write: Write | None = None) ->
     """The rank, from 1, of each of `lines` among those under the same conditions, by its index.
 
     Figures that look the same when written (by `write`, or in the usual format) share a rank. A
-    line that is alone under its conditions has no rank.
+    line that is alone under its conditions has no rank, and none has one in a metric without a
+    better side.
     """
     label, usual = metric_format(metric)
+    if not label.endswith(("↑", "↓")):
+        return {}
     write = write or usual
     known: dict[tuple[object, ...], dict[int, float]] = {}
     for row, line in enumerate(lines):

@@ -111,11 +111,13 @@ def csv(tables: Sequence[PaperTable], measured: Lines) -> str:
 
 
 def _written(metric: str, value: float | None) -> str:
-    """A figure with the paper's number of decimals; bytes in MB."""
+    """A figure with the paper's number of decimals, sizes in MB; as usual if it has none of it."""
     family = re.split(r"[._]", metric)[0]
+    if family not in DECIMALS:
+        return metric_format(metric)[1](value)
     if family == "size" and value is not None:
         value /= 1e6
-    return decimal(value, DECIMALS.get(family, 0))
+    return decimal(value, DECIMALS[family])
 
 
 def _escaped(text: str) -> str:

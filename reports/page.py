@@ -88,7 +88,7 @@ def _pictures(runs: Sequence[Run]) -> Iterator[Part]:
         for frame in kept_frames(group)
         for part in frame_section(group, frame, f"frames-{number}")
     ]
-    yield from ("## Pictures", *(parts or ["No frame has a ground truth."]))
+    yield from ("## Pictures", *(parts or ["No picture was kept."]))
 
 
 def _figures(run: Run) -> Iterator[Part]:

@@ -106,13 +106,15 @@ def _curves(table: PaperTable, lines: Lines) -> Iterator[figures.Curve]:
     measured = {line.label: line for line in lines.get(table.name, ()) if line.runs}
     for line in table.lines if table.curve else ():
         labels = {share: table.marks[line.label, share].label for share in SHARES}
+        labels[1.0] = line.label
         marks = {share: measured[label] for share, label in labels.items() if label in measured}
-        seeds = {run.facts["seed"] for mark in marks.values() for run in mark.runs}
-        if whole := measured.get(line.label):  # end points, of the same trainings
-            runs = [run for run in whole.runs if run.facts["seed"] in seeds]
-            marks |= {1.0: replace(whole, runs=runs)} if runs else {}
-        points = {_steps(of.runs[0]) * share: of for share, of in marks.items()}
-        if len(points) > 1:
+        seeds = [{run.facts["seed"] for run in mark.runs} for mark in marks.values()]
+        common = set.intersection(*seeds) if len(seeds) > 1 else set()  # of the same trainings
+        points = {}
+        for share, mark in marks.items() if common else ():
+            runs = [run for run in mark.runs if run.facts["seed"] in common]
+            points[_steps(runs[0]) * share] = replace(mark, runs=runs)
+        if points:
             yield figures.Curve(table.number, line.label, points)
 
 
@@ -127,7 +129,7 @@ def _images(images: Mapping[str, Any], lines: Lines) -> Iterator[Part]:
     runs = [run for run in runs if run.views == runs[0].views]
     if runs and (frames := kept_frames(runs)):
         title, stem = images["title"], f"frames-{images['title'].lower()}"
-        yield f"## {title}\n\nThe middle one of {len(frames)} frames that all runs kept."
+        yield f"## {title}\n\nA frame that all runs kept."
         yield from frame_section(runs, frames[len(frames) // 2], stem)
 
 

@@ -49,8 +49,8 @@ class Figures:
 
     `frames` has the figures that the headline averages, by metric and by number and name of the
     frame, in the order of the path: of qualities the steady frames that have them, of other
-    metrics all steady frames. `machine` names its processors. `views` is equal for the same frames
-    of the same scene under one protocol.
+    metrics all steady frames. `machine` names its device and processors. `views` is equal for the
+    same frames of the same scene under one protocol.
     """
 
     values: Mapping[str, float]
@@ -71,9 +71,8 @@ class Figures:
             names = averaged["frame"].astype(str) + ": " + averaged["name"].fillna("")
             if averaged[metric].notna().all():
                 frames[metric] = dict(zip(names, averaged[metric].astype(float), strict=True))
-        machine = run.record["machine"]
         views = ", ".join(map(str, (*run.views, run.facts["protocol"])))
-        return cls(values, frames, ", ".join((machine["cpu"], *machine["gpus"])), views)
+        return cls(values, frames, ", ".join(run.computer), views)
 
 
 @dataclass(frozen=True)
@@ -120,9 +119,10 @@ def changes(
 
 def _change(metric: str, limit: Limit, pairs: Sequence[tuple[Figures, Figures]]) -> Change:
     values = np.array([[run.values.get(metric, math.nan) for run in pair] for pair in pairs])
-    frames = [frames_apart(metric, *pair) for pair in pairs]
+    frames = [_hiding_nothing(frames_apart(metric, *pair), limit) for pair in pairs]
     pairwise = zip(frames, values, strict=True)
     by_seed = np.array([x.mean() if len(x) > 1 else _apart(*pair) for x, pair in pairwise])
+    by_seed = _hiding_nothing(by_seed, limit)
     before, after = map(float, values.mean(axis=0))
     allowed = limit.absolute + (limit.relative and limit.relative * abs(before))
     by, interval, certain = float(by_seed.mean()), None, True
@@ -143,6 +143,12 @@ def frames_apart(metric: str, old: Figures, new: Figures) -> np.ndarray:
     """New less old of the frames that both have, in the order of the path."""
     one, other = old.frames.get(metric, {}), new.frames.get(metric, {})
     return np.array([_apart(one[name], other[name]) for name in one if name in other])
+
+
+def _hiding_nothing(changes: np.ndarray, limit: Limit) -> np.ndarray:
+    """The `changes`, those of pictures that became perfect as 0: their gain, which is infinite,
+    would hide what others lost."""
+    return np.where(limit.better * changes == math.inf, 0.0, changes)
 
 
 def _apart(old: float, new: float) -> float:

@@ -97,9 +97,10 @@ class Run:
 
     @property
     def computer(self) -> tuple[str, ...]:
-        """Equal for runs on the same device and the same kind of processor."""
+        """Equal for runs on the same device, kind of processor and number of threads."""
         machine = self.record["machine"]
-        return (self.facts["device"], machine["cpu"], *machine["gpus"])
+        threads = f"{machine['threads']} threads"
+        return (self.facts["device"], machine["cpu"], threads, *machine["gpus"])
 
     @property
     def conditions(self) -> tuple[object, ...]:
@@ -146,13 +147,20 @@ class Repeated:
     """A table line with the `label`: runs that differ only in their seed. Figures are their means.
 
     `gaps` says why other runs are missing. For a data set, each of `runs` is a mean over scenes;
-    `by_scene` has all measured runs by scene, first the scenes in the means.
+    `of_scenes` are the stored runs in these means, and `by_scene` has all measured ones by scene,
+    first the scenes in the means.
     """
 
     label: str
     runs: Sequence[Run]
     gaps: Sequence[str] = ()
     by_scene: Mapping[str, Sequence[Run]] = field(default_factory=dict)
+    of_scenes: Sequence[Run] = ()
+
+    @property
+    def averaged(self) -> Sequence[Run]:
+        """The stored runs that its means are made of, each of a single scene."""
+        return self.of_scenes or self.runs
 
     @property
     def measured(self) -> list[Run]:
@@ -185,6 +193,11 @@ class Repeated:
 
 def readable(store: Store, keys: Collection[str] | None = None) -> list[Run]:
     """Every readable run, or those in `keys`, labelled with its key, in the order of storing."""
+
+    def stored(run: Run) -> float:
+        """When, in seconds since the epoch; older runs only tell it by their folders."""
+        return run.record.get("stored") or (store.folder / run.key).stat().st_mtime
+
     rows = store.rows(report=lambda unreadable: None, keys=keys)
     runs = [
         Run(
@@ -198,7 +211,7 @@ def readable(store: Store, keys: Collection[str] | None = None) -> list[Run]:
         for key, of_run in rows.groupby("run")
         if (folder := store.find(str(key)))
     ]
-    return sorted(runs, key=lambda run: (store.folder / run.key).stat().st_mtime)
+    return sorted(runs, key=stored)
 
 
 def load(store: Store, labels: Mapping[str, str]) -> list[Run]:
@@ -271,6 +284,8 @@ def over_scenes(runs: Sequence[Run]) -> Run:
     facts = {name: _joined([run.facts[name] for run in runs]) for name in names}
     facts["scene"] = f"mean of {', '.join(str(run.facts['scene']) for run in runs)}"
     key = facts["run"] = content_key({"mean of": [run.key for run in runs]})[:16]
+    if "fps" in rows.index:  # of the mean time, as in a run
+        rows.loc["fps", "value"] = 1000 / rows["value"]["frame_ms"]
     rows = rows.reset_index().assign(lo=math.nan, hi=math.nan, **facts)
     return Run(key, runs[0].label, rows, partial(_frames, runs), _record(runs), runs[0].pictures)
 

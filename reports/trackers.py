@@ -6,6 +6,7 @@ pictures and the provenance. A run already sent under the same key is replaced o
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -37,13 +38,15 @@ def to_wandb(run: Run, outputs: Path) -> None:
 
 
 def to_tensorboard(run: Run, outputs: Path) -> None:
-    """TensorBoard: event files in OUTPUTS/tensorboard/KEY, written once."""
+    """TensorBoard: event files in OUTPUTS/tensorboard/KEY, written once, and all or none."""
     from torch.utils.tensorboard import SummaryWriter
 
     folder = outputs / "tensorboard" / run.key
     if folder.exists():
         return
-    with SummaryWriter(str(folder)) as writer:
+    begun = folder.with_name(f".{run.key}")
+    shutil.rmtree(begun, ignore_errors=True)
+    with SummaryWriter(str(begun)) as writer:
         lines = [f"{name}: {value}" for name, value in settings(run).items()]
         writer.add_text("settings", "  \n".join(lines))
         for frame, figures in series(run):
@@ -54,6 +57,7 @@ def to_tensorboard(run: Run, outputs: Path) -> None:
         for name, path in pictures(run):
             with Image.open(path) as image:
                 writer.add_image(name, np.asarray(image.convert("RGB")), dataformats="HWC")
+    begun.replace(folder)
 
 
 TRACKERS = {"wandb": to_wandb, "tensorboard": to_tensorboard}

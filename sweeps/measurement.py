@@ -96,7 +96,7 @@ class Job:
     @property
     def failure_file(self) -> Path:
         """Holds why the job failed, until it succeeds."""
-        return self.outputs / "failures" / f"{content_key(self.settings)[:16]}.txt"
+        return self.outputs / "failures" / f"{self.key[:16]}.txt"
 
     @property
     def failure(self) -> str | None:

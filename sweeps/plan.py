@@ -136,7 +136,8 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
             command = ["steerbench", "run", *fixed, *own, "hydra.mode=RUN"]
             parts = (f"{table.name}: {line.label}", scene, f"seed {config.seed}")
             told = ", ".join(filter(None, parts))
-            turns = f"{table.name}, {seed}, {scene}" if block.in_turns else ""
+            where_timed = Path(config.scene.get("path") or config.scene.get("name", "")).name
+            turns = f"{table.name}, {seed}, {where_timed}" if block.in_turns else ""
             where = {"table": table.name, "block": title, "line": line.label, "scene": scene}
             jobs.append(Planned(config, command, told, turns, **where))
     return jobs

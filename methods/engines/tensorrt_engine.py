@@ -258,4 +258,4 @@ class _Execution:
 
 def _ceiling(size: int) -> int:
     """The smallest power of two that is at least `size`; at least 1."""
-    return 1 << (size - 1).bit_length()
+    return 1 << max(size - 1, 0).bit_length()

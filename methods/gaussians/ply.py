@@ -9,6 +9,7 @@ ours do not: those of odd order m change sign.
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -67,7 +68,7 @@ def read(path: Path, scene: Scene) -> Gaussians:
     names = vertices.dtype.names or ()
     missing = ", ".join(name for name in NEEDED if name not in names)
     refuse(bool(missing), f"expected the properties of 3D Gaussians, there is no {missing}")
-    rest = sorted((n for n in names if n.startswith("f_rest_")), key=lambda n: int(n[7:]))
+    rest = sorted((n for n in names if re.fullmatch(r"f_rest_\d+", n)), key=lambda n: int(n[7:]))
     degrees = "0, 9, 24 or 45 properties f_rest_* (degrees 0 to 3)"
     refuse(len(rest) not in (0, 9, 24, 45), f"expected {degrees}, got {len(rest)}")
 

@@ -21,6 +21,7 @@ from methods.kernels.types import Occupancy, expect
 from methods.kernels.voxel_walk import BRICK, Crossings, Voxels
 from methods.plenoctree.kernels.voxel_light import Light
 from methods.rendering.field import Field, pad
+from methods.rendering.occupancy import RESOLUTION
 from methods.students.voxels import largest_weights
 
 CELL = 4  # leaves along the side of a cell of the occupancy that selects the rays of a frame
@@ -98,8 +99,8 @@ class Extraction:
 
     def __post_init__(self) -> None:
         size, terms = self.resolution, (self.degree + 1) ** 2
-        whole = 128 <= size <= 2048 and not size % BRICK**2
-        expect(whole, "resolution", f"a multiple of {BRICK**2} from 128 to 2048", size)
+        whole = RESOLUTION <= size <= 2048 and not size % RESOLUTION
+        expect(whole, "resolution", f"a multiple of {RESOLUTION} up to 2048", size)
         expect(self.degree in range(4), "degree", "0 to 3", self.degree)
         needed = f"at least {terms}, as many as degree {self.degree} has harmonics"
         expect(self.directions >= terms, "directions", needed, self.directions)
@@ -134,19 +135,17 @@ def extract(
 def _candidates(occupancy: Occupancy, options: Extraction) -> Tensor:
     """The leaves [V, 3] int32 inside occupied cells."""
     size, cells = options.resolution, occupancy.cells.nonzero().int()
-    wide = size / occupancy.resolution
-    count = round(len(cells) * wide**3)
+    wide = size // occupancy.resolution
+    count = len(cells) * wide**3
     if count > options.most_leaves:
         raise SteerbenchError(
             f"octree: {count:,} leaves of {size}^3 lie in occupied cells, expected at most "
             f"{options.most_leaves:,}: choose a smaller method.extraction.resolution, or a larger "
             "most_leaves where there is the memory for them (about 500 bytes each)"
         )
-    of_field = f"a multiple of {occupancy.resolution}, that of the field's occupancy"
-    expect(wide.is_integer(), "resolution", of_field, size)
-    side = torch.arange(int(wide), dtype=torch.int32, device=cells.device)
+    side = torch.arange(wide, dtype=torch.int32, device=cells.device)
     inner = torch.cartesian_prod(side, side, side).view(-1, 3)
-    return (cells[:, None] * int(wide) + inner).reshape(-1, 3)
+    return (cells[:, None] * wide + inner).reshape(-1, 3)
 
 
 def _densities(field: Field, leaves: Voxels, points: int, generator: torch.Generator) -> Tensor:

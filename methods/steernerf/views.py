@@ -62,6 +62,7 @@ class Views:
                 with clock.frame():
                     frame = self._render(camera, buffer, clock)
                 found.append(psnr(frame.rgb.cpu(), truth))
+            self.pipeline.renderer.engine = None  # the network itself draws the frames before
         return [
             Figures(statistics.mean(found), statistics.median(map(_renderer_ms, clock.frames)))
             for found, clock in zip(quality, clocks, strict=True)

@@ -47,7 +47,7 @@ def largest_weights(
     backend: str,
 ) -> Tensor:
     """The largest weight [V] that each voxel has in a pixel, over as many random training `rays`,
-    or all that there are. `weigh` returns the weights [S] of the voxels that rays cross."""
+    at most one for each pixel. `weigh` returns the weights [S] of the voxels that rays cross."""
     largest = torch.zeros(len(voxels), device=voxels.coordinates.device)
     most = min(rays, len(batches))
     for first in range(0, most, CHUNK_RAYS):

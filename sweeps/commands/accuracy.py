@@ -113,9 +113,11 @@ def _chosen(
 
 
 def _recommended(rows: Sequence[Row], limit: float) -> str:
-    """The fastest setting that loses at most `limit` dB, as a command; the first always does."""
+    """The fastest setting that loses at most `limit` dB, as a command."""
     index = cheapest_within([row["ms"] for row in rows], [row["lost"] for row in rows], limit)
-    assert index is not None
+    if index is None:  # the first is perfect
+        first = rows[0]["setting"]
+        return f"within {limit:g} dB: no setting, because {first!r} has an infinite PSNR"
     row = rows[index]
     return (
         f"within {limit:g} dB of {rows[0]['setting']}: {row['setting']}, {row['ms']:.1f} ms, "

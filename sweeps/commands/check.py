@@ -45,6 +45,8 @@ def main(options: argparse.Namespace) -> int:
             else:
                 failed += sum(row.verdict != "" for row in rows)
                 show(change_table(command, rows))
+                if [each.machine for each in new] != [each.machine for each in old.values()]:
+                    console().print("times and memory are not compared: of other machines")
                 continue
         console().print(f"{command}: {why}", markup=False)
         failed += 1
@@ -105,7 +107,7 @@ def _read(path: Path) -> tuple[dict[str, dict[str, Figures]], dict[str, Limit]]:
             for command, seeds in held["runs"].items()
         }
         return runs, {metric: Limit(**limit) for metric, limit in held["limits"].items()}
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise SteerbenchError(
             f"{path}: no baseline ({error}); `steerbench check --record {path}` writes one"
         ) from error

@@ -93,7 +93,9 @@ def main(options: argparse.Namespace) -> int:
         elif "{data}" in command and options.data is None:
             log.info(f"{name}: left out, it needs --data DIR")
         else:
-            words = shlex.split(command.format(folder=folder, data=options.data))[1:]
+            _, *words = (
+                word.format(folder=folder, data=options.data) for word in shlex.split(command)
+            )
             log.info(f"{name}: steerbench {shlex.join(words)}")
             failed += not _measure(words, folder, Made(command, _commit(), code, _machine()))
     if not options.check:
@@ -104,6 +106,7 @@ def main(options: argparse.Namespace) -> int:
 def _measure(words: Sequence[str], folder: Path, made: Made) -> bool:
     """Run a command and keep its page in `folder`; whether it succeeded."""
     folder.mkdir(parents=True, exist_ok=True)
+    (folder / MADE).unlink(missing_ok=True)  # a command that fails may have written its page
     terminal.shown.clear()
     if status := cli.guard(cli.dispatch, words):
         if status == cli.INTERRUPTED:

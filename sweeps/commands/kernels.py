@@ -26,7 +26,7 @@ from statistics import median
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from bench.accuracy import render_in_turns
 from bench.case import failed, timed_rows
@@ -135,10 +135,15 @@ def errors(row: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def _worth(options: argparse.Namespace) -> list[Row]:
-    """The rows of the methods that the settings name; without `method=a,b`, of all methods."""
+    """The rows of the methods that the settings name; without `method=a,b`, of all methods that
+    need no further setting."""
     words = options.overrides
     typed = [word.partition("=")[2] for word in words if word.startswith("method=")]
-    names = swept(words).get("method", typed) or list(choices("method", words))
+    names = swept(words).get("method", typed) or [
+        name
+        for name in choices("method", words)
+        if not OmegaConf.missing_keys(composed([*words, f"method={name}"]).method)
+    ]
     rest = [*SETTINGS, *(word for word in words if not word.startswith("method="))]
     return [row for name in names for row in _rows_of_worth([*rest, f"method={name}"], options)]
 
@@ -153,18 +158,20 @@ def _rows_of_worth(words: Sequence[str], options: argparse.Namespace) -> list[Ro
     settings = checked_settings(config)
     log = ConsoleLog(Path(settings.outputs))
     scene, path, protocol = common_ground(config, options.frames)
-    with device_lock(settings.device, log):
+    with device_lock(settings.device, log), tempfile.TemporaryDirectory() as folder:
         with kernel_calls() as in_training:
-            method, _ = _trained(config, scene, AS_IT_IS)
+            method = _fitted(config, scene, folder)
         with kernel_calls() as in_frames, torch.no_grad():
             for step in path.steps:
                 method.render(step.camera, NullProbe())
-        lines: dict[str, Any] = {one: Forced(method, one) for one in (AS_IT_IS, *wanted(in_frames))}
+        kernels = (AS_IT_IS, *wanted(in_frames))
+        # Each line has the same training, but frames before of its own.
+        lines: dict[str, Any] = {x: Forced(_fitted(config, scene, folder), x) for x in kernels}
         rendered = render_in_turns(lines, scene, path, protocol, options.repeats, log)
         trained: dict[str, list[float]] = {one: [] for one in (AS_IT_IS, *wanted(in_training))}
         for _ in range(options.repeats):
             for kernel, seconds in trained.items():
-                seconds.append(_trained(config, scene, kernel)[1])
+                seconds.append(_training_s(config, scene, kernel))
     frame_ms = {row["setting"]: row["ms"] for row in rendered}
     return [
         {
@@ -179,15 +186,20 @@ def _rows_of_worth(words: Sequence[str], options: argparse.Namespace) -> list[Ro
     ]
 
 
-def _trained(config: DictConfig, scene: Scene, kernel: str) -> tuple[Method, float]:
-    """The method, trained in a store of its own, and how many seconds that took."""
-    with tempfile.TemporaryDirectory() as folder:
-        method = build(config, "method")
-        torch.manual_seed(config.seed)
+def _fitted(config: DictConfig, scene: Scene, folder: str) -> Method:
+    """The method, trained, or with its training from the store in `folder`."""
+    method: Method = build(config, "method")
+    torch.manual_seed(config.seed)
+    method.fit(scene, build(config, "budget"), ConsoleLog(Path(folder), quiet=True))
+    return method
+
+
+def _training_s(config: DictConfig, scene: Scene, kernel: str) -> float:
+    """How many seconds a training takes."""
+    with tempfile.TemporaryDirectory() as folder, by_reference(kernel):
         begun = time.perf_counter()
-        with by_reference(kernel):
-            method.fit(scene, build(config, "budget"), ConsoleLog(Path(folder), quiet=True))
-        return method, time.perf_counter() - begun
+        _fitted(config, scene, folder)
+        return time.perf_counter() - begun
 
 
 def by_reference(kernel: str) -> AbstractContextManager[None]:

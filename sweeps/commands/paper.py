@@ -222,12 +222,15 @@ def _line(label: str, outcomes: Sequence[Outcome], common: set[str]) -> Repeated
             by_scene.setdefault(each.job.scene, []).append(each.run)
             if each.job.scene in common:
                 by_seed.setdefault(each.job.config.seed, []).append(each.run)
-    runs = [over_scenes(of_seed) for of_seed in by_seed.values() if len(of_seed) == len(common)]
+    complete = [of_seed for of_seed in by_seed.values() if len(of_seed) == len(common)]
+    runs = [over_scenes(of_seed) for of_seed in complete]
     gaps = list(_gaps(outcomes))
     if by_scene and not common:
         gaps.append("no scene that all lines have")
     several = {each.job.scene for each in outcomes} != {""}
-    return Repeated(label, runs, gaps, by_scene if several else {})
+    if not several:
+        return Repeated(label, runs, gaps)
+    return Repeated(label, runs, gaps, by_scene, [run for of_seed in complete for run in of_seed])
 
 
 def _gaps(outcomes: Sequence[Outcome]) -> Iterator[str]:

@@ -50,6 +50,9 @@ def main(argv: Sequence[str]) -> int:
     In a sweep, a failed job is reported at once and the others still run; the table at the end
     lists all of them. Raises the error of a job, or SteerbenchError for a wrong setting.
     """
+    if several := swept([word for word in argv if word.startswith("outputs=")]):
+        got = ", ".join(several["outputs"])
+        raise unexpected("outputs", "one folder, for the table of all jobs", got)
     # Hydra's parser accepts overrides only in one contiguous block, so flags go first.
     flags = [word for word in argv if word.startswith("-") or not re.search("^~|=", word)]
     sys.argv = [sys.argv[0], *flags, *(word for word in argv if word not in flags)]
@@ -173,18 +176,21 @@ def _finish(folder: Path) -> None:
 
     def labels(jobs: Sequence[Ended]) -> tuple[dict[str, str], dict[str, str]]:
         """Names of the runs by key, and reasons of failed jobs by name."""
-        runs = {job.run: job.name for job in jobs if job.run}
+        runs: dict[str, str] = {}
+        for job in jobs:
+            if job.run:  # equal jobs share one
+                runs[job.run] = ", ".join(filter(None, (runs.get(job.run), job.name)))
         return runs, {job.name: job.failure for job in jobs if job.failure}
 
-    ended = read(folder)
-    for outputs in dict.fromkeys(job.outputs for job in ended):
-        store, there = Store(Path(outputs)), [job for job in ended if job.outputs == outputs]
-        names, failed = labels(there)
-        runs = over_common_frames(load(store, names))
-        show(comparison(runs, failed))
-        say_missing(runs)
-        for report in dict.fromkeys(job.report for job in there):
-            write_page(report, store, *labels([job for job in there if job.report == report]))
+    if not (ended := read(folder)):
+        return
+    store = Store(Path(ended[0].outputs))
+    names, failed = labels(ended)
+    runs = over_common_frames(load(store, names))
+    show(comparison(runs, failed))
+    say_missing(runs)
+    for report in dict.fromkeys(job.report for job in ended):
+        write_page(report, store, *labels([job for job in ended if job.report == report]))
 
 
 def _hide_subcommand_from_completion() -> None:

@@ -62,7 +62,8 @@ def main(options: argparse.Namespace) -> int:
     for row in rows:
         axes.setdefault(row["axis"], []).append(row)
     scene = rows[0]["scene"]
-    title = f"{config.method.get('name', scene)} on {scene}, {rows[0]['frames']} frames"
+    method = config.hydra.runtime.choices.method
+    title = f"{method} on {scene}, {rows[0]['frames']} frames"
     show(_table(title, axes))
     print_rows(rows)
     return 0

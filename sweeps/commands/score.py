@@ -96,6 +96,7 @@ def score(
         "lpips": protocol.find_lpips(weights, log),
         "facts": facts,
         "sequence": sequence,
+        "kept": plain.pictures,
         **({"times": reported} if times else {}),
     }
     words = {"--truth": truth, "--name": name, "--match": match, "--times": times}

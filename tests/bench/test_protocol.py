@@ -131,7 +131,20 @@ def test_the_last_of_so_many_frames_is_scored_with_lpips():
     protocol = EvaluationProtocol(name="some", lpips=("alex",), lpips_every=2)
     scoring = Scoring(protocol, {"alex": lambda *_: 0.5}, WHITE, shown=())
     picture = torch.zeros(16, 16, 3)
-    scores = [
-        scoring.score(index, picture, picture.byte(), cut=False)["lpips_alex"] for index in range(4)
-    ]
-    assert scores == [pytest.approx(value, nan_ok=True) for value in (math.nan, 0.5, math.nan, 0.5)]
+    found = []
+    for index in range(8):  # each second one has no truth
+        scored = index % 2 == 0
+        scores = scoring.score(index, picture, picture.byte(), scored=scored, cut=False)
+        found += [scores["lpips_alex"]] if scored else []
+    assert found == [pytest.approx(value, nan_ok=True) for value in (math.nan, 0.5, math.nan, 0.5)]
+
+
+def test_a_path_with_too_few_frames_for_lpips_says_so():
+    protocol = EvaluationProtocol(name="some", lpips=("alex",), lpips_every=2)
+    scoring = Scoring(protocol, {"alex": lambda *_: 0.5}, WHITE, shown=())
+    picture = torch.zeros(16, 16, 3)
+    scoring.score(0, picture, picture.byte(), cut=False)
+    expected = "protocol.lpips_every is 2, and the path has 1 frames to score"
+    assert scoring.missing([]) == {"lpips_alex": expected}
+    scoring.score(1, picture, picture.byte(), cut=False)
+    assert scoring.missing([]) == {}

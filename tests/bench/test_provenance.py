@@ -15,11 +15,12 @@ import torch
 
 from bench import provenance
 from bench.errors import SteerbenchError
-from bench.provenance import libraries
+from bench.provenance import computed_by, libraries
 from bench.run import measure
 from methods.instant_ngp.stage1 import train_field
 
 commit = provenance.commit.__wrapped__
+MACHINE = provenance.machine()
 
 
 @pytest.fixture
@@ -235,6 +236,24 @@ def test_libraries_are_those_that_the_sources_import_and_a_class_lists(tree):
     assert libraries(defined_in("bench.unused")) == {}
     thing = defined_in("bench.unused", libraries=("scipy", "not-installed"))
     assert libraries(thing) == {"scipy": metadata.version("scipy")}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda patch: patch.setattr(provenance, "machine", lambda: {**MACHINE, "cpu": "another"}),
+        lambda patch: patch.setattr(provenance, "machine", lambda: {**MACHINE, "threads": 99}),
+        lambda patch: patch.setattr(provenance, "machine", lambda: {**MACHINE, "python": "4.0"}),
+        lambda patch: patch.setattr(provenance, "libraries", lambda *_: {"torch": "99"}),
+        lambda patch: patch.setenv("NUMBA_NUM_THREADS", "99"),
+    ],
+)
+def test_what_else_decides_a_result_is_part_of_its_key(change, monkeypatch):
+    monkeypatch.setattr(provenance, "machine", lambda: MACHINE)
+    before = computed_by(measure)
+    assert computed_by(measure) == before
+    change(monkeypatch)
+    assert computed_by(measure) != before
 
 
 def test_a_real_training_stands_on_its_backends_and_not_on_how_results_are_shown():

@@ -93,15 +93,10 @@ def test_the_stages_of_every_frame_and_of_the_mean_add_up_to_the_total(run, offs
     assert total == pytest.approx(value(measured.rows, "frame_ms"), rel=1e-12)
     whole = run(offset_method, protocol=replace(QUICK, stages=False)).frames
     assert [name for name in whole if name.startswith("stage_ms.")] == ["stage_ms.other"]
-    # Frames a second follow from the mean time and its interval.
+    # The interval of frames a second follows from that of the mean time.
     ms, fps = row(measured.rows, "frame_ms"), row(measured.rows, "fps")
-    times = measured.frames["frame_ms"]
-    assert ms["value"] == pytest.approx(times.mean())
-    assert fps["value"] == pytest.approx(1000 / times.mean())
     assert fps["lo"] == pytest.approx(1000 / ms["hi"])
     assert math.isnan(fps["hi"]) or fps["hi"] == pytest.approx(1000 / ms["lo"])
-    assert value(measured.rows, "frame_ms.p50") == pytest.approx(times.median())
-    assert value(measured.rows, "frame_ms.p99") <= times.max()
 
 
 def test_warm_up_frames_come_first_and_a_method_forgets_them_or_all(run, offset_method):
@@ -130,7 +125,9 @@ def test_frames_with_too_little_to_look_back_on_are_cold(run, offset_method, tin
         for metric in ("psnr", "frame_ms", "work.pixels", "stage_ms.look-up"):
             found = row(of_rows, metric)
             assert (found["value"], found["n"]) == (of_phase[metric].mean(), len(of_phase))
-        assert value(of_rows, "frame_ms.p50") == pytest.approx(of_phase["frame_ms"].median())
+        for part in (50, 95, 99):
+            quantile = of_phase["frame_ms"].quantile(part / 100)
+            assert value(of_rows, f"frame_ms.p{part}") == pytest.approx(quantile)
         assert value(of_rows, "fps") == pytest.approx(1000 / of_phase["frame_ms"].mean())
     whole = rows.loc[rows["phase"] == "all", "metric"]
     assert set(whole) == {

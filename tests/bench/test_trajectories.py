@@ -212,6 +212,7 @@ def test_each_camera_is_approached_once_after_a_cut_from_a_motion_of_its_own(tin
     first, again, other = (approached(tiny_scene, "test", 1, 3.3, seed, 0) for seed in (0, 0, 1))
     poses = [[step.camera.c2w.tolist() for step in path.steps] for path in (first, again, other)]
     assert poses[0] == poses[1] != poses[2]
+    assert first.name == again.name != other.name
 
 
 POSE = torch.tensor([[1.0, 0, 0, 0.5], [0, -1, 0, 0.25], [0, 0, -1, 2.0]])
@@ -248,20 +249,24 @@ def nerfbaselines(**others: Any) -> dict[str, Any]:
     return about | others
 
 
-@pytest.mark.parametrize("form", ["nerfstudio", "nerfbaselines"])
-def test_a_path_comes_back_as_it_was_written(scene, tmp_path, form):
-    first = scene.splits["test"].cameras[0]
+@pytest.mark.parametrize(
+    ("form", "lens"),
+    [("nerfstudio", {}), ("nerfbaselines", {}), (None, {}), (None, {"cx": 9.0, "fx": 30.0})],
+)
+def test_a_path_comes_back_as_it_was_written(scene, tmp_path, form, lens):
+    first = replace(scene.splits["test"].cameras[0], **lens)
     second = moved(first, 0.125)
     write_path(tmp_path / "there.json", [first, second], scene, form=form)
     trajectory = follow(scene, str(tmp_path / "there.json"))
-    assert trajectory.name == "there"
+    assert trajectory.name.startswith("there-")
     assert trajectory.reads == (tmp_path / "there.json",)
     assert trajectory.preceding == [0, 1]
     for step, camera in zip(trajectory.steps, (first, second), strict=True):
         assert step.truth is None
         torch.testing.assert_close(step.camera.c2w, camera.c2w)
         assert (step.camera.width, step.camera.height) == (32, 24)
-        assert step.camera.fy == pytest.approx(camera.fy)
+        found, wanted = ((c.fx, c.fy, c.cx, c.cy) for c in (step.camera, camera))
+        assert found == pytest.approx(wanted)
 
 
 def test_a_key_frame_of_the_viewer_is_read_as_nerfstudio_means_it(scene, tmp_path):

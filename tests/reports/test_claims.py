@@ -26,6 +26,7 @@ from reports.claims import (
     apart,
     claim_table,
     compare,
+    finding_table,
     gap,
     tally,
     told,
@@ -123,7 +124,9 @@ def test_the_ratio_of_times_has_the_interval_of_its_frames(run):
     ("scenes", "seeds", "over"),
     [("a", 3, "3 seeds"), ("abc", 1, "3 scenes"), ("ab", 2, "2 scenes × 2 seeds")],
 )
-def test_a_pair_has_the_same_scene_and_seed_and_each_is_a_replicate(run, scenes, seeds, over):
+def test_a_pair_has_the_same_scene_and_seed_and_several_scenes_are_the_samples(
+    run, scenes, seeds, over
+):
     """Scenes and seeds differ by decibels, the lines by about a tenth with each of them."""
     places = [(scene, seed) for scene in scenes for seed in range(seeds)]
     by = {place: 0.1 + 0.01 * number for number, place in enumerate(places)}
@@ -132,7 +135,9 @@ def test_a_pair_has_the_same_scene_and_seed_and_each_is_a_replicate(run, scenes,
     found = between(one, two[::-1])
     assert (found.over, found.proves) == (over, True)
     assert found.by == pytest.approx(np.mean([*by.values()]))
-    assert found.half == pytest.approx(half_interval(np.array([*by.values()])))
+    of_scenes = [[by[x, seed] for seed in range(seeds)] for x in scenes]
+    samples = np.mean(of_scenes, axis=1) if len(scenes) > 1 else np.array(of_scenes[0])
+    assert found.half == pytest.approx(half_interval(samples))
     alone = between(one, two[:1])  # of a pair, frames are compared
     assert (alone.over, alone.by) == ("6 frames of one seed", pytest.approx(0.1))
 
@@ -154,9 +159,31 @@ def test_a_stage_includes_the_stages_inside_it(run):
     assert found.half == 0  # the frames are the same
 
 
-def test_a_line_not_measured_has_no_gap_nor_have_times_of_different_machines(run):
-    assert between([run], []) is between([run], [elsewhere(run)], "frame_ms") is NOT_MEASURED
-    assert between([run], [elsewhere(run)]) is not NOT_MEASURED
+def beside(run: Run, *keys: str) -> Run:
+    """`run` as one of those with these keys that were measured in turns."""
+    made_of = {**run.record["made_of"], "beside": [*keys]}
+    return replace(run, record={**run.record, "made_of": made_of})
+
+
+@pytest.mark.parametrize("other", [elsewhere, lambda run: beside(run, "a", "b")])
+def test_times_of_another_machine_or_of_other_turns_are_not_compared(run, other):
+    assert between([run], [other(run)], "frame_ms") is NOT_MEASURED
+    assert between([run], [other(run)]) is not NOT_MEASURED
+    assert between([run], []) is NOT_MEASURED
+    assert between([beside(run, "a")], [beside(run, "a")], "frame_ms") is not NOT_MEASURED
+
+
+def test_one_perfect_frame_does_not_make_two_lines_alike(run):
+    """It makes the mean PSNR of both infinite."""
+    psnr = run.frames["psnr"].to_numpy()
+    perfect = np.where(np.arange(6) == 0, math.inf, psnr)
+    one, two = (
+        replace(changed(run, {"psnr": math.inf}), read_frames=lambda x=x: run.frames.assign(psnr=x))
+        for x in (perfect, perfect + 3)
+    )
+    assert between([one], [two]).by == pytest.approx(3 * 5 / 6)
+    both = between([one, changed(one, {}, seed=1)], [two, changed(two, {}, seed=1)])
+    assert both.by == pytest.approx(3 * 5 / 6)
 
 
 def compared(
@@ -211,3 +238,18 @@ def test_a_line_of_the_table_has_no_more_than_two_numbers_in_a_cell():
         ("Table 9, model, MB: one < two", "×3.60", "×2.00", "", over, "×1.1", SMALLER),
     )
     assert tally([*found, found[0]]) == f"2 {OPPOSITE}; 1 {AS}; 1 {SMALLER}"
+
+
+def test_a_finding_on_a_further_data_set_has_a_line_where_its_figures_differ():
+    told = replace(RISING, says="PSNR gained", main=True)
+    first = replace(comparison(told, 0.9, 0.3, 1.0), table="Table 9")
+    same = replace(first, table="Table 9, Tanks & Temples")
+    other = replace(comparison(told, 0.2, 0.1, 1.0), table="Table 9, Tanks & Temples")
+    silent = comparison(RISING, 0.9, 0.3, 1.0)
+    assert [line[0] for line in finding_table([first, same, silent]).lines] == ["PSNR gained (dB)"]
+    table = finding_table([first, other])
+    assert [line[0] for line in table.lines] == [
+        "PSNR gained (dB)",
+        "PSNR gained, Tanks & Temples (dB)",
+    ]
+    assert table.bold == {(0, 0), (1, 0)}

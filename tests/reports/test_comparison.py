@@ -7,8 +7,8 @@ import math
 import pytest
 
 from bench.errors import SteerbenchError
-from reports.comparison import comparison, metric_format
-from reports.runs import Run
+from reports.comparison import comparison, metric_format, ranks
+from reports.runs import Repeated, Run
 from tests.reports.conftest import changed, elsewhere, run_of
 
 FACTS = dict.fromkeys(("split", "trajectory", "budget", "protocol", "device"), "same")
@@ -19,7 +19,7 @@ def make(rows):
     """Makes a run with the figures of `rows`, some of them changed."""
 
     def make_run(label: str, rows=rows, digest: str = "d", **figures: float) -> Run:
-        machine, scene = {"cpu": "EPYC", "gpus": []}, {"digest": digest}
+        machine, scene = {"cpu": "EPYC", "threads": 2, "gpus": []}, {"digest": digest}
         run = run_of(rows.assign(**FACTS), label, machine=machine, scene=scene)
         return changed(run, figures)
 
@@ -73,6 +73,13 @@ def test_cold_frames_have_a_line_of_their_own_and_compete_among_themselves(make,
 def test_a_figure_is_written_in_its_unit(metric, label, text):
     got, write = metric_format(metric)
     assert (got, write(1.5e6).replace(",", "")) == (label, text)
+
+
+def test_a_metric_without_a_better_side_has_no_best(make, rows):
+    renamed = rows.replace({"metric": {"ssim": "warp_1_true"}})
+    lines = [Repeated(x, [make(x, renamed, warp_1_true=by)]) for x, by in (("a", 0.1), ("b", 0.2))]
+    assert ranks(lines, "psnr") == {0: 1, 1: 1}
+    assert ranks(lines, "warp_1_true") == {}
 
 
 def test_a_metric_that_does_not_exist_is_refused():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 
 import pandas as pd
 import pytest
@@ -62,6 +63,16 @@ def test_latex_is_of_booktabs_has_the_decimals_of_the_paper_and_marks_the_best(l
     runs = [changed(lines["table9"][0].runs[0], {"psnr": psnr}) for psnr in (29.0, 31.0)]
     found = cells(export.latex([TABLE], {"table9": [Repeated("K = 3", runs)]}))
     assert found["$K = 3$"][0] == r"30.00 $\pm$ 12.71"
+
+
+def test_a_metric_that_the_paper_lacks_is_written_as_on_our_pages(lines):
+    table = replace(TABLE, metrics=["flip", "peak_bytes"])
+    (line, *_) = lines["table9"]
+    (run,) = line.runs
+    rows = run.rows.replace({"metric": {"ssim": "flip"}})
+    shown = changed(replace(run, rows=rows), {"flip": 0.1234, "peak_bytes": 2.5e9})
+    found = cells(export.latex([table], {"table9": [Repeated(line.label, [shown])]}))
+    assert found["$T = 2^{19}$"] == ["0.1234", "2,500.00"]
 
 
 def test_a_rule_stands_before_what_is_beyond_the_paper(lines):

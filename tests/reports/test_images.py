@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from reports.images import MOST_FRAMES, Frame, View, find_detail, kept_frames, write_image
+from reports.images import (
+    MOST_FRAMES,
+    Frame,
+    View,
+    find_detail,
+    frame_section,
+    kept_frames,
+    write_image,
+)
+from reports.runs import Run
+from tests.reports.conftest import changed
 
 HEIGHT, WIDTH = 64, 96
 
@@ -55,6 +66,22 @@ def test_an_image_has_a_place_for_every_picture(tmp_path, runs, columns, lines):
         assert np.count_nonzero((pixels == 50 * number).all(axis=-1)) > panel[0] * panel[1]
     brightest = (pixels == [252, 254, 164]).all(axis=-1)  # of inferno: a scale beside several maps
     assert brightest.any() == (lines == 3)
+
+
+def test_what_stands_below_a_picture_is_of_its_frame(run):
+    frames = run.frames.assign(psnr=30.0 + np.arange(6), frame_ms=100.0 + np.arange(6))
+    frames.loc[0, "phase"] = "cold"
+    of_frames = replace(changed(run, {"frame_ms": 250.0}), read_frames=lambda: frames)
+    kept = kept_frames([of_frames])
+    titles = [view.titles[1] for frame in kept for view in shown(of_frames, frame)]
+    assert titles[0] == "PSNR 30.00 dB, 100.0 ms, cold"
+    assert titles[1:] == [f"PSNR {30 + int(frame):.2f} dB, 250.0 ms" for frame in kept[1:]]
+
+
+def shown(run: Run, frame: str) -> list[View]:
+    """The views in the section of a frame."""
+    (part,) = (x for x in frame_section([run], frame, "frames") if isinstance(x, Frame))
+    return [*part.views]
 
 
 def test_a_page_has_a_few_of_the_frames_that_all_runs_kept(tmp_path):

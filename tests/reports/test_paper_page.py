@@ -144,6 +144,18 @@ def test_a_curve_has_a_point_for_every_measured_share(of_method, of_budget, run,
         assert set(line.get_ydata()) == {run.values["psnr"]}
 
 
+def test_all_points_of_a_curve_are_of_the_same_seeds(run):
+    table, (line, *_) = TABLES["table5"], TABLES["table5"].lines
+    seeds = {0.25: (0, 1), 0.5: (0, 2), 1.0: (0, 1, 2)}
+    labels = {share: table.marks[line.label, share].label for share in (0.25, 0.5)}
+    measured = [
+        Repeated({**labels, 1.0: line.label}[share], [changed(run, {}, seed=x) for x in some])
+        for share, some in seeds.items()
+    ]
+    (curve,) = _curves(table, {"table5": measured})
+    assert [[r.facts["seed"] for r in x.runs] for x in curve.points.values()] == 3 * [[0]]
+
+
 def test_several_seeds_have_bars_on_a_curve_and_one_has_none(run, tmp_path, drawn):
     seeds = [shifted(run, by, seed=seed) for seed, by in enumerate((0.0, 1.0, 2.0))]
     points = {10.0: Repeated("a", seeds), 20.0: Repeated("b", [run])}

@@ -73,11 +73,12 @@ def test_frames_that_both_have_are_compared_in_pairs(by, verdict):
     assert found.verdict == verdict
 
 
-def test_frames_without_an_error_hide_no_others():
-    """Equal pictures have an infinite PSNR, before and after."""
+@pytest.mark.parametrize("before", [math.inf, 30.0])
+def test_frames_without_an_error_hide_no_others(before):
+    """Equal pictures have an infinite PSNR."""
     old, new = (
-        replace(with_frames("psnr", *[psnr] * 9, math.inf), values={"psnr": math.inf})
-        for psnr in (30.0, 20.0)
+        replace(with_frames("psnr", *[psnr] * 9, last), values={"psnr": math.inf})
+        for psnr, last in ((30.0, before), (20.0, math.inf))
     )
     found = change("psnr", [old], [new])
     assert (found.by, found.verdict) == (pytest.approx(-9), "worse")

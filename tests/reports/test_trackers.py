@@ -26,6 +26,19 @@ def test_tensorboard_has_the_figures_of_every_frame_and_of_the_run(run, tmp_path
     assert set(events.Tags()["images"]) == {name for name, _ in pictures(run)}
 
 
+def test_an_interruption_leaves_nothing_that_looks_whole(run, tmp_path, monkeypatch):
+    pytest.importorskip("tensorboard")
+
+    def interrupted(run):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(trackers, "pictures", interrupted)
+        tracker("tensorboard")(run, tmp_path)
+    assert not (tmp_path / "tensorboard" / run.key).exists()
+    test_tensorboard_has_the_figures_of_every_frame_and_of_the_run(run, tmp_path)
+
+
 def test_wandb_has_a_run_whose_id_is_the_key(run, tmp_path, monkeypatch):
     pytest.importorskip("wandb")
     monkeypatch.setenv("WANDB_MODE", "offline")

@@ -113,6 +113,8 @@ def test_a_failure_is_kept_for_its_job_until_that_succeeds(elsewhere):
     (job,), (other,) = in_turns(0.5, turns=""), in_turns(0.75, turns="")
     job.keep_failure("no room")
     assert (job.failure, other.failure) == ("no room", None)
+    (timed,) = in_turns(0.5)
+    assert timed.failure is None  # in turns it is another job
     obtain([job])
     assert job.failure is None
 

@@ -88,6 +88,29 @@ def test_a_command_that_fails_leaves_its_region_and_the_others_are_measured(stee
     assert "|run|PSNR, dB ↑|" in (checkout / "README.md").read_text()
 
 
+def test_a_page_that_a_failing_command_wrote_is_not_shown_as_an_earlier_one(
+    steerbench, checkout, monkeypatch
+):
+    assert steerbench("figures", "--only", "run").status == 0
+    (checkout / "bench" / "code.py").write_text("one = 2\n")
+    before = (checkout / "README.md").read_text()
+
+    def failing(argv):
+        (checkout / "outputs/figures/run/report.md").write_text("# New\n\n| a |\n|---|\n| 1 |\n")
+        return 1
+
+    monkeypatch.setattr(figures.cli, "dispatch", failing)
+    assert figures.main(Namespace(only=["run"], check=False, data=None)) == 1
+    assert (checkout / "README.md").read_text() == before
+
+
+def test_the_folder_of_data_may_have_a_space(checkout, monkeypatch):
+    called = []
+    monkeypatch.setattr(figures.cli, "dispatch", lambda argv: called.append([*argv]) or 1)
+    figures.main(Namespace(only=["real"], check=False, data=Path("/my data")))
+    assert called == [["run", "scene.path=/my data/mic"]]
+
+
 def test_an_interruption_ends_all_commands(checkout, monkeypatch):
     def interrupted(argv):
         raise KeyboardInterrupt

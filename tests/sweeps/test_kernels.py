@@ -104,6 +104,19 @@ def test_what_a_kernel_brings_has_a_line_for_each_that_a_method_calls(steerbench
     assert rows["march"]["frame_ms_reference"] > 0
 
 
+def test_methods_that_need_a_setting_are_left_out_unless_named(steerbench, monkeypatch):
+    asked = []
+
+    def rows(words, options):
+        asked.append(next(word for word in words if word.startswith("method=")))
+        return []
+
+    monkeypatch.setattr("sweeps.commands.kernels._rows_of_worth", rows)
+    steerbench("kernels", "--worth")
+    assert {"method=ngp", "method=steernerf", "method=nsvf"} <= {*asked}
+    assert "method=external" not in asked
+
+
 def test_compiled_kernels_compute_their_quick_cases(monkeypatch):
     tolerances = {("cpu", "fp32"): 0.1, ("reference", "fp32"): 0.1}
     computed = []

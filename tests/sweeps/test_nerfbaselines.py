@@ -6,12 +6,17 @@ import base64
 import json
 import os
 import subprocess
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from PIL import Image
 
+from bench.nerfbaselines import Prediction, write_results
 from bench.results import Store
+from bench.types import Camera
 
 FIGURES = ("psnr", "ssim")
 
@@ -139,3 +144,16 @@ def test_nerfbaselines_reads_what_was_exported_and_is_read(steerbench, exported,
     rows = Store(Path("outputs")).rows()
     rows = rows[rows["method"] == "splatfacto"].set_index("metric")
     assert rows["value"].to_dict() == {"psnr": 21.5, "train_s": 12.5}
+
+
+def test_figures_are_in_the_order_of_the_names_of_their_files(tmp_path):
+    picture, camera = tmp_path / "grey.png", Camera(torch.eye(3, 4), 2.0, 2.0, 1.0, 1.0, 2, 2)
+    Image.new("RGB", (2, 2)).save(picture)
+    frames = [
+        Prediction(f"r_{number}", picture, picture, camera, {"psnr": float(number)})
+        for number in (2, 10)  # along a path
+    ]
+    data = {"evaluation_protocol": "default"}
+    write_results(tmp_path / "there", frames, {}, data, datetime.now(UTC))
+    raw = json.loads((tmp_path / "there/results.json").read_text())["metrics_raw"]["psnr"]
+    assert np.frombuffer(base64.b64decode(raw), "<f4").tolist() == [10.0, 2.0]

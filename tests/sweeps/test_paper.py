@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 import shutil
 from collections.abc import Mapping
@@ -16,6 +15,7 @@ from omegaconf import DictConfig
 
 from bench.results import Store
 from bench.types import Scene, SteerbenchError, Unavailable
+from reports.claims import gap
 from reports.runs import Run, load
 from sweeps import configured, execute
 from sweeps.commands import paper
@@ -165,8 +165,7 @@ def scenes(store: Store, stored_run: str, tmp_path: Path) -> Store:
         path = tmp_path / name / "mic"
         path.mkdir(parents=True)
         key = put(store, stored_run, job(path), f"{number}{stored_run[1:]}")
-        rewrite(store, key, scene={"digest": name}, scene_path=str(path))
-        os.utime(store.folder / key, (number, number))
+        rewrite(store, key, scene={"digest": name}, scene_path=str(path), stored=number + 1.0)
     return store
 
 
@@ -249,6 +248,7 @@ def test_means_are_over_the_scenes_that_all_lines_have(psnr):
     assert (one.mean("psnr"), other.mean("psnr")) == (20.0, 21.0)
     assert (one.gaps, other.gaps) == ([], ["b not measured yet"])
     assert list(one.by_scene) == ["a", "c", "b"]
+    assert gap("psnr", one, other).by == 1.0  # of the same scenes
     assert one.runs[0].conditions == other.runs[0].conditions
 
 

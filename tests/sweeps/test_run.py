@@ -189,6 +189,17 @@ def test_a_sweep_that_cannot_begin_is_one_line(run, tmp_path):
     assert stored(tmp_path) == []
 
 
+def test_a_sweep_has_one_folder_of_outputs_for_its_table(run, tmp_path):
+    outcome = run("-m", "outputs=a,b")
+    assert outcome.status == 2
+    assert "outputs: expected one folder, for the table of all jobs, got a, b" in outcome.err
+
+
+def test_equal_jobs_share_a_line_with_both_names(run):
+    outcome = run("-m", "precision=fp32,bf16")  # of a method without an engine
+    assert "grey (precision=fp32), grey (precision=bf16)" in outcome.out
+
+
 def test_outputs_that_cannot_be_written_are_named(run, tmp_path):
     (tmp_path / "a-file").touch()
     outcome = run("outputs=a-file/below")

@@ -56,11 +56,12 @@ def test_the_rows_stand_in_the_store_beside_those_of_runs(steerbench, folders, m
 def test_the_same_pictures_are_the_same_run_and_others_are_another(steerbench, folders):
     theirs, true = folders
     keys = []
-    for words in ([], [], ["--name", "better"], ["protocol.name=other", "protocol.ssim=uniform"]):
+    other = ["protocol.name=other", "protocol.ssim=uniform"]
+    for words in ([], [], ["--name", "better"], other, ["pictures=0"]):
         outcome = steerbench("score", theirs, "--truth", true, *QUICK, *words)
         keys.append(re.search(r"run (\w+)", outcome.out)[1])
     assert keys[0] == keys[1]
-    assert len(set(keys)) == 3
+    assert len(set(keys)) == 4
 
 
 def test_pictures_of_two_programs_are_compared_where_their_truth_is_the_same(steerbench, folders):

@@ -111,7 +111,9 @@ def test_our_lenses_are_those_of_colmap(model: str, ours: object) -> None:
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_every_lens_is_undone(model: str, folder, log) -> None:
+def test_pictures_of_every_lens_are_of_a_pinhole_of_the_same_focal_length(
+    model: str, folder, log
+) -> None:
     plain = colmap.load(folder(kind="text"), log=log)
     bent = colmap.load(folder(model, LENSES[model]), log=log)
     first, second = (scene.splits["test"].images[0] for scene in (plain, bent))

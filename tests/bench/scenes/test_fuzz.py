@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import json
 import math
-import resource
 import struct
 import warnings
 from collections.abc import Callable, Iterator
@@ -19,6 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from bench.console import ConsoleLog
+from bench.probes import MemoryMeter
 from bench.scenes import blender, nsvf, transforms
 from bench.scenes.images import decode_bytes
 from bench.types import Scene, SteerbenchError
@@ -121,9 +121,12 @@ def headers(draw: st.DrawFn) -> bytes:
 @pytest.fixture(autouse=True)
 def within_a_gigabyte() -> Iterator[None]:
     """No test makes the process grow by 1 GiB at its peak."""
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # KiB
-    yield
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1 << 20
+    before, meter = MemoryMeter("cpu"), MemoryMeter("cpu")
+    with before:
+        pass
+    with meter:
+        yield
+    assert meter.peak_bytes - before.peak_bytes < 1 << 30
 
 
 @pytest.fixture(scope="module")

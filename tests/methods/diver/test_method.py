@@ -9,20 +9,16 @@ import torch
 
 from bench.types import Budget, Log, Scene
 from methods.diver.method import Diver
-from methods.diver.training import DiverLessons
 from methods.instant_ngp.stage1 import TrainedField
 from methods.students.voxels import corners_of
+from tests.methods.small_students import SMALL
 from tests.methods.trainings import GRID, TAUGHT, TEACHER, quality
 
-LESSONS = DiverLessons(prune_rays=1 << 13)
-
-
-def method_of(**options) -> Diver:
-    return Diver(**{"teacher": TEACHER, "resolution": 32, "training": LESSONS} | options)
+new = SMALL["diver"]
 
 
 def fitted(scene: Scene, log: Log, budget: Budget = TAUGHT, **options) -> Diver:
-    method = method_of(**options)
+    method = new(**options)
     method.fit(scene, budget, log)
     return method
 
@@ -30,7 +26,7 @@ def fitted(scene: Scene, log: Log, budget: Budget = TAUGHT, **options) -> Diver:
 def test_it_begins_with_the_encoding_of_the_teacher(
     ball_scene: Scene, teacher: TrainedField
 ) -> None:
-    model = method_of().begin(teacher, ball_scene, TAUGHT).model
+    model = new().begin(teacher, ball_scene, TAUGHT).model
     cells = model.voxels.coordinates.long() * 4  # the teacher's grid is four times as fine
     near = teacher.occupancy.cells.unfold(0, 4, 4).unfold(1, 4, 4).unfold(2, 4, 4)
     assert near.flatten(3).any(dim=3).sum() == len(cells) > 0
@@ -42,17 +38,17 @@ def test_sparsity_draws_a_negative_density_back_to_zero(
     ball_scene: Scene, teacher: TrainedField
 ) -> None:
     """Its slope is 4 s / (1 + 2 s^2) of the mean, of the first `count` densities alone."""
-    training = method_of().begin(teacher, ball_scene, TAUGHT)
+    training = new().begin(teacher, ball_scene, TAUGHT)
     raw = torch.tensor([-2.0, 0.0, 0.5, 3.0], requires_grad=True)
     training._push_to_sparsity(raw, 3)
     raw.relu().mul(0).sum().backward()
-    wanted = LESSONS.sparsity / 3 * torch.tensor([-8 / 9, 0, 4 / 3, 0])
+    wanted = training.options.sparsity / 3 * torch.tensor([-8 / 9, 0, 4 / 3, 0])
     torch.testing.assert_close(raw.grad, wanted)
 
 
 def test_pruning_leaves_what_shows(ball_scene: Scene, teacher: TrainedField) -> None:
-    late = replace(LESSONS, prune_at=1.0)
-    method = method_of(stored="fp32", stop=1e-4, faint=0.0, training=late)
+    late = replace(new().training, prune_at=1.0)
+    method = new(stored="fp32", stop=1e-4, faint=0.0, training=late)
     method.background = ball_scene.background
     training = method.begin(teacher, ball_scene, replace(TAUGHT, renderer_steps=200))
     while training.step < 100:

@@ -123,13 +123,15 @@ def gone(process: psutil.Process) -> bool:
 def test_what_it_does_wrong_is_one_line_with_its_last_words(
     place, lines, said, worker, external, tiny_scene, quiet_log, started
 ):
-    method = external(worker(before=talking(place, lines), after=""), frame_s=0.5, start_s=0.5)
-    method.start_s = 60.0 if place == "render" else 0.5
+    limit_s = 0.5 if lines == HANG else 60.0
+    method = external(worker(before=talking(place, lines), after=""), frame_s=limit_s)
+    method.start_s = limit_s if place == "hello" else 60.0
     with pytest.raises(SteerbenchError, match=said) as error:
         render(method, tiny_scene, quiet_log)
     message = str(error.value)
     assert message.startswith(f"worker {'bad' if place == 'render' else ''}")
-    assert message.endswith("; its last words: its own words")
+    if (place, lines) != ("hello", HANG):  # it may not have come to say them
+        assert message.endswith("; its last words: its own words")
     assert "\n" not in message
     assert all(map(gone, started))
 

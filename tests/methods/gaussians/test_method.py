@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -56,6 +57,8 @@ def test_a_training_is_found_again_and_left_for_others(
 
 def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, shared_log: Log) -> None:
     plain = fitted(ball_scene, shared_log)
+    small = fitted(ball_scene, shared_log, stored="int8", stop=0.5)
+    assert small.train_s == plain.train_s  # both are chosen after a training
     small = fitted(ball_scene, shared_log, stored="int8")
     assert plain.sizes() == {"gaussians": 400 * 59 * 4}
     assert small.sizes()["gaussians"] < plain.sizes()["gaussians"] / 3.5
@@ -68,7 +71,10 @@ def test_by_triton_there_are_none() -> None:
         GaussianSplatting(grid=GRID, training=QUICK, fitting=Fitting(), count=9, backend="gpu")
 
 
-@pytest.mark.parametrize("wrong", [{"count": 0}, {"degree": 4}, {"stop": 1.0}])
-def test_wrong_settings_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="expected"):
+@pytest.mark.parametrize(
+    "wrong", [{"count": 0}, {"degree": 4}, {"stop": 1.0}, {"start": "x"}, {"stored": "fp8"}]
+)
+def test_wrong_settings_are_refused(wrong: dict[str, Any]) -> None:
+    (name,) = wrong
+    with pytest.raises(ValueError, match=f"^{name}: expected"):
         GaussianSplatting(grid=GRID, training=QUICK, fitting=Fitting(), **{"count": 10} | wrong)

@@ -218,7 +218,20 @@ def test_pictures_without_alpha_are_trained_on_as_they_are(ball_scene: Scene) ->
     opaque = replace(split, images=[image[..., :3] for image in split.images])
     scene = replace(ball_scene, splits={"train": opaque, "test": opaque})
     training = new_training(scene)
-    assert all(training.advance()[""] < 1 for _ in range(5))
+    colours = torch.rand(9, 3)
+    target, background = training._target(colours)
+    assert torch.equal(target, colours)
+    assert torch.equal(background, scene.background)
+
+
+def test_a_random_background_is_one_colour_for_a_ray_and_its_truth(ball_scene: Scene) -> None:
+    training = new_training(ball_scene)
+    clear = torch.cat((torch.rand(9, 3), torch.zeros(9, 1)), dim=1)
+    target, background = training._target(clear)
+    assert torch.equal(target, background)
+    assert len(set(map(tuple, background.tolist()))) == 9
+    target, _ = training._target(torch.cat((clear[:, :3], torch.ones(9, 1)), dim=1))
+    assert torch.equal(target, clear[:, :3])
 
 
 STRESS = [case for case in cases() if case.subject == "training"]

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import torch
 
 from methods.kernels.types import Occupancy
 from methods.kilonerf.field import KiloField, place_networks
+from methods.kilonerf.method import KiloLessons, KiloTraining
 
 BOUNDS = torch.tensor([[0.1, 0.2, 0.1], [0.9, 0.8, 0.7]])
 
@@ -66,3 +69,17 @@ def test_a_scene_without_matter_has_no_network() -> None:
     assert grid.count == 0
     sigma, _ = KiloField(grid, "auto").density(torch.rand(9, 3))
     assert not sigma.any()
+
+
+def test_layers_that_see_directions_are_drawn_to_zero_by_the_gradient_of_their_norm() -> None:
+    grid, _ = place_networks(occupied((8, 8, 8)), BOUNDS, 4)
+    field = KiloField(grid, "auto", torch.Generator().manual_seed(0))
+    for parameter in field.parameters():
+        parameter.grad = torch.zeros_like(parameter)
+    KiloTraining._smooth_views(SimpleNamespace(field=field, options=KiloLessons(view_cost=0.25)))
+    seeing = (field.weights["direction"], field.weights["colour"])
+    for parameter in seeing:
+        assert parameter.grad is not None
+        torch.testing.assert_close(parameter.grad, 0.25 * parameter / parameter.norm())
+    others = (field.weights[name].grad for name in ("in", "mid", "density", "feature"))
+    assert not any(grad.any() for grad in others if grad is not None)

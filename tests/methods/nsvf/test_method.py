@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
@@ -16,18 +15,12 @@ from methods.instant_ngp.stage1 import train_field
 from methods.kernels.encode import encode
 from methods.kernels.types import Occupancy
 from methods.nsvf.field import NsvfField
-from methods.nsvf.method import Nsvf
-from methods.students.fields import FieldLessons
-from tests.methods.trainings import EXACT_GRID, EXACT_TEACHER, TAUGHT, TEACHER
+from tests.methods.small_students import SMALL, budget
+from tests.methods.trainings import EXACT_GRID, TEACHER
 
-BUDGET = replace(TAUGHT, steps=80, renderer_steps=4)
+BUDGET = budget("nsvf", 4)
 U = 2.0**-24
 SINES = (torch.sin, torch.cos)
-
-
-def new_method(**options: Any) -> Nsvf:
-    given = {"teacher": EXACT_TEACHER, "resolution": 32, "start": "random"} | options
-    return Nsvf(training=FieldLessons(rate=2e-3), **given)
 
 
 def two_thirds(backend: str = "reference") -> NsvfField:
@@ -94,14 +87,14 @@ def test_the_network_is_that_of_the_publication() -> None:
 
 
 def test_its_step_is_in_voxels(ball_scene: Scene, shared_log: Log) -> None:
-    method = new_method()
+    method = SMALL["nsvf"]()
     method.fit(ball_scene, replace(BUDGET, renderer_steps=2), shared_log)
     assert method.how.step == 0.5 / 32
-    assert new_method(step=0.25).sampling(BUDGET).step == 0.25 / 32
+    assert SMALL["nsvf"](step=0.25).sampling(BUDGET).step == 0.25 / 32
 
 
 def test_embeddings_begin_as_the_teachers_features(ball_scene: Scene, shared_log: Log) -> None:
-    method = new_method(start="teacher")
+    method = SMALL["nsvf"](start="teacher")
     teacher = train_field(method.teacher, ball_scene, BUDGET, shared_log)
     field = method.begin(teacher, ball_scene, BUDGET).field
     assert isinstance(field, NsvfField)
@@ -116,4 +109,4 @@ def test_embeddings_begin_as_the_teachers_features(ball_scene: Scene, shared_log
 
 def test_a_teacher_of_other_channels_is_no_start() -> None:
     with pytest.raises(ValueError, match=r"32 channels .* got 16"):
-        new_method(teacher=TEACHER, start="teacher")
+        SMALL["nsvf"](teacher=TEACHER, start="teacher")

@@ -3,28 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 
-from bench.types import EMPTY_ALPHA, Log, NullProbe, Scene, SteerbenchError
+from bench.types import Log, Scene, SteerbenchError
 from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.types import Pixels
 from methods.plenoctree.method import OctreeLessons, OctreeTraining, PlenOctree, opaque_at_end
 from methods.plenoctree.octree import Extraction, Octree, extract, fibonacci_sphere
 from tests.methods.conftest import Work
-from tests.methods.trainings import TAUGHT, TEACHER, quality
-
-SMALL = {"resolution": 128, "degree": 1, "rays": 20_000, "points": 2, "directions": 8}
-
-
-def fitted(scene: Scene, log: Log, steps: int = 20, stored: str = "fp16") -> PlenOctree:
-    how = {"extraction": Extraction(**SMALL), "training": OctreeLessons(samples=8192)}
-    method = PlenOctree(teacher=TEACHER, stored=stored, **how)
-    method.fit(scene, replace(TAUGHT, renderer_steps=steps), log)
-    return method
+from tests.methods.small_students import LEAVES, fitted
+from tests.methods.trainings import PIXEL, TAUGHT, TEACHER, quality, shows_the_ball
 
 
 def mean_quality(method: PlenOctree, scene: Scene, split: str) -> float:
@@ -35,7 +26,7 @@ def extracted(teacher: TrainedField, scene: Scene, **others: float) -> tuple[Oct
     """An octree, and the centres of its leaves."""
     batches = PixelBatches(scene.splits["train"], torch.device("cpu"))
     generator = torch.Generator().manual_seed(0)
-    octree = extract(teacher, batches, Extraction(**SMALL | others), generator)
+    octree = extract(teacher, batches, Extraction(**LEAVES | others), generator)
     return octree, (octree.voxels.coordinates + 0.5) / 128
 
 
@@ -53,7 +44,7 @@ def test_leaves_stand_where_the_ball_is(ball_scene: Scene, teacher: TrainedField
     assert teacher.occupancy.holds(centres).all()
     # Pixels are 1.6 / 40 wide: half of the leaves are not farther than two from the surface.
     away = ((centres - 0.5).norm(dim=1) - 0.3).abs()
-    assert away.median() < 2 * 1.6 / 40
+    assert away.median() < 2 * PIXEL
     # Without the test of weights, all that the teacher takes for occupied would be there.
     assert len(octree.voxels) < 0.9 * int(teacher.occupancy.cells.sum())
 
@@ -108,15 +99,11 @@ def test_too_many_leaves_and_none_are_refused(
 
 @pytest.mark.slow
 def test_it_learns_a_ball(ball_scene: Scene, shared_log: Log) -> None:
-    before, after = fitted(ball_scene, shared_log, 1), fitted(ball_scene, shared_log, 60)
+    before, after = (fitted("plenoctree", ball_scene, shared_log, steps) for steps in (1, 60))
     assert mean_quality(after, ball_scene, "train") > mean_quality(before, ball_scene, "train") + 1
-    assert mean_quality(after, ball_scene, "test") > 21
-    frame = after.render(ball_scene.splits["test"].cameras[1], NullProbe())
     # From the front of the ball, 1.6 - 0.3 from the camera, to its middle: after so few steps the
     # teacher's ball is a mist.
-    assert 1.3 - 1.6 / 40 < frame.depth[16, 16].item() < 1.6
-    assert torch.equal(frame.depth.isinf(), frame.alpha <= EMPTY_ALPHA)
-    assert (frame.rgb[frame.alpha == 0] == 1).all()
+    shows_the_ball(after, ball_scene, 21, off=0.3)
 
 
 def test_only_what_rays_meet_is_changed(ball_scene: Scene, teacher: TrainedField) -> None:
@@ -135,7 +122,9 @@ def test_only_what_rays_meet_is_changed(ball_scene: Scene, teacher: TrainedField
 
 
 def test_what_is_stored_is_chosen_afterwards(ball_scene: Scene, shared_log: Log) -> None:
-    half, full = (fitted(ball_scene, shared_log, stored=kind) for kind in ("fp16", "fp32"))
+    half, full = (
+        fitted("plenoctree", ball_scene, shared_log, 20, stored=kind) for kind in ("fp16", "fp32")
+    )
     assert full.train_s == half.train_s  # the same training
     assert full.sizes()["leaves"] == 2 * half.sizes()["leaves"]
     assert half.settings()["precision"] == "fp16"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -12,7 +14,14 @@ from methods.instant_ngp.field import HashField
 from methods.kernels.composite import composite, visible
 from methods.kernels.march import march
 from methods.kernels.types import Occupancy, Pixels
-from methods.rendering.batch import KEPT_THIN, Round, render_batch, thinned, visible_samples
+from methods.rendering.batch import (
+    KEPT_THIN,
+    Round,
+    opacity_entropy,
+    render_batch,
+    thinned,
+    visible_samples,
+)
 from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import Sampling
 from tests.methods.conftest import Cloud, look_at_the_middle
@@ -129,3 +138,12 @@ def test_a_guide_tells_which_samples_are_hidden(cloud: Cloud, device: str) -> No
     offsets = march(rays, occupancy, STEP).offsets
     assert few == int((offsets.diff() > 0).sum())
     assert (wall.alpha <= own.alpha + 1e-6).all()
+
+
+def test_the_entropy_of_opacities_is_smallest_where_rays_are_opaque_or_empty() -> None:
+    assert opacity_entropy(torch.tensor([0.5])).item() == pytest.approx(0.5 * math.log(2))
+    assert opacity_entropy(torch.tensor([0.0, 1.0])).item() == pytest.approx(0, abs=1e-4)
+    opacity = torch.tensor([0.2, 0.6], requires_grad=True)  # on both sides of the largest, 1 / e
+    opacity_entropy(opacity).backward()
+    assert opacity.grad is not None
+    assert opacity.grad[0] > 0 > opacity.grad[1]

@@ -101,17 +101,18 @@ def test_at_once_rays_look_as_in_rounds(
     rays = cast(place_camera(look_at_the_middle(0.1, 0.4), device))
     window = torch.tensor((0.0, 1.7), device=device).expand(len(rays.origins), 2)
     found = []
-    for compacts, chunk in ((True, 10_000), (False, 10_000), (False, 100)):
+    for compacts, chunk in ((True, 10_000), (True, 100), (False, 10_000), (False, 100)):
         monkeypatch.setattr(rendering, "compacts", lambda device, compacts=compacts: compacts)
         monkeypatch.setattr(rendering, "CHUNK_RAYS", chunk)
         found.append(render_rays(field, rays, occupancy, NullProbe(), Sampling(window=window)))
-    rounds, once, chunks = found
+    rounds, rounds_of_chunks, once, chunks = found
     assert 0.2 < rounds.alpha.max() < 1
     for name in ("values", "depth_sum", "alpha"):
-        # As in `test_rounds_render_what_one_go_renders`.
-        a, b, c = (getattr(pixels, name) for pixels in (rounds, once, chunks))
+        # As in `test_rounds_render_what_one_go_renders`: a chunk has rounds of its own.
+        a, b, c, d = (getattr(x, name) for x in (rounds, rounds_of_chunks, once, chunks))
         torch.testing.assert_close(a, b, rtol=0, atol=3e-4)
-        torch.testing.assert_close(b, c, rtol=0, atol=1e-6)
+        torch.testing.assert_close(a, c, rtol=0, atol=3e-4)
+        torch.testing.assert_close(c, d, rtol=0, atol=1e-6)
 
 
 def test_samples_behind_the_early_stop_are_hardly_evaluated() -> None:

@@ -32,6 +32,7 @@ def test_engines_are_compared_in_the_same_frames_with_the_true_pictures(
         return (torch.ones_like(network(inputs)[0]),)
 
     exact, wrong = views.compare([Built(network, 0), Built(white, 0)])
+    assert views.pipeline.renderer.engine is None  # the next frame before is drawn by the network
     numbers = [place * 24 // COMPARED for place in range(COMPARED)]
     pictures = [ball_scene.splits["train"].images[number] for number in numbers]
     truth = [composite(picture, ball_scene.background) for picture in pictures]

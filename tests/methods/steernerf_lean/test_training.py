@@ -126,6 +126,24 @@ def test_the_result_is_the_running_mean_of_the_weights_or_the_weights(ball_scene
         assert all(torch.equal(one, other) for one, other in pairs) == (average == 0)
 
 
+def test_a_long_gradient_is_shortened_before_the_weights_are_changed(
+    ball_scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen, update = [], JointTraining.update
+
+    def watched(training: JointTraining) -> None:
+        grads = [x.grad for x in training.renderer.parameters() if x.grad is not None]
+        seen.append(torch.stack([grad.norm() for grad in grads]).norm().item())
+        update(training)
+
+    monkeypatch.setattr(JointTraining, "update", watched)
+    for clip in (None, 1e-3):
+        new_training(ball_scene, replace(OPTIONS, clip=clip)).advance()
+    free, clipped = seen
+    assert free > 1e-3
+    assert clipped == pytest.approx(1e-3, rel=1e-3)
+
+
 def test_a_killed_training_ends_as_if_it_had_never_stopped(
     ball_scene: Scene, tmp_path: Path
 ) -> None:

@@ -12,52 +12,24 @@ from typing import Any
 import pytest
 import torch
 
-from bench.types import Budget, Log, NullProbe, Scene, Unavailable
-from methods.diver.method import Diver
+from bench.types import Log, NullProbe, Scene, Unavailable
 from methods.diver.training import DiverLessons
 from methods.instant_ngp.stage1 import train_field
-from methods.kilonerf.method import KiloLessons, KiloNerf
-from methods.nerf.method import Nerf
-from methods.nsvf.method import Nsvf
-from methods.plenoctree.method import OctreeLessons, PlenOctree
+from methods.kilonerf.method import KiloLessons
+from methods.plenoctree.method import OctreeLessons
 from methods.plenoctree.octree import Extraction
 from methods.students.fields import FieldLessons
-from methods.students.method import Student
 from methods.training import loop
+from tests.methods.small_students import LEAVES, SMALL, budget, fitted
 from tests.methods.trainings import (
     EXACT_TEACHER,
     PIXEL,
-    TAUGHT,
     TEACHER,
     goes_on_after_a_kill,
     shows_the_ball,
 )
 
-LEAVES = {"resolution": 128, "degree": 1, "rays": 20_000, "points": 2, "directions": 8}
-SMALL: dict[str, Callable[..., Student]] = {
-    "diver": partial(
-        Diver, teacher=TEACHER, training=DiverLessons(prune_rays=1 << 13), resolution=32
-    ),
-    "kilonerf": partial(
-        KiloNerf, teacher=TEACHER, training=KiloLessons(points_each=64, rate=1e-2), networks=4
-    ),
-    "nerf": partial(Nerf, teacher=EXACT_TEACHER, training=FieldLessons()),
-    "nsvf": partial(
-        Nsvf, teacher=EXACT_TEACHER, training=FieldLessons(rate=2e-3), resolution=32, start="random"
-    ),
-    "plenoctree": partial(
-        PlenOctree,
-        teacher=TEACHER,
-        training=OctreeLessons(samples=8192),
-        extraction=Extraction(**LEAVES),
-    ),
-}
 names = pytest.mark.parametrize("name", SMALL)
-
-
-def budget(name: str, steps: int) -> Budget:
-    exact = name in ("nerf", "nsvf")
-    return replace(TAUGHT, steps=80 if exact else TAUGHT.steps, renderer_steps=steps)
 
 
 @pytest.mark.parametrize(
@@ -83,12 +55,6 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(
     goes_on_after_a_kill(training, killed_at, tmp_path)
 
 
-def fitted(name: str, scene: Scene, log: Log, steps: int = 2, **options: Any) -> Student:
-    method = SMALL[name](**options)
-    method.fit(scene, budget(name, steps), log)
-    return method
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "steps", "least", "off"),
@@ -109,8 +75,9 @@ def test_it_learns_a_ball(
 @names
 def test_a_training_is_found_again(name: str, ball_scene: Scene, shared_log: Log) -> None:
     first = fitted(name, ball_scene, shared_log)
-    again = fitted(name, ball_scene, shared_log, stop=1e-2)
-    assert again.train_s == first.train_s > 0
+    again = fitted(name, ball_scene, shared_log)
+    other = fitted(name, ball_scene, shared_log, stop=0.5)  # is chosen after a training
+    assert first.train_s == again.train_s == other.train_s > 0
     camera = ball_scene.splits["test"].cameras[0]
     pictures = [method.render(camera, NullProbe()).rgb for method in (first, again)]
     assert torch.equal(*pictures)
@@ -147,7 +114,7 @@ REFUSED: list[tuple[Callable[..., Any], str, Any]] = [
     (KiloLessons, "view_cost", -1.0),
     (OctreeLessons, "density_rate", -1.0),
     (OctreeLessons, "samples", 0),
-    *((partial(Extraction, **LEAVES), "resolution", x) for x in (100, 4096)),
+    *((partial(Extraction, **LEAVES), "resolution", x) for x in (100, 192, 4096)),
     (partial(Extraction, **LEAVES), "degree", 4),
     (partial(Extraction, **LEAVES), "directions", 3),
     (partial(Extraction, **LEAVES), "rays", 0),

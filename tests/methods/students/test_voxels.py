@@ -5,8 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
+from bench.types import Rays, Scene
+from methods.instant_ngp.pixels import PixelBatches
 from methods.kernels.types import Occupancy
-from methods.students.voxels import OFFSETS, corners_of, occupied_voxels
+from methods.kernels.voxel_walk import Crossings, Voxels
+from methods.students.voxels import OFFSETS, corners_of, largest_weights, occupied_voxels
 
 
 def scattered(share: float, size: int = 16) -> Occupancy:
@@ -41,3 +44,27 @@ def test_voxels_are_those_that_reach_into_occupied_cells(resolution: int) -> Non
     x, y, z = meets.unbind(dim=2)  # [G, N]
     want = (x[:, None, None] & y[None, :, None] & z[None, None]).any(dim=-1).nonzero()
     assert torch.equal(voxels.long(), want)
+
+
+def test_the_largest_weight_of_a_voxel_is_that_over_all_rays(
+    ball_scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Traced in three chunks, of which the second has the largest weights."""
+    monkeypatch.setattr("methods.students.voxels.CHUNK_RAYS", 10)
+    batches = PixelBatches(ball_scene.splits["train"], torch.device("cpu"))
+    voxels = Voxels(torch.cartesian_prod(*3 * [torch.arange(8, dtype=torch.int32)]), 8)
+    weights, crossed, counts = iter((0.2, 0.7, 0.4)), [], []
+
+    def weigh(rays: Rays, crossings: Crossings) -> torch.Tensor:
+        counts.append(len(rays.origins))
+        crossed.append(crossings.voxel.unique())
+        return torch.full((len(crossings.voxel),), next(weights))
+
+    generator = torch.Generator().manual_seed(0)
+    found = largest_weights(voxels, weigh, batches, 25, generator, "cpu")
+    assert counts == [10, 10, 5]
+    want = torch.zeros(512)
+    for chunk, weight in ((0, 0.2), (2, 0.4), (1, 0.7)):
+        want[crossed[chunk].long()] = weight
+    assert torch.equal(found, want)
+    assert len(found.unique()) == 4  # 0 where no ray came

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from bench.errors import SteerbenchError
 from bench.study import Study, Variant
 from sweeps import variants
-from sweeps.commands.accuracy import _last_words, decibels
+from sweeps.commands.accuracy import _last_words, _recommended, decibels
 
 EXACT = "method.rendering.skip.empty=false"
 
@@ -82,6 +82,11 @@ def test_the_fastest_setting_within_the_budget_is_a_command(steerbench, measured
     outcome = steerbench("accuracy", "--within", budget, "seed=3")
     usual = "method=steernerf_lean scene=totem budget=demo trajectory=orbit"
     assert outcome.out.splitlines()[-2] == f"steerbench run {usual} seed=3 {setting}"
+
+
+def test_no_setting_is_recommended_beside_a_perfect_picture():
+    rows = [{"setting": "as it is", "ms": 1.0, "lost": math.nan}]  # inf - inf
+    assert _recommended(rows, 0.1).endswith("because 'as it is' has an infinite PSNR")
 
 
 def test_a_later_word_replaces_one_of_the_same_setting_and_no_folder():

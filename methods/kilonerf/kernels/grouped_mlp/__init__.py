@@ -137,7 +137,7 @@ def colours(
     check_shape("geometry", geometry, None, HIDDEN + 1)
     check_shape("encoded", encoded, len(geometry), SHAPES["direction"][0] - HIDDEN)
     kernel = implementation(__name__, backend, geometry.device)
-    if _in_one_pass(kernel, networks):
+    if _in_one_pass(kernel, networks) and not (geometry.requires_grad and torch.is_grad_enabled()):
         return kernel.colours(geometry, encoded, networks)
     numbers, count = geometry[:, HIDDEN].detach().int(), len(networks["feature"][0])
     place, offsets = order(numbers, count, backend=backend)

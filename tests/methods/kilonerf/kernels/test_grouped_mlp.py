@@ -56,6 +56,18 @@ def test_they_are_those_of_torch_one_by_one(backend: str) -> None:
         torch.testing.assert_close(shown[s], colour, rtol=0, atol=188 * 6**3 * U32)
 
 
+def test_the_hidden_channels_have_a_gradient_even_of_networks_that_stay() -> None:
+    few, _ = networks(1)
+    grads = []
+    for backend in ("reference", "cpu"):
+        geometry = torch.zeros(3, 33, requires_grad=True)
+        colours(geometry, torch.ones(3, 27), few, backend=backend).sum().backward()
+        grads.append(geometry.grad)
+    torch.testing.assert_close(*grads)
+    assert grads[0] is not None
+    assert grads[0].any()
+
+
 @both
 def test_nan_stays_with_its_sample(backend: str) -> None:
     few, _ = networks(1)
