@@ -32,9 +32,10 @@ def test_an_interruption_leaves_nothing_that_looks_whole(run, tmp_path, monkeypa
     def interrupted(run):
         raise KeyboardInterrupt
 
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch:
         patch.setattr(trackers, "pictures", interrupted)
-        tracker("tensorboard")(run, tmp_path)
+        with pytest.raises(KeyboardInterrupt):
+            tracker("tensorboard")(run, tmp_path)
     assert not (tmp_path / "tensorboard" / run.key).exists()
     test_tensorboard_has_the_figures_of_every_frame_and_of_the_run(run, tmp_path)
 
