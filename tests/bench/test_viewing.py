@@ -56,13 +56,17 @@ def test_only_the_newest_camera_of_a_browser_is_drawn_and_a_still_picture_gives_
     assert turns.next(0) is None
 
 
-def test_who_waits_for_an_ask_wakes_up() -> None:
-    turns, found = Turns(), []
-    waiting = threading.Thread(target=lambda: found.append(turns.next()))
-    waiting.start()
-    turns.want("a", Ask(CAMERA))
-    waiting.join(timeout=60)
-    assert found == [("a", Ask(CAMERA))]
+def test_who_waits_for_an_ask_wakes_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    turns, woken = Turns(), []
+    wait = turns._changed.wait
+
+    def wait_and_ask(timeout: float | None = None) -> None:
+        threading.Thread(target=turns.want, args=("a", Ask(CAMERA))).start()
+        woken.append(wait(timeout))
+
+    monkeypatch.setattr(turns._changed, "wait", wait_and_ask)
+    assert turns.next(60) == ("a", Ask(CAMERA))
+    assert woken == [True]  # not by the end of its time
 
 
 def test_frames_are_timed_and_forgotten_for_another_browser_and_another_size() -> None:
