@@ -197,6 +197,7 @@ def serve(kind):
     load(job): load from `job.state` what `fit` stored there. Without it every run trains again.
     reset(): a new sequence of frames begins
     sizes(): bytes of the model by component; without it, those of the files in `job.state`
+    peak_bytes(): its peak memory, None: unknown; without it, that of this process or its GPU
     name, device, precision, memory: attributes for rows; `memory`: preceding frames that are used
     knobs: a dict of settings that need no new training, each with a list of values to try
     files: those that the pictures depend on, beside the modules that are loaded
@@ -227,6 +228,7 @@ def _converse(channel, kind):
         if message == "settings":
             renderer = kind(**header["options"])
             answer = _about(renderer)
+            _forget_peak()
         elif message in ("fit", "load"):
             job = Job(header, channel)
             getattr(renderer, message)(job)
@@ -242,7 +244,8 @@ def _converse(channel, kind):
             arrays = picture if isinstance(picture, dict) else {"rgb": picture}
             # `_now` waits only for torch: what else computes in the background is fetched before.
             arrays = {k: x if hasattr(x, "detach") else np.asarray(x) for k, x in arrays.items()}
-            answer = {**_frames[-1].report(), "peak_bytes": _peak()}
+            peak_bytes = getattr(renderer, "peak_bytes", _peak)()
+            answer = {**_frames[-1].report(), "peak_bytes": peak_bytes}
             of_torch = {k: x.detach().cpu() for k, x in arrays.items() if hasattr(x, "detach")}
             arrays.update({k: x.numpy() for k, x in of_torch.items()})
         elif message == "sizes":
@@ -287,31 +290,34 @@ def _packages():
 
 def _now():
     """The time in nanoseconds, once a GPU has finished its work."""
-    cuda = _cuda()
-    if cuda:
-        cuda.synchronize()
+    cuda, gpus = _cuda()
+    for gpu in gpus:
+        cuda.synchronize(gpu)
     return time.perf_counter_ns()
 
 
 def _cuda():
-    """`torch.cuda`, if it is in use; otherwise None."""
+    """`torch.cuda`, and the GPUs that this process uses."""
     torch = sys.modules.get("torch")
-    return torch.cuda if torch and torch.cuda.is_initialized() else None
+    cuda = torch.cuda if torch and torch.cuda.is_initialized() else None
+    if not cuda:
+        return None, []
+    return cuda, [gpu for gpu in range(cuda.device_count()) if cuda.memory_reserved(gpu)]
 
 
 def _forget_peak():
-    cuda = _cuda()
-    if cuda:
-        cuda.reset_peak_memory_stats()
+    cuda, gpus = _cuda()
+    for gpu in gpus:
+        cuda.reset_peak_memory_stats(gpu)
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
 
 
 def _peak():
-    """Peak memory in bytes since `_forget_peak`: of the GPU, or of this process; None: unknown."""
-    cuda, found = _cuda(), None
-    if cuda:
-        return cuda.max_memory_allocated()
+    """Peak memory in bytes since `_forget_peak`: of the GPUs, or of this process; None: unknown."""
+    (cuda, gpus), found = _cuda(), None
+    if gpus:
+        return sum(map(cuda.max_memory_allocated, gpus))
     with suppress(OSError):
         found = re.search(r"VmHWM:\s*(\d+)", Path("/proc/self/status").read_text())
     return found and 1024 * int(found.group(1))

@@ -106,6 +106,10 @@ def read_results(file: Path) -> tuple[Measurement, dict[str, Any]]:
     """
     file = file.resolve()
     record = read_json(file.parent, file.name)
+    try:
+        json.dumps(record, allow_nan=False)
+    except ValueError as error:
+        raise unexpected(file, "finite numbers", error) from error
     raw, info = _field(record, "metrics_raw", dict, file), _field(record, "nb_info", dict, file)
     data = record.get("render_dataset_metadata") or _field(info, "dataset_metadata", dict, file)
     try:
@@ -121,8 +125,10 @@ def read_results(file: Path) -> tuple[Measurement, dict[str, Any]]:
     frames.insert(0, "frame", range(len(frames)))
     frames.insert(1, "name", "")
     frames.insert(2, "phase", STEADY)
-    memory = (info.get("resources_utilization") or {}).get("gpu_memory")  # in MiB
-    whole = {"train_s": info.get("total_train_time"), "peak_bytes": memory and memory * 2**20}
+    used = info.get("resources_utilization")
+    memory = used.get("gpu_memory") if isinstance(used, dict) else None  # in MiB
+    told = {"train_s": (info.get("total_train_time"), 1), "peak_bytes": (memory, 2**20)}
+    whole = {k: x * unit for k, (x, unit) in told.items() if isinstance(x, int | float)}
     summary = score_rows(frames, list(scores))
     summary += [single(name, value) for name, value in whole.items() if value]
     protocol = f"nerfbaselines-{record.get('evaluation_protocol')}"

@@ -85,7 +85,11 @@ def measure(methods: Sequence[Method], task: Task, log: Log) -> list[Measurement
     neighbours = _render(takes, task, log)
     if neighbours.notable:
         log.info(f"{neighbours} while frames were timed: times are longer than they need be")
-    return [_measurement(take, task, missing, neighbours, len(takes)) for take in takes]
+    measurements = []
+    for take in takes:
+        with _named(take.method, len(takes) > 1):
+            measurements.append(_measurement(take, task, missing, neighbours, len(takes)))
+    return measurements
 
 
 class _Take:
@@ -105,7 +109,8 @@ class _Take:
         """The meter, around a frame whose memory counts; around others, nothing.
 
         On a GPU the frames of the path count. A process also holds what scoring has left in it: on
-        a CPU the `warm` frames before count or, without any, the first of the path.
+        a CPU the `warm` frames before count (of several, all but the first) or, without any, the
+        first of the path.
         """
         counts = warm or not self.meter.peak_bytes if self.meter.of_process else not warm
         return self.meter if counts else nullcontext()
@@ -186,7 +191,8 @@ def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
     frames = len(takes) * (len(warmup) + len(steps))
     with torch.no_grad(), log.progress("rendering", frames) as progress:
         for take in takes:
-            take.method.reset()
+            with _named(take.method, len(takes) > 1):
+                take.method.reset()
         for number, take in product(warmup, takes):
             settled = number > 0 or len(warmup) == 1  # in the first, kernels may be compiled
             with (
@@ -197,7 +203,8 @@ def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
                 take.method.render(steps[number].camera, take.clock)
             progress.advance(note="warming up")
         for take in takes:
-            take.method.reset()
+            with _named(take.method, len(takes) > 1):
+                take.method.reset()
         watch = Watch()
         for index, take in product(range(len(steps)), takes):
             with _named(take.method, len(takes) > 1):

@@ -191,7 +191,7 @@ def _kept(
 
 def _smooth_steps(scene: Scene, split: str, degrees: float, limit: int) -> tuple[list[Step], str]:
     """The steps of the smooth path through the first `limit` cameras, and its name's ending."""
-    _check(degrees > 0, "degrees", "more than 0", degrees)
+    _check(0 < degrees < math.inf, "degrees", "more than 0", degrees)
     cameras, kept, part = _kept(scene, split, limit)
     steps = [Step(cameras[0], 0)]
     for first, second in pairwise(kept):
@@ -258,8 +258,7 @@ def spline(
     spread over the `split`, and only they have ground truth. Raises SteerbenchError as `follow`,
     `from_split` and `leading` do.
     """
-    if not degrees > 0:
-        raise unexpected("trajectory.degrees", "more than 0", degrees)
+    _check(0 < degrees < math.inf, "degrees", "more than 0", degrees)
     whole_number(keys, "trajectory.keys", 2)
     through = follow(scene, path) if path else from_split(scene, split, keys)
     first, *others = through.steps
@@ -281,7 +280,8 @@ def write_path(
 ) -> None:
     """Write `cameras` (scene units, all of one size) as a path that nerfstudio's viewer reads, or
     NerfBaselines; without a `form`, the viewer unless it has no words for a lens."""
-    moved = [move_camera(camera, scene.unit_length, scene.origin) for camera in cameras]
+    where = scene.unit_length, scene.origin, torch.float64
+    moved = [move_camera(camera, *where) for camera in cameras]
     if form is None:
         form = "nerfstudio" if all(map(_plain, cameras)) else "nerfbaselines"
     record = (_viewers if form == "nerfstudio" else _nerfbaselines)(moved, fps)
@@ -351,6 +351,8 @@ def _numbers(value: object, count: int, where: str) -> list:
 
 def _of_viewer(record: dict, file: Path) -> list[Camera]:
     """The cameras of nerfstudio's file: square pixels, principal point at the centre."""
+    if (kind := record.get("camera_type", "perspective")) != "perspective":
+        raise unexpected(f"{file}: camera_type", "perspective", describe(kind))
     width, height = (
         whole_number(record.get(k), f"{file}: {k}", 1) for k in ("render_width", "render_height")
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.console import ConsoleLog
-from bench.errors import SteerbenchError, explained
+from bench.errors import SteerbenchError, explained, unexpected
 from bench.provenance import computed_by
 from bench.results import Store, content_key
 from bench.run import MethodFailed, Task, measure
@@ -54,8 +55,12 @@ def described(config: DictConfig) -> dict[str, Any]:
 
 
 def job_key(settings: Mapping[str, Any], turns: str) -> str:
-    """Equal for jobs with the same `settings` (see `described`) and the same `turns`."""
-    return content_key({"settings": settings, "turns": turns} if turns else settings)
+    """Equal for jobs with the same `settings` (see `described`) and the same `turns`; raises
+    SteerbenchError if a number is infinite or NaN."""
+    try:
+        return content_key({"settings": settings, "turns": turns} if turns else settings)
+    except ValueError as error:
+        raise unexpected("settings", "finite numbers", error) from error
 
 
 def reason(error: BaseException) -> str:
@@ -130,7 +135,9 @@ def obtain(jobs: Sequence[Job]) -> tuple[list[str], bool]:
     log = ConsoleLog(jobs[0].outputs)
     ready, measured = _ready(jobs, log), False
     if not _stored(ready):
-        with device_lock(ready[0].method.settings()["device"], log):
+        with ExitStack() as locks:
+            for device in sorted({each.method.settings()["device"] for each in ready}):
+                locks.enter_context(device_lock(device, log))
             measured = not _stored(ready)  # by another process meanwhile
             if measured:
                 _measure(ready, log)
@@ -183,6 +190,8 @@ def _ready(jobs: Sequence[Job], log: Log) -> list[_Ready]:
             raise JobFailed(job) from error
     if not jobs[0].turns:
         return ready
+    if any(each.task.budget != ready[0].task.budget for each in ready):
+        raise SteerbenchError("budget: expected the same for all that is measured in turns")
     beside = sorted(content_key(each.parts) for each in ready)
     return [replace(each, parts={**each.parts, "beside": beside}) for each in ready]
 

@@ -39,6 +39,10 @@ def load(
     return assemble(name or root.name, pictures, box, background=background, camera_files=files)
 
 
+LENS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
+"""What other programs write of a lens; here `camera_angle_x` describes it."""
+
+
 def camera_file(split: str) -> str:
     return f"transforms_{split}.json"
 
@@ -59,6 +63,9 @@ def read_split(root: Path, split: str, log: Log) -> list[View]:
     if missing:
         where = f"{frames[missing[0]][0]}.file_path"
         raise unexpected(where, "a picture", f"no file {files[missing[0]]}")
+    frame = frames[0][1] if frames else {}
+    if unread := [name for name in LENS if name in record or name in frame]:
+        log.info(f"{path.name}: {', '.join(unread)} are not read; scene=transforms reads them")
     width, height = image_size(files[0])
     focal = focal_length(record.get("camera_angle_x"), width, f"{path}: camera_angle_x")
     views = []

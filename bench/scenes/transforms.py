@@ -80,6 +80,9 @@ def read_views(root: Path, record: dict, log: Log) -> list[View]:
         if not file.is_file():
             missing.append(frame["file_path"])
             continue
+        if "mask_path" in frame:
+            expected = "none: masks are not read, but the alpha channel of a picture is"
+            raise unexpected(f"{where}.mask_path", expected, frame["mask_path"])
         settings, pose = ChainMap(frame, record), opengl_pose(frame, where)
         width, height = image_size(file)
         usual = Camera(pose, 0, 0, width / 2, height / 2, width, height)  # without a focal length

@@ -61,7 +61,7 @@ class DiverTraining(PixelTraining):
         self.grad = torch.zeros_like(model.table)
 
     def advance(self) -> dict[str, float]:
-        if self.step == int(self.options.prune_at * self.steps):
+        if self.step == max(int(self.options.prune_at * self.steps), 1):
             self._prune()
         return super().advance()
 
@@ -110,8 +110,10 @@ class DiverTraining(PixelTraining):
             return weights(sigma, as_intervals(crossings), stop=STOP, backend=model.backend)
 
         rays = self.batches, options.prune_rays, self.generator
-        largest = largest_weights(model.voxels, weigh, *rays, model.backend)
-        rows = model.keep(largest >= options.prune_below).long()
+        kept = largest_weights(model.voxels, weigh, *rays, model.backend) >= options.prune_below
+        if not kept.any():  # the decoder has learned nothing yet
+            return
+        rows = model.keep(kept).long()
         moments = self.moments
         self.moments = AdamState(moments.first[rows], moments.second[rows], moments.steps[rows])
         self.grad = torch.zeros_like(model.table)

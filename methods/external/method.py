@@ -13,6 +13,7 @@ import tempfile
 import time
 import weakref
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -63,13 +64,13 @@ class External:
 
     @cached_property
     def _worker(self) -> Worker:
-        words = shlex.split(self.command)
+        words = _words("method.command", self.command)
         if (shipped := WORKERS / f"{words[0]}.py").exists():
             words[0] = str(shipped)
         if words[0].endswith(".py"):
             words.insert(0, self.python or sys.executable)
         worker = Worker(words, self.start_s)
-        weakref.finalize(self, _close, worker)
+        self._closing = weakref.finalize(self, _close, worker)
         return worker
 
     @cached_property
@@ -81,6 +82,8 @@ class External:
         for name, usual in UNTOLD.items():
             kind = type(usual)
             worker.expect(type(about[name]) is kind, "settings", f"{name}: {kind.__name__}", told)
+        lists = all(type(values) is list for values in about["knobs"].values())
+        worker.expect(lists, "settings", "knobs: lists of values", told)
         worker.name = about["name"]
         return about
 
@@ -103,7 +106,7 @@ class External:
     @property
     def reads(self) -> list[Path]:
         """The files that its pictures depend on: code that it has loaded, words, and `files`."""
-        words = (Path(word) for word in shlex.split(self.command))
+        words = map(Path, _words("method.command", self.command))
         given = [file for path in self.files for file in _files_at(Path(path))]
         loaded = map(Path, self._about["files"])
         return sorted(file for file in {*loaded, *given, *words} if file.is_file())
@@ -114,9 +117,8 @@ class External:
         if self.lock is None:
             return self._about["packages"]
         try:
-            done = subprocess.run(
-                shlex.split(self.lock), capture_output=True, text=True, check=True
-            )
+            words = _words("method.lock", self.lock)
+            done = subprocess.run(words, capture_output=True, text=True, check=True)
         except OSError as error:
             raise SteerbenchError(f"method.lock: {self.lock}: {error.strerror}") from error
         except subprocess.CalledProcessError as error:
@@ -149,6 +151,7 @@ class External:
                 self._worker.ask("load", self.start_s, {**job, "state": None})
             return
         folder = log.stage_dir("external", self._key(job))
+        stored = {**job, "state": str(folder / "state")}
         finished = folder / "trained.json"
         with missing(finished, log) as untrained:
             if untrained:
@@ -156,11 +159,18 @@ class External:
                 if "load" in can:  # otherwise the next process trains again, alone
                     with whole(finished) as new:
                         new.write_text(json.dumps({"train_s": self.train_s}) + "\n")
+                    self._restart()  # without the memory of a training
             else:
                 log.info(f"{self.name}: found in {folder}")
-                stored = {**job, "state": str(folder / "state")}
-                self._worker.ask("load", self.start_s, stored)
                 self.train_s = json.loads(finished.read_text())["train_s"]
+        if "load" in can:
+            self._worker.ask("load", self.start_s, stored)
+
+    def _restart(self) -> None:
+        """End the process, and begin another one with the same options."""
+        self._closing()
+        del self._worker
+        self._worker.ask("settings", self.start_s, {"options": self.options})
 
     def _key(self, job: Mapping[str, object]) -> dict[str, object]:
         knobs = self._about["knobs"]
@@ -169,6 +179,10 @@ class External:
             "scene": self._scene.digest,
             "name": self.name,
             "options": {name: value for name, value in self.options.items() if name not in knobs},
+            "command": [
+                sha256(Path(word)) if Path(word).is_file() else word
+                for word in _words("method.command", self.command)
+            ],
             "files": [sha256(file) for file in self.reads],
             "environment": self._environment,
             "device": self._about["device"],
@@ -258,6 +272,14 @@ class External:
         sizes: Any = told.get("sizes")
         self._worker.expect(_counts(sizes), "sizes", "sizes in bytes", told)
         return sizes
+
+
+def _words(setting: str, text: str) -> list[str]:
+    """The words of a command; raises SteerbenchError if there are none, or a quote is open."""
+    with suppress(ValueError):
+        if words := shlex.split(text):
+            return words
+    raise unexpected(setting, "a program and its arguments", repr(text))
 
 
 def _counts(told: object) -> bool:

@@ -21,7 +21,7 @@ from methods.kernels.types import Occupancy, expect
 from methods.kernels.voxel_walk import BRICK, Crossings, Voxels
 from methods.plenoctree.kernels.voxel_light import Light
 from methods.rendering.field import Field, pad
-from methods.rendering.occupancy import RESOLUTION
+from methods.rendering.occupancy import LARGEST, RESOLUTION
 from methods.students.voxels import largest_weights
 
 CELL = 4  # leaves along the side of a cell of the occupancy that selects the rays of a frame
@@ -156,7 +156,7 @@ def _densities(field: Field, leaves: Voxels, points: int, generator: torch.Gener
         for _ in range(points):
             jitter = torch.rand(part.shape, generator=generator, device=part.device)
             places = (part + jitter) / leaves.resolution
-            total += field.density(pad(places))[0][: len(part)]
+            total += field.density(pad(places))[0][: len(part)].clamp(max=LARGEST)
         found.append(total / points)
     return torch.cat(found)
 

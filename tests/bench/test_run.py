@@ -299,7 +299,7 @@ def test_methods_in_turns_draw_frames_as_if_alone(run, offset_method, tiny_scene
     assert value(both[0].rows, "psnr") > value(both[1].rows, "psnr")
 
 
-@pytest.mark.parametrize("where", ["fit", "render"])
+@pytest.mark.parametrize("where", ["fit", "reset", "render", "sizes"])
 def test_of_several_methods_the_one_that_failed_is_named(
     where, run, offset_method, tiny_scene, quiet_log, monkeypatch
 ):

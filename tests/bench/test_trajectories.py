@@ -149,6 +149,7 @@ REFUSED = [
     (jump, {"every": 3}, "every: expected 1 to 2, .* got 3"),
     (jump, {"every": 0}, "every: expected 1 to 2"),
     (spline, {"degrees": 0}, "degrees: expected"),
+    *((make, {"degrees": math.inf}, "degrees: expected") for make in (smooth, spline)),
     (spline, {"keys": 1}, "keys: expected"),
     (approached, {"lead": -1}, "lead: expected 0 or more"),
     (approached, {"degrees": 0}, "degrees: expected more than 0"),
@@ -301,6 +302,7 @@ def test_a_transforms_file_gives_intrinsics_or_leaves_them_to_the_test_camera(sc
     [
         (viewer(), r"camera_path: expected a list with at least one entry, got list of 0"),
         ({"camera_path": [{}]}, r"render_width: expected a whole number"),
+        (viewer(keyframe()) | {"camera_type": "fisheye"}, "camera_type: expected perspective"),
         (viewer(keyframe(fov=200)), r"camera_path\[0\]\.fov: expected a finite number above 0"),
         (viewer(keyframe(camera_to_world=[1, 2])), r"camera_to_world: expected 16 numbers"),
         (

@@ -82,6 +82,7 @@ def test_what_cannot_be_exported_or_imported_is_named(run, steerbench, exported)
     whole = json.loads(file.read_text())
     for changes, said in (
         ({"metrics_sha256": "0"}, "metrics_sha256: expected"),
+        ({"total": float("nan")}, "results.json: expected finite numbers"),
         ({"nb_info": None}, "nb_info: expected dict, got nothing"),
         ({"metrics_raw": {"psnr": "!"}}, "metrics_raw: expected float32 numbers in base64"),
     ):

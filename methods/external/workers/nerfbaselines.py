@@ -2,9 +2,11 @@
 
 Options: `id` of the method; `backend`, "python" if this environment can run the method itself;
 `presets`, a list, or null for those that it has for the layout of the data; `overrides` of its
-configuration; `iterations`, null for as many as the method wants.
+configuration; `iterations`, null for as many as the method wants; `weights`, a pattern for the
+files of a checkpoint that rendering needs.
 """
 
+import random
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -22,10 +24,22 @@ from steerbench_worker import serve
 
 
 class NerfBaselines:
-    def __init__(self, id, backend="python", presets=None, overrides=None, iterations=None):
+    def __init__(
+        self,
+        id,
+        backend="python",
+        presets=None,
+        overrides=None,
+        iterations=None,
+        weights=None,
+    ):
         self.name, self.backend, self.presets = id, backend, presets
-        self.overrides, self.iterations = overrides or {}, iterations
+        self.overrides, self.iterations, self.weights = overrides or {}, iterations, weights
         self.spec, self.stack = nerfbaselines.get_method_spec(id), ExitStack()
+        self.torch = _torch()  # which a method loads only when it is built
+        self.device = "cuda" if self.torch and self.torch.cuda.is_available() else "cpu"
+        if backend != "python":  # the model is in another process
+            self.peak_bytes = lambda: None
 
     def _method(self, job, *folders):
         """The class of the method, in its backend, which sees the `folders`."""
@@ -36,6 +50,13 @@ class NerfBaselines:
         return self.stack.enter_context(build)
 
     def fit(self, job):
+        if self.presets is None and list(job.background) != [1, 1, 1]:
+            raise ValueError("presets: those for this layout are for a white background")
+        random.seed(job.seed)
+        np.random.seed(job.seed)
+        if self.torch:
+            self.torch.manual_seed(job.seed)
+        self.state = job.state
         kind = self._method(job, job.scene, job.state)
         info, paths = kind.get_method_info(), [str(path) for path, _ in job.pictures]
         metadata = {
@@ -66,6 +87,7 @@ class NerfBaselines:
         self.method.save(str(job.state))
 
     def load(self, job):
+        self.state = job.state
         self.method = self._method(job, job.state)(checkpoint=str(job.state))
 
     def render(self, camera):
@@ -74,6 +96,11 @@ class NerfBaselines:
         if color.shape[-1] == 4:
             color = color[..., :3] * color[..., 3:] + (1 - color[..., 3:]) * self.background
         return color
+
+    def sizes(self):
+        files = self.state.rglob(self.weights) if self.weights else ()
+        sizes = [path.stat().st_size for path in files if path.is_file()]
+        return {"model": sum(sizes)} if sizes else {}  # a checkpoint may hold the optimiser, too
 
     def _cameras(self, cameras):
         pinhole = nerfbaselines.camera_model_to_int("pinhole")
@@ -89,6 +116,14 @@ class NerfBaselines:
             image_sizes=np.array([(camera.width, camera.height) for camera in cameras], np.int32),
             nears_fars=np.stack((near, away + radius), axis=1).astype(np.float32),
         )
+
+
+def _torch():
+    try:
+        import torch
+    except ImportError:
+        return None
+    return torch
 
 
 if __name__ == "__main__":

@@ -16,6 +16,8 @@ from nerfstudio.utils.eval_utils import eval_setup
 
 from steerbench_worker import serve
 
+METRICS = ("psnr", "ssim", "lpips")  # submodules of a model that no picture needs
+
 
 class Nerfstudio:
     def __init__(self, config, output="rgb"):
@@ -39,8 +41,9 @@ class Nerfstudio:
         return pictures[self.output]
 
     def sizes(self):
-        parameters = self.pipeline.model.parameters()
-        return {"model": sum(x.numel() * x.element_size() for x in parameters)}
+        kept = self.pipeline.model.state_dict().items()
+        own = (x for name, x in kept if name.partition(".")[0] not in METRICS)
+        return {"model": sum(x.numel() * x.element_size() for x in own)}
 
 
 if __name__ == "__main__":

@@ -120,6 +120,7 @@ FAR = [[1, 0, 0, 1e308], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         (every(fl_x=0), r"frames\[0\].fl_x: expected a finite number above 0, got 0"),
         (first(fl_y="9"), r"transforms\.json: frames\[0\].fl_y: .* got '9'"),
         (lambda r: r.pop("fl_x"), r"frames\[0\].fl_x: expected a focal length, or camera_angle_x"),
+        (first(mask_path="m.png"), r"frames\[0\].mask_path: expected none: masks are not read"),
         (first(cx=9), r"frames\[0\].cx: .* below 8, got 9"),
         (first(w=0), r"frames\[0\].w: expected a whole number from 1 on"),
         (first(k1=None), r"frames\[0\].k1: expected a finite number, got nothing"),

@@ -192,6 +192,26 @@ def test_what_it_was_trained_with_makes_another_training(
     assert stages(files=[str(more)]) == 7
     assert stages(lock="echo torch==1") == 8
     assert stages(lock="echo torch==2") == 9
+    path = f"{path} --width 9"
+    assert stages() == 10
+
+
+def test_a_new_process_renders_without_what_a_training_left(
+    worker, external, tiny_scene, quiet_log
+):
+    lines = """
+        import os
+
+        class Renews(Grey):
+            def fit(self, job):
+                (job.state / "process").write_text(str(os.getpid()))
+
+            def load(self, job):
+                self.level = float((job.state / "process").read_text() != str(os.getpid()))
+    """
+    method = external(worker(lines, after="serve(Renews)\n"))
+    method.fit(tiny_scene, BUDGET, quiet_log)
+    assert level(method, tiny_scene) == 1
 
 
 @pytest.mark.parametrize(
@@ -199,6 +219,7 @@ def test_what_it_was_trained_with_makes_another_training(
     [
         ({"files": ["nowhere"]}, "method.files: expected files and folders, got nowhere, which is"),
         ({"lock": "ls /nowhere"}, "method.lock: ls /nowhere: .*No such file"),
+        ({"lock": "'"}, "method.lock: expected a program and its arguments"),
         ({"options": {"colour": 1}}, "worker Stores: failed at 'settings': TypeError: .*'colour'"),
     ],
 )
@@ -302,6 +323,11 @@ STUDIO = """
             return self
 
     class Model(torch.nn.Linear):
+        def __init__(self, *sizes):
+            super().__init__(*sizes)
+            self.lpips = torch.nn.Linear(9, 9)  # no part of a picture
+            self.register_buffer("grid", torch.zeros(5))
+
         def get_outputs_for_camera(self, camera):
             picture = torch.zeros(32, 40, 3)
             picture[0, :18, 0] = torch.cat((camera.c2w.flatten(), torch.tensor(camera.lens)))
@@ -334,7 +360,7 @@ def test_a_nerfstudio_model_gets_the_camera_in_its_own_coordinates(
     options = {"config": str(tmp_path / "config.yml"), "output": "picture"}
     method = external("nerfstudio", options=options)
     method.fit(moved_scene, BUDGET, quiet_log)
-    assert (method.name, method.sizes()) == ("nerfacto", {"model": 4 * (2 * 3 + 3)})
+    assert (method.name, method.sizes()) == ("nerfacto", {"model": 4 * (2 * 3 + 3 + 5)})
     camera = moved_scene.splits["test"].cameras[1]
     shown = method.render(camera, NullProbe()).rgb[0, :18, 0]
     x, y, z = move_camera(camera, 3.0, moved_scene.origin).c2w * torch.tensor([1, -1, -1, 1])

@@ -70,7 +70,7 @@ def test_a_registered_method_trains_renders_and_is_loaded(
     expected = torch.stack(train).mean(dim=(0, 1, 2))
     pictures, seconds = [], []
     for _ in range(2):
-        options = {"id": "mean", "overrides": {"steps": 5}}
+        options = {"id": "mean", "overrides": {"steps": 5}, "weights": "*.npy"}
         method = external("nerfbaselines", python=nerfbaselines, options=options)
         method.fit(scene, Budget("test", steps=1, samples=1), quiet_log)
         pictures.append(method.render(scene.splits["test"].cameras[0], NullProbe()).rgb)

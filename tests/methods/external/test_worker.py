@@ -181,6 +181,12 @@ def test_an_exception_is_told_and_its_traceback_is_among_the_last_words(
     assert "Error" in str(error.value).rpartition("last words")[2]
 
 
+@pytest.mark.parametrize("command", ["", "worker.py 'a"])
+def test_what_is_no_command_is_refused(external, command):
+    with pytest.raises(SteerbenchError, match=r"method\.command: expected a program and its arg"):
+        external(command).settings()
+
+
 def test_what_is_no_program_is_an_error_about_the_command(external):
     with pytest.raises(Unavailable, match=r"method\.command: cannot start 'no-such-program'"):
         _ = external("no-such-program --fast").name
