@@ -40,7 +40,7 @@ class Study:
     trained: Mapping[str, Sequence[Variant]] = field(default_factory=dict)
     exact: tuple[str, ...] = ()  # settings that give up no accuracy of the trained model for speed
     # By what is skipped, the setting that switches this skipping off with `false`; settings shared
-    # by all lines of the study of skips; further savings, each compared on top of all skips.
+    # by all lines of the study of skips; further savings, each on top of all skips.
     skips: Mapping[str, str] = field(default_factory=dict)
     skips_with: tuple[str, ...] = ()
     savings: Sequence[Variant] = ()

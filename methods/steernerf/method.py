@@ -30,7 +30,7 @@ from methods.steernerf.views import Views
 HOW = "method.rendering"
 SKIPS = {
     "empty space": f"{HOW}.skip.empty",
-    "hidden samples": f"{HOW}.skip.hidden",
+    "hidden and faint samples": f"{HOW}.skip.hidden",
     "background": f"{HOW}.skip.background",
 }
 TABLES = (14, 16, 17, 19)  # sizes of the hash table, log2 T
@@ -58,7 +58,7 @@ STUDY = Study(
         f"{HOW}.skip.background=false",
     ),
     skips=SKIPS,
-    savings=(Variant("and range reduction", (f"{HOW}.range.mode=paper",)),),
+    savings=(Variant("all, and range reduction", (f"{HOW}.range.mode=paper",)),),
     axes={
         "L": Axis("L = {}", "method.model.frames", (0, 1, 2, 3)),
         "K": Axis("K = {}", "method.model.channels", (3, 6, 9)),

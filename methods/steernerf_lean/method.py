@@ -39,6 +39,7 @@ class SteerNerfLean(SteerNerf):
         STUDY,
         knobs={
             **STUDY.knobs,
+            "skips": STUDY.knobs["skips"][:-1],  # without the background, of which it is a share
             "step length": STEPS,
             "refined step length": REFINED_STEPS,
             "refined share": REFINED,
@@ -50,7 +51,12 @@ class SteerNerfLean(SteerNerf):
         trained={
             **STUDY.trained,
             "L, trained": turned("L", "method.model.frames", (0,)),
-            "s, trained": turned("s", "method.model.scale", (2, 4, 8), SCRATCH),
+            "s, trained": [
+                Variant(
+                    f"s {s}", (f"method.model.scale={s}", f"method.joint.patch={128 // s}", SCRATCH)
+                )
+                for s in (2, 4, 8)  # patches of 128 pixels
+            ],
             "step, trained": turned("trained step", "method.model.step", (1, 3), REFINED_AS_IT_IS),
         },
         exact=(*STUDY.exact, f"{HOW}.overlap=0", f"{HOW}.refined=1"),

@@ -1,7 +1,7 @@
 """`steerbench parity` and `steerbench skips`: variants of a method, each compared with the first.
 
-`parity` compares every engine and precision with torch in fp32. `skips` shows the time that each
-skip saves, and the error that it adds.
+`parity` compares every engine and precision with torch in fp32. `skips` shows what a frame takes,
+and how it differs, without each of the skips.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from sweeps.variants import Row
 
 USUAL = (variants.METHOD, "trajectory=smooth")
 COMPARED = ("PSNR to the first, dB ↑", "PSNR, dB ↑", "lost, dB ↓", "frame, ms ↓", "of rounds")
+NOTHING = "nothing"  # is skipped
 OF_ENGINES: tuple[str, ...] = ("p99 / p50 ↓", "worst pixel ↓", "network, ms ↓", "network, MB ↓")
 
 
@@ -43,10 +44,11 @@ def main(options: argparse.Namespace) -> int:
     wanted = variants.words_of(words, variants.engines(words) if parity else _skips(study))
     rendered = variants.render(wanted, options, launcher)
     first = rendered[0]
-    title, work = f"{first['method']}, {first['frames']} frames", _work(first)
+    every = next((each for each in rendered if each["setting"] == NOTHING), first)
+    title, work = f"{first['method']}, {first['frames']} frames", _work(every)
     label, first_column, further = "engine", "engine, precision", OF_ENGINES
     if not parity:
-        title += ": mean work of a frame, and its share"
+        title += ": mean work of a frame, and its share of all"
         label = first_column = "skipped"
         further = tuple(name.replace("_", " ") for name in work)
     rows, lines = [], []
@@ -105,10 +107,10 @@ def _work(rendered: Row) -> dict[str, float]:
 
 
 def _skips(study: Study) -> Iterator[Variant]:
-    """Variants: nothing skipped, each skip alone, all skips, and further savings on top."""
+    """Variants: all skips, further savings on top, all skips but each one, nothing skipped."""
     off = dict(zip(study.skips, variants.nothing_skipped(study), strict=True))
-    yield Variant("nothing", tuple(off.values()))
-    for name in off:
-        yield Variant(name, tuple(line for other, line in off.items() if other != name))
-    yield Variant("all of these")
+    yield Variant("all")
     yield from study.savings
+    for name, word in off.items() if len(off) > 1 else ():
+        yield Variant(f"all but {name}", (word,))
+    yield Variant(NOTHING, tuple(off.values()))

@@ -85,7 +85,7 @@ class Shades(Grey):
         trained={"seed, trained": [Variant("seed 7", ("method.seed=7",))]},
         exact=("method.skip.left=false",),
         skips={"left half": "method.skip.left", "right half": "method.skip.right"},
-        savings=[Variant("and half as bright", ("method.level=0.25",))],
+        savings=[Variant("all, and half as bright", ("method.level=0.25",))],
         axes={"N": Axis("N = 2^{}", "method.log2_layers", (0, 3), (1.0, 8.0))},
         parts={"paint": "painting"},
         network_stage="paint/network",
