@@ -173,7 +173,6 @@ class MemoryMeter:
 
     def __enter__(self) -> None:
         if self.of_process:
-            give_back()  # of compiling, say
             _reset_high_water_mark()
         else:
             torch.cuda.reset_peak_memory_stats(self._device)

@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 import torch
 
+from bench.allocator import give_back
 from bench.intervals import path_interval
 from bench.metrics import Lpips
 from bench.neighbours import Neighbours, Watch
@@ -195,6 +196,8 @@ def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
                 take.method.reset()
         for number, take in product(warmup, takes):
             settled = number > 0 or len(warmup) == 1  # in the first, kernels may be compiled
+            if settled:
+                give_back()  # what compiling has freed
             with (
                 _named(take.method, len(takes) > 1),
                 take.metered(warm=True) if settled else nullcontext(),

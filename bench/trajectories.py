@@ -28,6 +28,7 @@ from bench.cameras import move_camera
 from bench.errors import unexpected
 from bench.motion import between, lens_between, preceding, rotation_between, viewing_target
 from bench.provenance import sha256
+from bench.scenes.export import data_camera
 from bench.scenes.files import (
     describe,
     entries_of,
@@ -280,8 +281,7 @@ def write_path(
 ) -> None:
     """Write `cameras` (scene units, all of one size) as a path that nerfstudio's viewer reads, or
     NerfBaselines; without a `form`, the viewer unless it has no words for a lens."""
-    where = scene.unit_length, scene.origin, torch.float64
-    moved = [move_camera(camera, *where) for camera in cameras]
+    moved = [data_camera(scene, camera) for camera in cameras]
     if form is None:
         form = "nerfstudio" if all(map(_plain, cameras)) else "nerfbaselines"
     record = (_viewers if form == "nerfstudio" else _nerfbaselines)(moved, fps)

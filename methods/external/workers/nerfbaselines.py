@@ -56,7 +56,6 @@ class NerfBaselines:
         np.random.seed(job.seed)
         if self.torch:
             self.torch.manual_seed(job.seed)
-        self.state = job.state
         kind = self._method(job, job.scene, job.state)
         info, paths = kind.get_method_info(), [str(path) for path, _ in job.pictures]
         metadata = {

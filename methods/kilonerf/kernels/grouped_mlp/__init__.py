@@ -137,7 +137,7 @@ def colours(
     check_shape("geometry", geometry, None, HIDDEN + 1)
     check_shape("encoded", encoded, len(geometry), SHAPES["direction"][0] - HIDDEN)
     kernel = implementation(__name__, backend, geometry.device)
-    if _in_one_pass(kernel, networks) and not (geometry.requires_grad and torch.is_grad_enabled()):
+    if _in_one_pass(kernel, networks, geometry):
         return kernel.colours(geometry, encoded, networks)
     numbers, count = geometry[:, HIDDEN].detach().int(), len(networks["feature"][0])
     place, offsets = order(numbers, count, backend=backend)
@@ -149,9 +149,10 @@ def colours(
     return _back(x.sigmoid(), place, len(geometry))
 
 
-def _in_one_pass(kernel: ModuleType, networks: Networks) -> bool:
+def _in_one_pass(kernel: ModuleType, networks: Networks, *inputs: Tensor) -> bool:
     """Whether nobody asks for gradients, and the backend has all layers in one loop."""
-    learned = any(tensor.requires_grad for layer in networks.values() for tensor in layer)
+    tensors = (*inputs, *(tensor for layer in networks.values() for tensor in layer))
+    learned = any(tensor.requires_grad for tensor in tensors)
     return hasattr(kernel, "densities") and not (learned and torch.is_grad_enabled())
 
 
