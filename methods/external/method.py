@@ -62,9 +62,14 @@ class External:
     def __post_init__(self) -> None:
         self.train_s = 0.0
 
+    @property
+    def _typed(self) -> list[str]:
+        """The words of the command."""
+        return _words("method.command", self.command)
+
     @cached_property
     def _worker(self) -> Worker:
-        words = _words("method.command", self.command)
+        words = self._typed
         if (shipped := WORKERS / f"{words[0]}.py").exists():
             words[0] = str(shipped)
         if words[0].endswith(".py"):
@@ -106,7 +111,7 @@ class External:
     @property
     def reads(self) -> list[Path]:
         """The files that its pictures depend on: code that it has loaded, words, and `files`."""
-        words = map(Path, _words("method.command", self.command))
+        words = map(Path, self._typed)
         given = [file for path in self.files for file in _files_at(Path(path))]
         loaded = map(Path, self._about["files"])
         return sorted(file for file in {*loaded, *given, *words} if file.is_file())
@@ -180,8 +185,7 @@ class External:
             "name": self.name,
             "options": {name: value for name, value in self.options.items() if name not in knobs},
             "command": [
-                sha256(Path(word)) if Path(word).is_file() else word
-                for word in _words("method.command", self.command)
+                sha256(Path(word)) if Path(word).is_file() else word for word in self._typed
             ],
             "files": [sha256(file) for file in self.reads],
             "environment": self._environment,
