@@ -42,10 +42,11 @@ def locked(path: Path, waiting: str, log: Log) -> Iterator[None]:
         handle = _opened(path)
     try:
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            log.info(waiting)
-            fcntl.flock(handle, fcntl.LOCK_EX)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                log.info(waiting)
+                fcntl.flock(handle, fcntl.LOCK_EX)
         except OSError as error:
             log.info(f"not locked, others may do the same meanwhile: {path}: {error.strerror}")
         yield

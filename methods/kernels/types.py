@@ -18,6 +18,8 @@ from bench.types import Rays, check_shape
 
 BRICK = 4  # cells along the side of a brick; its 64 cells are one word of `Occupancy.words`
 
+LARGEST_SIDE = 1008  # most cells along a side of a grid: a byte holds its clearances, in bricks
+
 
 def expect(holds: bool, name: str, expected: str, got: object) -> None:
     """Raise ValueError with the `name` of a setting, and what is expected, unless that `holds`."""
@@ -36,14 +38,15 @@ def check_rays(rays: Rays) -> int:
 class Occupancy:
     """Which cells of the unit cube may hold matter.
 
-    `cells` [G, G, G] bool is indexed (x, y, z); G is a multiple of 16. The derived properties let a
-    ray cross all space known to be empty around it in one step.
+    `cells` [G, G, G] bool is indexed (x, y, z); G is a multiple of 16, at most `LARGEST_SIDE`. The
+    derived properties let a ray cross all space known to be empty around it in one step.
     """
 
     def __init__(self, cells: Tensor) -> None:
         size = cells.shape[0]
         check_shape("cells", cells, size, size, size)
-        expect(not size % BRICK**2, "cells", "a side that is a multiple of 16", size)
+        sides = f"a side that is a multiple of 16, at most {LARGEST_SIDE}"
+        expect(not size % BRICK**2 and size <= LARGEST_SIDE, "cells", sides, size)
         self.cells = cells.bool()
 
     @classmethod

@@ -60,16 +60,10 @@ class Cloud:
         alpha, centre = torch.where(self.reliable, self.alpha, torch.nan), self.camera.c2w[:, 3]
         return replace(self, points=centre + (self.points - centre) / alpha[:, None])
 
-    def splat(self, camera: Camera, backend: str) -> tuple[Tensor, Tensor]:
-        """The point that each pixel of `camera` shows, as [H, W] int32 indices, -1 for none; and
-        the z-depth [N] of all points."""
-        index, depth = _splat([self], camera, backend)
-        return index[0], depth
-
     def interval(self, camera: Camera, epsilon: float, backend: str) -> Tensor:
         """The z-depths [h, w, 2] between which each pixel of the low-resolution `camera` is
         sampled: D - epsilon and D + epsilon, or 0 and inf where no point lands."""
-        index, depth = self.splat(camera, backend)
+        (index,), depth = _splat([self], camera, backend)
         depth = functional.pad(depth, (0, 1), value=torch.inf)[index.long()]  # -1: the padding
         near = torch.where(index >= 0, depth - epsilon, 0)
         return torch.stack((near, depth + epsilon), dim=-1)

@@ -87,7 +87,8 @@ class MotionOptions:
 
     def __post_init__(self) -> None:
         least, degrees = self.least, self.degrees
-        expect(0 <= degrees[0] <= degrees[1], "joint.motion.degrees", "a range from 0 on", degrees)
+        ordered = len(degrees) == 2 and 0 <= degrees[0] <= degrees[1]
+        expect(ordered, "joint.motion.degrees", "a range from 0 on", degrees)
         expect(0 <= least <= self.length, "joint.motion.least", "0 to joint.motion.length", least)
         expect(self.pool >= 1, "joint.motion.pool", "1 or more", self.pool)
         expect(self.uses >= 1, "joint.motion.uses", "1 or more", self.uses)
@@ -105,7 +106,7 @@ class JointOptions:
     final_rate: float  # final learning rate of both
     half_waves: int  # half waves of their schedule, an odd number
     patch: int  # maximum side of a patch, in low-resolution pixels
-    patch_share: float  # the same as a share of the shorter side of the low-resolution frame
+    patch_share: float  # the same as a share of the shortest side of all low-resolution frames
     batch: int  # patches per step
     jitter: bool  # whether the samples of each ray have a random phase
     opacity_entropy: float  # weight of -o ln o of the rays' opacity o

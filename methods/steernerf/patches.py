@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import accumulate
 from typing import Any
 
@@ -202,13 +203,18 @@ class Patches(Examples):
 
     def cut(self, example: Example) -> Patch:
         """Cut a random square from `example`."""
-        view = self.pipeline.view(self.cameras[example.number])
-        size = view.low.height, view.low.width
-        side = min(self.options.patch, max(1, int(self.options.patch_share * min(size))))
-        top, left = self.place(example, side, size)
+        view, side = self.pipeline.view(self.cameras[example.number]), self._side
+        top, left = self.place(example, side, (view.low.height, view.low.width))
         cut = view.crop((slice(top, top + side), slice(left, left + side)))
         truth = self._truth(example, top, left, cut.full)
         return Patch(example, cut, truth, self.pipeline.reproject(example.buffer, cut))
+
+    @cached_property
+    def _side(self) -> int:
+        """The side of all patches, in low-resolution pixels; even the smallest picture has one."""
+        shortest = min(min(camera.width, camera.height) for camera in self.cameras)
+        share = self.options.patch_share * -(-shortest // self.pipeline.model.scale)
+        return min(self.options.patch, max(1, int(share)))
 
     def place(self, example: Example, side: int, size: tuple[int, int]) -> Sequence[int]:
         """Choose the first row and column of a patch of `side` in a frame of `size` h, w."""

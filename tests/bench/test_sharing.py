@@ -94,14 +94,21 @@ def test_every_user_can_open_a_lock_whatever_the_umask(tmp_path, monkeypatch, lo
         pass
 
 
-def test_without_locks_in_the_file_system_the_work_is_done_all_the_same(tmp_path, monkeypatch, log):
+@pytest.mark.parametrize("held", [False, True])
+def test_without_locks_in_the_file_system_the_work_is_done_all_the_same(
+    tmp_path, monkeypatch, log, held
+):
+    """Also if the system first says that another process has the lock."""
+
     def refuse(handle: int, kind: int) -> None:
+        if held and kind & fcntl.LOCK_NB:
+            raise BlockingIOError
         raise OSError(37, "No locks available")
 
     monkeypatch.setattr(fcntl, "flock", refuse)
     with missing(tmp_path / "made", log) as to_make:
         assert to_make
-    assert re.search("not locked.*No locks available", log.messages[0])
+    assert re.search("not locked.*No locks available", log.messages[-1])
 
 
 def test_what_is_there_needs_no_lock_and_a_folder_that_cannot_be_written_is_named(tmp_path, log):

@@ -79,7 +79,8 @@ def extents(
     window: Tensor | None = None,
     backend: str = "auto",
 ) -> list[Extent]:
-    """How many samples `march` finds in each batch of `size` rays, in order.
+    """How many samples `march` finds in each batch of `size` rays, in order, without `jitter`,
+    `start` and `limit`.
 
     The host waits for a GPU, once.
     """

@@ -51,7 +51,7 @@ class _Steps:
         most = longest_ray(segments.step)
         if alive.device.type == "cpu":  # a GPU would make the host wait
             count = torch.where(alive, (far - near) / length, 0).ceil()
-            most = int(functional.pad(count, (0, 1)).max())
+            most = int(functional.pad(count, (0, 1)).max().clamp(max=most))
         return cls(segments, near, far, length, alive, most)
 
     def at(self, ray: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:

@@ -141,5 +141,6 @@ def test_wrong_arguments_are_named() -> None:
         march(Rays(origins, origins), full(), 0.0)
     with pytest.raises(ValueError, match="limit: expected 1 or more, got 0"):
         march(Rays(origins, origins), full(), STEP, limit=0)
-    with pytest.raises(ValueError, match="multiple of 16, got 24"):
-        Occupancy(torch.zeros(24, 24, 24))
+    for side in (24, 1024):  # a clearance of 256 bricks would not fit into a byte
+        with pytest.raises(ValueError, match=f"multiple of 16, at most 1008, got {side}"):
+            Occupancy(torch.zeros(1, 1, 1).bool().expand(side, side, side))

@@ -44,13 +44,18 @@ def low_camera(scale: int) -> Camera:
     return scale_camera(replace(full, fx=9.0 * scale, fy=10.0 * scale), 8, 6)
 
 
+def shown(cloud: Cloud, camera: Camera) -> Tensor:
+    """The point of `cloud` that each pixel of `camera` shows, [H, W]."""
+    return reproject([cloud], camera, cloud.values.shape[1], "auto").index[0]
+
+
 @pytest.mark.parametrize("scale", [1, 2, 3, 4])
 def test_a_still_frame_is_shown_in_the_first_pixel_of_each_cell(scale: int) -> None:
     """Off by s / 2 - 1/2 pixels from the middle of the cell."""
     low = low_camera(scale)
     full = scale_camera(low, 8 * scale, 6 * scale)
     cloud = Cloud.of(frame_of(low))
-    index, depth = cloud.splat(full, "auto")
+    index, depth = shown(cloud, full), project(full, cloud.points)[1]
     assert torch.equal(index[::scale, ::scale].flatten(), torch.arange(48).int())
     assert (index >= 0).sum() == 48
     # Coordinates up to 2 are rounded a dozen times.
@@ -64,10 +69,8 @@ def test_a_frame_of_nothing_is_shown_nowhere_else() -> None:
     torch.testing.assert_close(cloud.points, low.c2w[:, 3].expand(48, 3), rtol=0, atol=1e-11)
     ahead = replace(low, c2w=low.c2w.clone())
     ahead.c2w[:, 3] += 0.1 * low.c2w[:, 2]
-    index, _ = cloud.splat(ahead, "auto")
-    assert (index == -1).all()
-    index, _ = cloud.expected().splat(low, "auto")
-    assert (index == -1).all()
+    assert (shown(cloud, ahead) == -1).all()
+    assert (shown(cloud.expected(), low) == -1).all()
 
 
 @pytest.mark.parametrize("age", [1, 2])

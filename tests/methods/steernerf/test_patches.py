@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from bench.cameras import pack_camera
+from bench.cameras import crop_camera, pack_camera
 from bench.console import ConsoleLog
 from bench.types import Budget, Camera, NullProbe, Scene, Split
 from methods.instant_ngp.stage1 import Setup, TrainedField
@@ -196,6 +196,19 @@ def test_a_patch_has_its_side_and_at_most_its_share_of_the_frame(
     source = new_patches(ball_scene, MOTION, patch=6, patch_share=share)
     low = source.cut(source.example()).view.low
     assert (low.width, low.height) == (side, side)
+
+
+def test_patches_of_pictures_of_several_sizes_have_one_side(ball_scene: Scene) -> None:
+    """The share of the shortest side of all: half of 24 pixels is 3 low-resolution pixels."""
+    split = ball_scene.splits["train"]
+    narrow = crop_camera(split.cameras[0], 4, 0, SIZE - 8, SIZE)
+    cameras = [narrow, *split.cameras[1:]]
+    images = [split.images[0][:, 4:-4], *split.images[1:]]
+    scene = replace(ball_scene, splits={"train": replace(split, cameras=cameras, images=images)})
+    source = new_patches(scene, small_motion(uses=1, length=1), patch=8, patch_share=0.5)
+    cuts = [source.cut(source.example()) for _ in range(60)]
+    assert {0, 1} <= {cut.example.number for cut in cuts}
+    assert {cut.truth.shape for cut in cuts} == {(12, 12, 3)}
 
 
 def test_a_patch_lies_anywhere(ball_scene: Scene) -> None:

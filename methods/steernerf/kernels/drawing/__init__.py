@@ -32,7 +32,8 @@ def shown(
     (None: that of `present`), first the RGB of all frames, then their other features.
 
     `present` [h, w, K] stands at every s-th pixel; each pixel has the row of `values` [P, K] that
-    `index` [L', H, W] int32 names, -1 for none, for L' <= L preceding frames. All else is 0.
+    `index` [L', H, W] int32 names, -1 for none, for L' <= L preceding frames, each with rows of its
+    own. All else is 0.
     Differentiable in `present` and `values`; the gradient of a row is the sum over all pixels that
     show it. Without a gradient, a CPU writes the result into the beginning of `memory` [M], if that
     is given: fresh pages of the system take as long as the work itself. `spans` are of the result.
