@@ -40,7 +40,7 @@ test: lint ## lint, then all tests that take no more than a few seconds
 test-all: lint ## lint, then all tests: what continuous integration runs
 	$(PYTEST)
 
-figures: install ## measure all that the documents show, and put it there; for hours
+figures: install ## measure all that the documents show, and put it there; in hours
 	@$(BIN)/steerbench figures
 
 fuzz: install ## loaders and settings on whatever comes, for some minutes
