@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -270,9 +269,3 @@ def claim_table(comparisons: Sequence[Comparison]) -> Table:
         lines.append((name, *figures, each.verdict))
     columns = ("claim", "paper", "here", "95 % interval", "over", "margin", "against the paper")
     return Table("All comparisons", columns, tuple(lines))
-
-
-def tally(comparisons: Sequence[Comparison]) -> str:
-    """How many comparisons have which verdict, the most frequent first."""
-    counts = Counter(each.verdict for each in comparisons).most_common()
-    return "; ".join(f"{count} {verdict}" for verdict, count in counts)

@@ -14,7 +14,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from reports import figures
-from reports.claims import NOT_MEASURED, Comparison, claim_table, finding_table, tally
+from reports.claims import NOT_MEASURED, Comparison, claim_table, finding_table
 from reports.images import Part, Picture, frame_section, kept_frames
 from reports.outliers import Outlier, outlier_table
 from reports.paper_tables import METHOD, SHARES, Lines, PaperTable, comparisons, conditions, section
@@ -67,10 +67,9 @@ def write_paper_page(
 def _conclusions(found: Sequence[Comparison]) -> Iterator[Part]:
     """The main findings of the paper beside what was measured here, and how to read verdicts."""
     sampled = sum(each.here.proves and each.here.half > 0 for each in found)
-    words = {"count": len(found), "tally": tally(found), "sampled": sampled}
     if found:
         yield from (f"## {PAGE['conclusions']}", finding_table(found))
-        yield PAGE["verdicts"].format(**words).strip()
+        yield PAGE["verdicts"].format(sampled=sampled, count=len(found)).strip()
 
 
 def _every_comparison(found: Sequence[Comparison]) -> Iterator[Part]:
