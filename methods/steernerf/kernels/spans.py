@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+
+RIM = 4  # pixels at the border of what is computed, where a network reads zeros beyond
 
 
 @dataclass(frozen=True)
@@ -47,3 +50,20 @@ def ends(spans: Spans | None, height: int, width: int) -> Tensor:
             f"rows in all, got {bands} of {unit}"
         )
     return (unit * spans.columns).clamp(max=width).repeat_interleave(unit, 0)[:height]
+
+
+def inside(spans: Spans | None, height: int, width: int, edges: Sequence[bool]) -> Spans:
+    """What is computed of a part of a picture, [height, width], without its `RIM` at the border.
+
+    `edges` says whether the picture ends at the top, bottom, left, right of the part: nothing is
+    missing there, so that this is no border. Otherwise its sides are multiples of `RIM`.
+    """
+    top, bottom, left, right = edges
+    across = -(-width // RIM)
+    first, end = (-(-ends(spans, height, width)[::RIM] // RIM)).unbind(1)
+    first = first + ((first > 0) | (not left)).long()
+    end = end - ((end < across) | (not right)).long()
+    rows, beyond = torch.stack((first, end), 1), torch.tensor([[across, 0]])
+    above, below = rows[:1] if top else beyond, rows[-1:] if bottom else beyond
+    first, end = torch.cat((above, rows, below)).unfold(0, 3, 1).unbind(1)  # of three rows each
+    return Spans(torch.stack((first.amax(1), end.amin(1)), 1), RIM)

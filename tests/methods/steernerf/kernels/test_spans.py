@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch.nn import functional
 
-from methods.steernerf.kernels.spans import Spans, ends
+from methods.steernerf.kernels.spans import RIM, Spans, ends, inside
 
 
 def test_a_picture_cuts_the_last_unit_of_its_spans() -> None:
@@ -35,3 +36,28 @@ def test_too_few_bands_and_parts_of_tiles_are_refused(bands: int, unit: int) -> 
     spans = Spans(torch.zeros(bands, 2, dtype=torch.int64), unit)
     with pytest.raises(ValueError, match=f"bands of 8 rows in all, got {bands} of {unit}"):
         ends(spans, 8, 8)
+
+
+@pytest.mark.parametrize(
+    ("size", "edges"),
+    [
+        ((48, 80), [False] * 4),
+        ((48, 80), [True, False, False, True]),
+        ((42, 75), [True] * 4),
+    ],
+)
+def test_inside_is_what_has_computed_pixels_around_it_or_the_end_of_the_picture(
+    size: tuple[int, int], edges: list[bool]
+) -> None:
+    """A mask made smaller by `RIM` pixels; bands of 16 rows, one of them empty."""
+    for columns in ([[1, 4], [0, 5], [2, 5]], [[0, 5], [4, 2], [0, 5]]):
+        spans = Spans(torch.tensor(columns), 16)
+        top, bottom, left, right = edges
+        beyond = functional.pad(spans.mask(*size).float(), [RIM] * 4)
+        beyond[:RIM] = beyond[RIM] if top else 0
+        beyond[-RIM:] = beyond[-RIM - 1] if bottom else 0
+        beyond[:, :RIM] = beyond[:, RIM : RIM + 1] if left else 0
+        beyond[:, -RIM:] = beyond[:, -RIM - 1 :][:, :1] if right else 0
+        wanted = -functional.max_pool2d(-beyond[None], 2 * RIM + 1, 1)[0] == 1
+        found = inside(spans, *size, edges).mask(*size)
+        assert torch.equal(found, wanted)
