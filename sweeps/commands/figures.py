@@ -64,8 +64,8 @@ class Made:
 
     @property
     def told(self) -> str:
-        """As a line above the figures."""
-        command = re.sub(r" (--)?report[ =]\{folder\}", "", self.command)
+        """As a line above the figures; DIR is what --data names."""
+        command = re.sub(r" (--)?report[ =]\{folder\}", "", self.command).format(data="DIR")
         return f"`{command}`, at {self.commit}, on {self.machine}:"
 
 
