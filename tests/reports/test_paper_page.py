@@ -84,7 +84,7 @@ def test_findings_come_first_all_comparisons_last(run, tmp_path):
     before, after = text.split("## The tables")
     says = "PSNR lost by a hash table of 2^16 against 2^19"
     assert f"| **{says} (dB)** | +0.02 | +0.11 | " in before
-    assert "2 of all 4 comparisons have an interval" in before  # sizes are computed
+    assert "Of all 4 comparisons, 2 have an interval" in before  # sizes are computed
     found = after.split("## All comparisons")[1]
     assert "| Table 6, PSNR, dB: T = 2^14 < T = 2^16 | +0.33 | +0.11 |" in found
     assert "| Table 6, PSNR, dB: T = 2^16 ≈ T = 2^19 | +0.02 | +0.11 |" in found
