@@ -46,13 +46,12 @@ class Observation:
         Zeros beyond the border change what the network draws there by less than a grey level, but
         such a line across a white background costs 0.01 of LPIPS. None: the whole picture.
         """
-        if self.part == WHOLE and self.spans is None:
-            return None
         edges = []
         for one, side in zip(self.part, self.frame.values.shape, strict=False):
             begin, end, _ = one.indices(side)
             edges += [begin == 0, end == side]
-        return inside(self.spans, height, width, edges)
+        whole = self.spans is None and all(edges)
+        return None if whole else inside(self.spans, height, width, edges)
 
 
 class Renderer2d(nn.Module):
