@@ -101,6 +101,7 @@ class JointOptions:
 
     field: Literal["joint", "frozen"]  # frozen: as stage 1 left it (the paper's Table 5)
     features: Literal["random", "constant"]  # initial features beyond RGB; constant: 1/2
+    optimiser: Literal["muon", "adam"]  # of the 2D renderer; adam, as in the release
     rate: float  # initial learning rate of the 2D renderer
     field_rate: float  # initial learning rate of the field
     final_rate: float  # final learning rate of both

@@ -25,9 +25,14 @@ from methods.steernerf.patches import Batch, Patches, distilled_views
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.unet import Renderer2d
 from methods.training import checkpoint, loop
+from methods.training.muon import Muon
 
 MARKS = (0.125, 0.25, 0.5)
 """Shares of the steps after which the weights are saved as well: an ablation becomes a curve."""
+
+MUON = 5
+"""Muon's learning rate, in those of Adam: the root mean square of its updates is then Adam's
+rate."""
 
 
 class JointTraining:
@@ -51,9 +56,14 @@ class JointTraining:
             self._visits = torch.Generator(trained.field.device).manual_seed(seed)
 
     @cached_property
-    def optimiser(self) -> torch.optim.Adam:
-        """Adam for the renderer; created when first needed, like that of the field."""
-        return torch.optim.Adam(self.renderer.parameters(), lr=self.options.rate, fused=True)
+    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """Of the renderer's parameters; created when first needed, like that of the field."""
+        parameters, rate = list(self.renderer.parameters()), self.options.rate
+        if self.options.optimiser == "adam":
+            return {"adam": torch.optim.Adam(parameters, lr=rate, fused=True)}
+        weights = [x for x in parameters if x.dim() == 4]
+        others = [x for x in parameters if x.dim() != 4]
+        return {"adam": torch.optim.Adam(others, lr=rate, fused=True), "muon": Muon(weights, rate)}
 
     def advance(self) -> dict[str, float]:
         """Take one step; return the mean squared error of the pictures, as `loop.look` does, which
@@ -82,7 +92,9 @@ class JointTraining:
 
     def update(self) -> None:
         """Update the weights."""
-        loop.step_at(self.optimiser, self.rate_now(self.options.rate))
+        rate = self.rate_now(self.options.rate)
+        for name, optimiser in self.optimisers.items():
+            loop.step_at(optimiser, MUON * rate if name == "muon" else rate)
         if self.trained:
             self.field_optimiser.step(self.rate_now(self.options.field_rate))
 
@@ -113,8 +125,9 @@ class JointTraining:
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
         """Optimisers, random numbers, and the examples that patches are cut from."""
-        tensors = checkpoint.optimiser_tensors(self.optimiser, "renderer_adam.")
-        tensors |= {f"patches.{name}": x for name, x in self.patches.state().items()}
+        tensors = {f"patches.{name}": x for name, x in self.patches.state().items()}
+        for name, optimiser in self.optimisers.items():
+            tensors |= checkpoint.optimiser_tensors(optimiser, f"renderer_{name}.")
         tensors["generator"] = self.generator.get_state()
         if self.trained:
             tensors |= {"visits": self._visits.get_state(), **self.field_optimiser.tensors()}
@@ -123,7 +136,8 @@ class JointTraining:
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
         """Restore what `result` and `state` returned."""
         self.restore_result(tensors)
-        checkpoint.restore_optimiser(self.optimiser, tensors, "renderer_adam.")
+        for name, optimiser in self.optimisers.items():
+            checkpoint.restore_optimiser(optimiser, tensors, f"renderer_{name}.")
         self.patches.restore(checkpoint.part(tensors, "patches."))
         self.generator.set_state(tensors["generator"].cpu())
         if self.trained:

@@ -35,6 +35,7 @@ MOTION = MotionOptions(degrees=(0.0, 2.5), length=4, least=0, pool=12, uses=16, 
 JOINT = JointOptions(
     field="joint",
     features="constant",
+    optimiser="muon",
     rate=1e-3,
     field_rate=1e-3,
     final_rate=1e-5,
@@ -71,7 +72,7 @@ lean_rendering = partial(replace, LeanRendering(**vars(RENDERING) | LEAN_RENDERI
 """As `lean_model()` is trained, but without refinement."""
 
 REFINED = {"refined": 0.2, "refined_step": 2.0, "refined_rays": 2048}
-LEAN_JOINT = {**REFINED, "error_weight": 1e-4, "clip": 1.0, "average": 0.999}
+LEAN_JOINT = {**REFINED, "optimiser": "adam", "error_weight": 1e-4, "clip": 1.0, "average": 0.999}
 lean_joint = partial(replace, LeanJointOptions(**vars(JOINT) | LEAN_JOINT))
 """Two patches a step, refinement with steps of 2."""
 

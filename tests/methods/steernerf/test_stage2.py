@@ -146,7 +146,7 @@ def test_both_learning_rates_of_the_release_fall_twice_to_the_same(ball_scene: S
         assert rates[15] == pytest.approx((first + 5e-5) / 2)
     training.step = 10
     training.advance()
-    assert training.optimiser.param_groups[0]["lr"] == pytest.approx(5e-5)
+    assert training.optimisers["adam"].param_groups[0]["lr"] == pytest.approx(5e-5)
     with pytest.raises(ValueError, match=r"^joint\.half_waves: expected an odd number, got 2$"):
         replace(OPTIONS, half_waves=2)
     with pytest.raises(ValueError, match=r"^joint\.motion\.degrees: expected a range from 0 on"):
@@ -184,13 +184,13 @@ def test_weights_on_the_way_are_kept(ball_scene: Scene, tmp_path: Path, quiet_lo
         assert torch.equal(tensor, found.result()[name]), name
 
 
+@pytest.mark.parametrize("optimiser", ["muon", "adam"])
 def test_a_killed_training_ends_as_if_it_had_never_stopped(
-    ball_scene: Scene, tmp_path: Path
+    ball_scene: Scene, tmp_path: Path, optimiser: str
 ) -> None:
     """The examples go on, too: there and back, or are replaced when they are used up. Kernels of
-    the U-Net are channels last, and files keep no order; a fused optimiser reads both as they
-    lie."""
-    options = replace(OPTIONS, motion=small_motion(pool=2, uses=3, longer=0.5))
+    the U-Net are channels last, and files keep no order; optimisers read both as they lie."""
+    options = replace(OPTIONS, optimiser=optimiser, motion=small_motion(pool=2, uses=3, longer=0.5))
     goes_on_after_a_kill(lambda: new_training(ball_scene, options, steps=8), 5, tmp_path)
 
 
