@@ -42,11 +42,7 @@ def locked(path: Path, waiting: str, log: Log) -> Iterator[None]:
         handle = _opened(path)
     try:
         try:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                log.info(waiting)
-                fcntl.flock(handle, fcntl.LOCK_EX)
+            _lock(handle, waiting, log)
         except OSError as error:
             log.info(f"not locked, others may do the same meanwhile: {path}: {error.strerror}")
         yield
@@ -63,6 +59,14 @@ def missing(path: Path, log: Log) -> Iterator[bool]:
     waiting = f"waits for another process that makes the same: {path}"
     with locked(path.with_name("lock"), waiting, log):
         yield not path.exists()
+
+
+def _lock(handle: int, waiting: str, log: Log) -> None:
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        log.info(waiting)
+        fcntl.flock(handle, fcntl.LOCK_EX)
 
 
 def _opened(path: Path) -> int:
