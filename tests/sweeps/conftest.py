@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 from hydra.core.plugins import Plugins
@@ -30,6 +31,21 @@ class Outcome(NamedTuple):
     status: int
     out: str
     err: str
+
+    def ok(self) -> Outcome:
+        """Itself: it ended well."""
+        assert self.status == 0, self.err
+        return self
+
+    def refused(self) -> str:
+        """What was said: it was refused."""
+        assert self.status == 2, self.err
+        return self.err
+
+    @property
+    def json(self) -> Any:
+        """What the last line of its output holds."""
+        return json.loads(self.out.splitlines()[-1])
 
 
 @pytest.fixture

@@ -91,15 +91,13 @@ WITHOUT_LPIPS = ("protocol.lpips=[]", "protocol.name=quick")
 
 def test_what_the_document_makes_is_listed_measured_and_studied(steerbench, mine, monkeypatch):
     assert "The mean colour of the training pictures." in steerbench(*typed("list")).out
-    measured = steerbench(*typed("run"), *WITHOUT_LPIPS)
-    assert measured.status == 0, measured.err
+    measured = steerbench(*typed("run"), *WITHOUT_LPIPS).ok()
     assert "19.83" in measured.out  # 20 log10(255 / 26)
     assert "paint" in measured.out
     refused = steerbench(*typed("run"), *WITHOUT_LPIPS, "method.shade=2.0")
     assert refused.err.endswith("method: shade: expected 0 to 1, got 2.0\n")
     monkeypatch.setattr("methods.checks.found", lambda name: [])  # no kernels
-    studied = steerbench(*typed("accuracy"), "--repeats", "1")
-    assert studied.status == 0, studied.err
+    studied = steerbench(*typed("accuracy"), "--repeats", "1").ok()
     assert "shade 0.9" in studied.out
 
 

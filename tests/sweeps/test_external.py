@@ -71,8 +71,7 @@ def typed(begin: str) -> list[str]:
 def test_the_worker_of_the_document_is_a_row_of_ten_lines(steerbench, documented, tmp_path):
     lines = (tmp_path / "mean_worker.py").read_text().splitlines()
     assert len([line for line in lines if line.strip()]) <= 10
-    done = steerbench(*typed("run method=external method.command=mean"), *WHITE)
-    assert done.status == 0, done.err
+    done = steerbench(*typed("run method=external method.command=mean"), *WHITE).ok()
     assert "frame, with the socket" in done.out
     table = rows(tmp_path).set_index("metric")
     assert table.loc["psnr", "value"] == math.inf  # white, as the scene is
@@ -94,8 +93,7 @@ def test_another_worker_or_another_option_is_another_run(run, write, tmp_path):
 
 def test_the_worker_of_the_document_takes_turns_with_ours(steerbench, documented, tmp_path):
     words = typed("run --config-dir")
-    done = steerbench(*(word.replace("ngp", "grey") for word in words), *QUICK[1:])
-    assert done.status == 0, done.err
+    steerbench(*(word.replace("ngp", "grey") for word in words), *QUICK[1:]).ok()
     assert set(rows(tmp_path)["method"]) == {"Mean", "grey"}
     records = [json.loads(x.read_text()) for x in tmp_path.glob("outputs/runs/*/record.json")]
     first, second = (record["made_of"] for record in records)
@@ -105,14 +103,12 @@ def test_the_worker_of_the_document_takes_turns_with_ours(steerbench, documented
 def test_the_worker_of_the_document_has_a_line_in_a_table(steerbench, documented, monkeypatch):
     monkeypatch.setattr("sweeps.plan.TABLES", HERE / "configs/experiment")
     words = typed("paper --config-dir")
-    done = steerbench(*(word.replace("table1", "table9") for word in words), *WHITE, "seed=0")
-    assert done.status == 0, done.err
+    steerbench(*(word.replace("table1", "table9") for word in words), *WHITE, "seed=0").ok()
     assert "| mine |" in Path("outputs/paper/report.md").read_text()
 
 
 def test_the_worker_of_the_document_is_drawn_along_a_path(steerbench, documented):
-    done = steerbench("render", *documented, *WHITE, "--beside", "grey", "--output", "there")
-    assert done.status == 0, done.err
+    steerbench("render", *documented, *WHITE, "--beside", "grey", "--output", "there").ok()
     for picture in pictures("there"):  # white as the scene, and beside it the grey
         assert (picture[:, :40] == 255).all()
         assert (picture[:, 40:] == 128).all()
@@ -127,8 +123,7 @@ def test_accuracy_turns_the_knobs_that_it_declares_and_trains_once(steerbench, w
     Grey.fit, Grey.load = fit, lambda self, job: None
     """)
     monkeypatch.setattr("methods.checks.found", lambda name: [])  # no kernels
-    done = steerbench("accuracy", *WHITE, *EXTERNAL, "--repeats", "1")
-    assert done.status == 0, done.err
+    done = steerbench("accuracy", *WHITE, *EXTERNAL, "--repeats", "1").ok()
     assert "level 0.25" in done.out
     assert "level 1.0" in done.out
     assert Path("trainings").read_text() == "one "

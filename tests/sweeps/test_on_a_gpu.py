@@ -48,6 +48,5 @@ def test_it_ends_well(command, steerbench, gpu):
 
 def test_pictures_are_scored_there(steerbench, gpu, lpips_weights):
     words = ("scene.width=32", "protocol.lpips=[alex]", f"weights_dir={lpips_weights}")
-    outcome = steerbench("run", *SMALLEST, *words)
-    assert outcome.status == 0, outcome.err
+    outcome = steerbench("run", *SMALLEST, *words).ok()
     assert "LPIPS alex" in outcome.out

@@ -67,8 +67,7 @@ def keys(tmp_path: Path) -> set[str]:
 
 
 def test_a_change_in_a_module_is_a_new_run_of_a_new_process(call, folder, tmp_path, monkeypatch):
-    first = call("run", "method=mine", *SMALL)
-    assert first.status == 0, first.err
+    call("run", "method=mine", *SMALL).ok()
     assert call("run", "method=mine", *SMALL).err.startswith("already measured")
     for number, name in enumerate(("helper.py", "renderer.py"), 2):
         with (folder / "mine" / name).open("a") as file:
@@ -95,9 +94,7 @@ THERE = "There are: diver, external, gaussians, kilonerf, mine, nerf, nerfbaseli
     ],
 )  # fmt: skip
 def test_a_word_that_leads_nowhere_is_answered(call, argv, said):
-    refused = call(*argv.split())
-    assert refused.status == 2
-    assert said in refused.err
+    assert said in call(*argv.split()).refused()
 
 
 # Packages from pip
@@ -150,8 +147,7 @@ def plugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
 
 def test_a_package_that_cannot_be_imported_or_is_not_there_is_a_line(plugged, steerbench):
     plugged("broken.configs", {"broken/__init__.py": "import nothing_of_this_name\n"})
-    listed = steerbench("list")
-    assert listed.status == 0
+    listed = steerbench("list").ok()
     assert "other (other 2.0)" in listed.out
     assert "No module named 'nothing_of_this_name'" in " ".join(listed.out.split())
     assert plugged("nowhere_at_all") == "there is no package nowhere_at_all"

@@ -22,11 +22,10 @@ def pictures(folder: str) -> list[np.ndarray]:
 
 @pytest.mark.slow
 def test_every_frame_of_a_run_is_written_and_its_path_can_be_followed_and_timed(steerbench):
-    assert steerbench("run", "method=ngp", *SCENE, *QUICK, *PROTOCOL).status == 0
+    steerbench("run", "method=ngp", *SCENE, *QUICK, *PROTOCOL).ok()
     (run,) = Store(Path("outputs")).rows()["run"].unique()
 
-    outcome = steerbench("render", "--run", run[:6], "--output", "there")
-    assert outcome.status == 0, outcome.err
+    outcome = steerbench("render", "--run", run[:6], "--output", "there").ok()
     assert "trained field found" in outcome.err
     there = pictures("there")
     assert [picture.shape for picture in there] == [(24, 24, 3)] * 2
@@ -36,8 +35,7 @@ def test_every_frame_of_a_run_is_written_and_its_path_can_be_followed_and_timed(
     path = json.loads(Path("there/path.json").read_text())
     assert len(path["camera_path"]) == 2
     words = ["--run", run, "--path", "there/path.json", "--beside", "ngp", "--output", "again"]
-    outcome = steerbench("render", *words)
-    assert outcome.status == 0, outcome.err
+    steerbench("render", *words).ok()
     for before, after in zip(there, pictures("again"), strict=True):
         left, right = after[:, :24], after[:, 24:]
         assert np.array_equal(left, right)  # the same method twice
@@ -45,8 +43,7 @@ def test_every_frame_of_a_run_is_written_and_its_path_can_be_followed_and_timed(
         assert np.abs(left - before).mean() < 0.5
 
     words = ("trajectory=path", "trajectory.path=there/path.json")
-    outcome = steerbench("run", "method=ngp", *words, *SCENE, *QUICK, *PROTOCOL)
-    assert outcome.status == 0, outcome.err
+    steerbench("run", "method=ngp", *words, *SCENE, *QUICK, *PROTOCOL).ok()
     rows = Store(Path("outputs")).rows()
     timed = rows[rows["run"] != run].set_index("metric")
     assert timed["n"]["frame_ms"] == 2

@@ -24,8 +24,7 @@ def test_a_damaged_file_is_named_and_fails(steerbench, tmp_path, monkeypatch):
 def test_get_says_how_to_run_on_what_it_got(steerbench, monkeypatch, web, tmp_path):
     publish(monkeypatch, {"mic/a.png": b"a", "lego/a.png": b"b"}, folder=web.address)
     web.files = {"/mic/a.png": b"a", "/lego/a.png": b"b"}
-    outcome = steerbench("scenes", "get", "release", "--to", "mine")
-    assert outcome.status == 0
+    outcome = steerbench("scenes", "get", "release", "--to", "mine").ok()
     assert "scene=blender scene.path=mine/release/lego\n" in outcome.out
     assert "licence: free" in outcome.out
     assert (tmp_path / "mine/release/mic/a.png").read_bytes() == b"a"
@@ -34,12 +33,10 @@ def test_get_says_how_to_run_on_what_it_got(steerbench, monkeypatch, web, tmp_pa
 
 def test_export_says_how_to_train_on_it_and_how_to_score_what_others_render(steerbench):
     sizes = "scene.width=16", "scene.train=2", "scene.test=3"
-    outcome = steerbench("scenes", "export", "totem", "--to", "out", "--path", "orbit", *sizes)
-    assert outcome.status == 0, outcome.err
+    outcome = steerbench("scenes", "export", "totem", "--to", "out", "--path", "orbit", *sizes).ok()
     assert "scene=blender scene.path=out\n" in outcome.out
     told = outcome.out.split("its path: steerbench ")[1].split()
     words = [word.replace("PICTURES", "out/test") for word in told]
-    scored = steerbench(*words, "protocol.lpips=[]", "protocol.name=quick")
-    assert scored.status == 0, scored.err
+    scored = steerbench(*words, "protocol.lpips=[]", "protocol.name=quick").ok()
     assert "3 pictures" in scored.err
     assert steerbench("scenes", "export", "totem", "--to", "out", *sizes).status == 2

@@ -150,9 +150,7 @@ def test_a_recorded_path_can_be_measured(opened, steerbench):
         page.until(lambda: not path)
     (file,) = Path("outputs/view").glob("*.json")
     assert len(json.loads(file.read_text())["camera_path"]) == 3
-    words = ("trajectory=path", f"trajectory.path={file}")
-    outcome = steerbench("run", *STAND_INS, *words)
-    assert outcome.status == 0, outcome.err
+    steerbench("run", *STAND_INS, "trajectory=path", f"trajectory.path={file}").ok()
 
 
 def test_a_browser_that_leaves_in_the_middle_of_a_frame_takes_nothing_with_it(opened, monkeypatch):
