@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from PIL import Image
 
 from bench.results import STEADY, Store
 from reports.trackers import TRACKERS
+from tests.sweeps.conftest import Outcome
 
 QUICK = ("protocol.name=quick", "protocol.lpips=[]")
 SCENE = ("scene=totem", "scene.width=24", "scene.train=2", "scene.test=3")
@@ -28,14 +30,24 @@ def folders(tmp_path: Path) -> tuple[str, str]:
     return "theirs", "true"
 
 
+@pytest.fixture
+def scored(steerbench: Callable[..., Outcome], folders: tuple[str, str]) -> Callable[..., str]:
+    """Score a folder of pictures against the true ones; the key of the run."""
+
+    def score(folder: str, *words: str) -> str:
+        outcome = steerbench("score", folder, "--truth", "true", *QUICK, *words).ok()
+        return re.search(r"run (\w+)", outcome.out)[1]
+
+    return score
+
+
 def test_the_rows_stand_in_the_store_beside_those_of_runs(steerbench, folders, monkeypatch):
     sent = []
     monkeypatch.setattr("reports.trackers.find_spec", lambda name: name)
     monkeypatch.setitem(TRACKERS, "wandb", lambda run, outputs: sent.append(run.label))
     theirs, true = folders
     words = ("--sequence", "pictures=1", "tracker=wandb")
-    outcome = steerbench("score", theirs, "--truth", true, *QUICK, *words)
-    assert outcome.status == 0, outcome.err
+    outcome = steerbench("score", theirs, "--truth", true, *QUICK, *words).ok()
     assert "2 pictures, matched by name: 0.png is scored against 0.png" in outcome.err
     assert "PSNR" in outcome.out
     rows = Store(Path("outputs")).rows().set_index("metric")
@@ -53,25 +65,17 @@ def test_the_rows_stand_in_the_store_beside_those_of_runs(steerbench, folders, m
     assert "expected one of `steerbench run`, got score" in refused.err
 
 
-def test_the_same_pictures_are_the_same_run_and_others_are_another(steerbench, folders):
-    theirs, true = folders
-    keys = []
+def test_the_same_pictures_are_the_same_run_and_others_are_another(scored):
     other = ["protocol.name=other", "protocol.ssim=uniform"]
-    for words in ([], [], ["--name", "better"], other, ["pictures=0"]):
-        outcome = steerbench("score", theirs, "--truth", true, *QUICK, *words)
-        keys.append(re.search(r"run (\w+)", outcome.out)[1])
+    cases = ([], [], ["--name", "better"], other, ["pictures=0"])
+    keys = [scored("theirs", *words) for words in cases]
     assert keys[0] == keys[1]
     assert len(set(keys)) == 4
 
 
-def test_pictures_of_two_programs_are_compared_where_their_truth_is_the_same(steerbench, folders):
-    theirs, true = folders
-    keys = []
-    for folder in (theirs, true):
-        outcome = steerbench("score", folder, "--truth", true, *QUICK)
-        keys.append(re.search(r"run (\w+)", outcome.out)[1])
-    compared = steerbench("compare", *(key[:6] for key in keys))
-    assert compared.status == 0, compared.err
+def test_pictures_of_two_programs_are_compared_where_their_truth_is_the_same(steerbench, scored):
+    keys = [scored(folder) for folder in ("theirs", "true")]
+    compared = steerbench("compare", *(key[:6] for key in keys)).ok()
     assert "psnr" in compared.out
     assert steerbench("compare", *reversed(keys)).status == 1
 
@@ -79,8 +83,7 @@ def test_pictures_of_two_programs_are_compared_where_their_truth_is_the_same(ste
 def test_the_pictures_of_a_scene_are_its_own_truth(steerbench):
     assert steerbench("score", "nowhere", *SCENE, *QUICK).status == 2  # writes the scene
     (folder,) = Path("outputs/scenes").glob("totem-*/test")
-    outcome = steerbench("score", str(folder), *SCENE, *QUICK, "--name", "exact")
-    assert outcome.status == 0, outcome.err
+    outcome = steerbench("score", str(folder), *SCENE, *QUICK, "--name", "exact").ok()
     rows = Store(Path("outputs")).rows().set_index("metric")
     # Its alpha is composited, and that rounded to 8 bit: at most half a level off.
     assert rows["value"]["psnr"] >= 20 * math.log10(255 / 0.5)
@@ -88,15 +91,10 @@ def test_the_pictures_of_a_scene_are_its_own_truth(steerbench):
     assert (rows["scene"].iloc[0], rows["split"].iloc[0], rows["n"].iloc[0]) == ("totem", "test", 3)
 
 
-def test_reported_times_are_in_the_rows_and_marked(steerbench, folders):
-    theirs, true = folders
+def test_reported_times_are_in_the_rows_and_marked(steerbench, scored):
     Path("named.csv").write_text("frame_ms,name\n30,1\n10,0\n99,other\n")
     Path("plain.csv").write_text("frame_ms\n10\n30\n")
-    keys = []
-    for file in ("named.csv", "plain.csv"):
-        outcome = steerbench("score", theirs, "--truth", true, *QUICK, "--times", file)
-        assert outcome.status == 0, outcome.err
-        keys.append(re.search(r"run (\w+)", outcome.out)[1])
+    keys = [scored("theirs", "--times", file) for file in ("named.csv", "plain.csv")]
     assert keys[0] == keys[1]
     store = Store(Path("outputs"))
     rows = store.rows().set_index("metric")
@@ -119,9 +117,8 @@ def test_reported_times_are_in_the_rows_and_marked(steerbench, folders):
 )
 def test_times_that_do_not_fit_the_pictures_are_refused(steerbench, folders, text, said):
     Path("times.csv").write_text(text)
-    outcome = steerbench("score", "theirs", "--truth", "true", *QUICK, "--times", "times.csv")
-    assert outcome.status == 2
-    assert said in outcome.err
+    words = ("--truth", "true", *QUICK, "--times", "times.csv")
+    assert said in steerbench("score", "theirs", *words).refused()
 
 
 @pytest.mark.parametrize(
@@ -132,6 +129,4 @@ def test_times_that_do_not_fit_the_pictures_are_refused(steerbench, folders, tex
     ],
 )
 def test_what_cannot_be_scored_is_one_message(steerbench, folders, words, said):
-    outcome = steerbench("score", folders[0], *words, *QUICK)
-    assert outcome.status == 2
-    assert said in outcome.err
+    assert said in steerbench("score", folders[0], *words, *QUICK).refused()
