@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import json
 import sys
 from functools import partial
 from types import SimpleNamespace
@@ -52,12 +51,11 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], int]]:
 def test_the_last_line_is_json_and_a_wrong_kernel_fails(steerbench, asked):
     outcome = steerbench("kernels", "--filter", "enc", "--repeats", "3")
     assert asked == [(["encode"], 3)]
-    assert outcome.status == 0
-    assert json.loads(outcome.out.splitlines()[-1]) == [SMALL, REFERENCE, RIGHT]
+    assert outcome.ok().json == [SMALL, REFERENCE, RIGHT]
     outcome = steerbench("kernels")
     assert outcome.status == 1
     assert "wrong" in outcome.out  # instead of a time
-    assert json.loads(outcome.out.splitlines()[-1]) == [SMALL, REFERENCE, RIGHT, WRONG]
+    assert outcome.json == [SMALL, REFERENCE, RIGHT, WRONG]
 
 
 def test_a_fast_version_has_a_line_with_the_time_of_its_reference(steerbench, asked):
@@ -72,35 +70,30 @@ def test_a_fast_version_has_a_line_with_the_time_of_its_reference(steerbench, as
     assert small["by its reference"] == "n/a"
 
 
-def test_settings_are_refused_where_no_method_is_trained(steerbench, asked):
-    outcome = steerbench("kernels", "scene=wires")
-    assert outcome.status == 2
-    assert "settings: expected none without --worth, got scene=wires" in outcome.err
-
-
 @pytest.mark.parametrize(
-    ("command", "said"),
-    [("kernels", "no kernel has 'x' in its name"), ("stress", "no subject or case has 'x' in it")],
+    ("argv", "said"),
+    [
+        ("kernels --filter x", "no kernel has 'x' in its name"),
+        ("stress --filter x", "no subject or case has 'x' in it"),
+        ("kernels scene=wires", "settings: expected none without --worth, got scene=wires"),
+    ],
 )
-def test_a_filter_that_fits_nothing_is_an_error(steerbench, asked, command, said):
-    outcome = steerbench(command, "--filter", "x")
-    assert outcome.status == 2
-    assert said in outcome.err
+def test_a_filter_or_a_setting_that_fits_nothing_is_an_error(steerbench, asked, argv, said):
+    assert said in steerbench(*argv.split()).refused()
 
 
 def test_what_a_kernel_brings_has_a_line_for_each_that_a_method_calls(steerbench, tmp_path):
     small = ("scene.width=16", "scene.train=4", "scene.test=2", "budget.steps=2")
     few = ("budget.samples=64", "--frames", "2", "--repeats", "1", f"outputs={tmp_path}")
-    outcome = steerbench("kernels", "--worth", "method=ngp", *small, *few)
-    assert outcome.status == 0, outcome.err
-    rows = {row["kernel"]: row for row in json.loads(outcome.out.splitlines()[-1])}
+    found = steerbench("kernels", "--worth", "method=ngp", *small, *few).ok().json
+    rows = {row["kernel"]: row for row in found}
     assert set(rows) == {"adam", "composite", "encode", "march", "mlp", "spherical"}
     assert rows["adam"]["frame_ms_reference"] is None  # it is called in training alone
     for row in rows.values():
         assert row["method"] == "ngp"
         assert min(row["frame_ms"], row["training_s"], row["training_s_reference"]) > 0
     outcome = steerbench("kernels", "--worth", "--filter", "ada", "method=ngp", *small, *few)
-    assert [row["kernel"] for row in json.loads(outcome.out.splitlines()[-1])] == ["adam"]
+    assert [row["kernel"] for row in outcome.json] == ["adam"]
     assert rows["march"]["frame_ms_reference"] > 0
 
 
@@ -163,16 +156,15 @@ def two_cases(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_last_line_of_stress_is_json_and_a_case_that_fails_fails_it(steerbench, two_cases):
-    outcome = steerbench("stress", "--filter", "sum")
-    assert outcome.status == 0
+    outcome = steerbench("stress", "--filter", "sum").ok()
     for text in ("sum", "long", "all is there", "reference", "fp32", "5.0e-07", "1.0e-06", "ok"):
         assert text in outcome.out
-    (row,) = json.loads(outcome.out.splitlines()[-1])
+    (row,) = outcome.json
     assert (row["subject"], row["error"], row["status"]) == ("sum", 5e-7, "ok")
     outcome = steerbench("stress")
     assert outcome.status == 1
     assert "2 cases, 2 cells, 1 failed" in outcome.out
-    assert [r["status"] for r in json.loads(outcome.out.splitlines()[-1])] == ["ok", "failed"]
+    assert [row["status"] for row in outcome.json] == ["ok", "failed"]
 
 
 def test_cases_nearest_to_their_tolerances_are_shown_again(steerbench, monkeypatch):
