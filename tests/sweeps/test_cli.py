@@ -19,22 +19,15 @@ from sweeps.cli import COMMANDS
 
 
 def test_without_a_command_the_help_shows_every_command_and_examples(steerbench):
-    outcome = steerbench()
-    assert outcome.status == 0
+    outcome = steerbench().ok()
     for word in (*COMMANDS, "+experiment=demo"):
         assert word in outcome.out
 
 
 def test_help_of_run_lists_choices_settings_and_examples(run):
-    outcome = run("--help")
-    assert outcome.status == 0
-    for text in (
-        "steerbench run -m seed=0,1,2",
-        "method: dark, diver, external, gaussians, grey, kilonerf",
-        "totem",
-        "seed: 0",
-        "-sc install",
-    ):
+    outcome = run("--help").ok()
+    methods = "method: dark, diver, external, gaussians, grey, kilonerf"
+    for text in ("steerbench run -m seed=0,1,2", methods, "totem", "seed: 0", "-sc install"):
         assert text in outcome.out
 
 
@@ -77,9 +70,7 @@ def test_list_shows_choices_backends_and_why_an_engine_cannot_be_used(steerbench
     ],
 )
 def test_a_wrong_word_is_answered_with_what_there_is(steerbench, argv, message):
-    outcome = steerbench(*argv)
-    assert outcome.status == 2
-    assert message in outcome.err
+    assert message in steerbench(*argv).refused()
 
 
 def test_of_settings_around_an_option_the_last_one_counts(steerbench):
@@ -105,7 +96,7 @@ def test_results_are_the_same_in_every_format_and_can_be_narrowed_down(steerbenc
     assert "Did you mean psnr" in steerbench("results", "--metric", "psn").err
 
 
-def test_bash_completes_what_follows_run(tmp_path):
+def test_bash_completes_what_follows_run(tmp_path, monkeypatch):
     """Through the function that `steerbench run -sc install=bash` defines, as on pressing TAB."""
     line = "steerbench run +experiment=d"
     script = f"""
@@ -114,13 +105,7 @@ def test_bash_completes_what_follows_run(tmp_path):
         hydra_bash_completion
         printf '%s\\n' "${{COMPREPLY[@]}}"
     """
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    done = subprocess.run(
-        ["bash", "-c", script],
-        cwd=tmp_path,
-        env={**os.environ, "PATH": path},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", str(Path(sys.executable).parent), prepend=os.pathsep)
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=True)
     assert (done.stdout.split(), done.stderr) == (["+experiment=demo"], "")
