@@ -30,7 +30,6 @@ UNKNOWN = [
         ("seed=-1", "seed: expected 0 or more, got -1\n"),
         ("threads=0", "threads: expected 1 or more, or null, got 0\n"),
         ("device=gpu", "device: expected auto, cpu, cuda or cuda:N, got gpu\n"),
-        ("scene.frames=many", "scene.frames: expected int, got 'many'\n"),
         ("budget.steps=true", "budget.steps: expected int, got True\n"),
     ],
 )  # fmt: skip
