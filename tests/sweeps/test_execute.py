@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from functools import cache
+from unittest.mock import Mock
 
 import pytest
 
@@ -42,11 +43,7 @@ def test_a_label_has_method_and_what_varies_by_whole_names_where_ends_are_alike(
 
 def test_a_failure_that_cannot_be_kept_is_printed_all_the_same(tmp_path, monkeypatch, capsys):
     cause = SteerbenchError("the cause")
-
-    def obtain(jobs: list[Job]) -> None:
-        raise cause
-
-    monkeypatch.setattr(execute, "obtain", obtain)
+    monkeypatch.setattr(execute, "obtain", Mock(side_effect=cause))
     (tmp_path / "outputs").touch()  # no folder can be made there
     job = Job(composed([f"outputs={tmp_path / 'outputs'}"]), [], "a job")
     assert execute.attempt([(0, job)], 1, tmp_path / "sweep") == [cause]
@@ -181,8 +178,7 @@ SMALL = [
 @pytest.mark.slow
 def test_what_was_trained_ahead_is_found_when_it_is_measured(steerbench, monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
-    outcome = steerbench("paper", "--table", "table5", *SMALL)
-    assert outcome.status == 0, outcome.err
+    outcome = steerbench("paper", "--table", "table5", *SMALL).ok()
     assert "training 2 models, 2 at a time" in outcome.err
     assert outcome.err.count("trained in") == 2
     _, measured = outcome.err.split("1 of 6", 1)

@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pandas as pd
 import pytest
@@ -16,13 +17,13 @@ from omegaconf import DictConfig
 from bench.results import Store
 from bench.types import Scene, SteerbenchError, Unavailable
 from reports.claims import gap
-from reports.runs import Run, load
+from reports.runs import load
 from sweeps import configured, execute
 from sweeps.commands import paper
 from sweeps.commands.paper import gather, newest
 from sweeps.measurement import Job, JobFailed, described
 from sweeps.plan import DataSet, Planned, plan
-from tests.reports.conftest import rewrite
+from tests.reports.conftest import changed, rewrite
 from tests.sweeps.conftest import CONFIGS, HERE
 from tests.sweeps.test_plan import TABLES, blender
 
@@ -94,12 +95,9 @@ def test_the_jobs_go_where_hydras_launcher_puts_them(steerbench, measured, launc
 
 
 def test_what_cannot_run_here_says_so_and_does_not_fail(steerbench, monkeypatch, outputs):
-    def obtain(*_: object) -> None:
-        raise Unavailable("no bfloat16 on this CPU")
-
-    monkeypatch.setattr(execute, "obtain", obtain)
-    outcome = steerbench("paper", "--table", "table3", "seed=0", outputs)
-    assert outcome.status == 0
+    cause = Unavailable("no bfloat16 on this CPU")
+    monkeypatch.setattr(execute, "obtain", Mock(side_effect=cause))
+    outcome = steerbench("paper", "--table", "table3", "seed=0", outputs).ok()
     page = Path(re.search(r"report: (.*)", outcome.err)[1])
     assert labels(page)[0] == "L = 0: failed: no bfloat16 on this CPU"
 
@@ -145,8 +143,7 @@ def test_frames_of_runs_that_are_not_on_a_page_are_not_read(steerbench, outputs,
 def test_the_page_goes_where_asked_and_tables_to_stdout(steerbench, measured, outputs, tmp_path):
     folder = tmp_path / "there"
     words = ("--table", "table5", "--report", str(folder), "--format", "latex")
-    outcome = steerbench("paper", *words, outputs)
-    assert outcome.status == 0
+    outcome = steerbench("paper", *words, outputs).ok()
     assert r"\label{tab:table5}" in outcome.out
     assert "## Table 5: Joint training" in (folder / "report.md").read_text()
 
@@ -215,18 +212,13 @@ def psnr(store: Store, stored_run: str, monkeypatch: pytest.MonkeyPatch, elsewhe
         for job in jobs:
             place = (labels.index(job.line), job.scene, job.config.seed)
             if place in found:
-                runs[job.key] = [run_of(source, job, found[place])]
+                facts = {"scene": job.scene, "seed": job.config.seed}
+                run = changed(source, {"psnr": found[place]}, **facts)
+                runs[job.key] = [replace(run, key=job.key[:16])]
         (of_table,) = gather(jobs, runs).values()
         return of_table
 
     return lines
-
-
-def run_of(source: Run, job: Planned, psnr: float) -> Run:
-    """A run of the scene and seed of `job` with this PSNR."""
-    rows = source.rows.assign(scene=job.scene, seed=job.config.seed)
-    rows.loc[rows["metric"] == "psnr", "value"] = psnr
-    return replace(source, key=job.key[:16], rows=rows)
 
 
 def test_a_figure_is_the_mean_over_seeds_of_means_over_scenes(psnr):
@@ -290,8 +282,7 @@ def test_the_page_of_a_data_set_has_means_scenes_and_gaps(steerbench, tmp_path, 
     blender(data / "ship", pictures=False)
     monkeypatch.setattr("sweeps.plan.TABLES", HERE / "configs" / "experiment")
     words = [CONFIGS, f"data={data}", "device=cpu", "seed=0,1"]
-    outcome = steerbench("paper", *words)
-    assert outcome.status == 0, outcome.err
+    outcome = steerbench("paper", *words).ok()
     assert "missing: ship: no pictures" in outcome.err
     assert "4 of 8" in outcome.err
     page = Path(re.search(r"report: (.*)", outcome.err)[1]).read_text()
