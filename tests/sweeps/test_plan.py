@@ -110,10 +110,8 @@ def test_turns_are_of_one_seed_and_one_scene():
     of = {job.turns: (job.config.seed, job.scene) for job in jobs}
     assert len(of) == 4
     assert all(of[job.turns] == (job.config.seed, job.scene) for job in jobs)
-    alone = plan(
-        TABLES["table2"], ["seed=0", "scene=totem"]
-    )  # finds what was measured beside wires
-    assert {job.key for job in alone} <= {job.key for job in jobs}
+    alone = plan(TABLES["table2"], ["seed=0", "scene=totem"])
+    assert {job.key for job in alone} <= {job.key for job in jobs}  # found beside wires
 
 
 def test_the_lines_of_table_3_differ_in_l_alone():
