@@ -158,12 +158,8 @@ def in_browser(page: str, clicks: str, folder: Path) -> dict[str, object]:
     page = page.replace("</body>", f"<script>{act}</script></body>")
     (folder / "clicked.html").write_text(page)
     flags = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'profile'}"]
-    done = subprocess.run(
-        [str(CHROMIUM), *flags, "--dump-dom", (folder / "clicked.html").as_uri()],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    command = [str(CHROMIUM), *flags, "--dump-dom", (folder / "clicked.html").as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
     (title,) = re.findall(r"<title>(\{.*?\})</title>", done.stdout)
     found = json.loads(title.replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&"))
     assert found.pop("errors") == []

@@ -18,7 +18,6 @@ from reports.images import (
     kept_frames,
     write_image,
 )
-from reports.runs import Run
 from tests.reports.conftest import changed
 
 HEIGHT, WIDTH = 64, 96
@@ -73,15 +72,10 @@ def test_what_stands_below_a_picture_is_of_its_frame(run):
     frames.loc[0, "phase"] = "cold"
     of_frames = replace(changed(run, {"frame_ms": 250.0}), read_frames=lambda: frames)
     kept = kept_frames([of_frames])
-    titles = [view.titles[1] for frame in kept for view in shown(of_frames, frame)]
+    parts = (part for frame in kept for part in frame_section([of_frames], frame, "frames"))
+    titles = [view.titles[1] for part in parts if isinstance(part, Frame) for view in part.views]
     assert titles[0] == "PSNR 30.00 dB, 100.0 ms, cold"
     assert titles[1:] == [f"PSNR {30 + int(frame):.2f} dB, 250.0 ms" for frame in kept[1:]]
-
-
-def shown(run: Run, frame: str) -> list[View]:
-    """The views in the section of a frame."""
-    (part,) = (x for x in frame_section([run], frame, "frames") if isinstance(x, Frame))
-    return [*part.views]
 
 
 def test_a_page_has_a_few_of_the_frames_that_all_runs_kept(tmp_path):

@@ -3,6 +3,8 @@ machine; a tracker that is not installed is not tested."""
 
 from __future__ import annotations
 
+from unittest.mock import Mock
+
 import pytest
 
 from bench.errors import SteerbenchError, Unavailable
@@ -28,12 +30,8 @@ def test_tensorboard_has_the_figures_of_every_frame_and_of_the_run(run, tmp_path
 
 def test_an_interruption_leaves_nothing_that_looks_whole(run, tmp_path, monkeypatch):
     pytest.importorskip("tensorboard")
-
-    def interrupted(run):
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr(trackers, "pictures", interrupted)
+        patch.setattr(trackers, "pictures", Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             tracker("tensorboard")(run, tmp_path)
     assert not (tmp_path / "tensorboard" / run.key).exists()
