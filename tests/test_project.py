@@ -85,13 +85,8 @@ def test_the_changelog_and_the_citation_are_of_the_current_version():
 
 
 def test_make_explains_which_python_it_needs(tmp_path):
-    done = subprocess.run(
-        ["make", "install", f"VENV={tmp_path / 'venv'}", "PYTHON=no-such-python"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = ["make", "install", f"VENV={tmp_path / 'venv'}", "PYTHON=no-such-python"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode != 0
     assert "needs Python 3.11 or newer" in done.stderr
     assert "no-such-python" in done.stderr
