@@ -143,9 +143,7 @@ def test_compile_computes_the_cases_of_all_modules_in_processes(steerbench, monk
 # stress
 
 
-@pytest.fixture
-def two_cases(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One that holds, about sums, and one that does not, about products."""
+def test_the_last_line_of_stress_is_json_and_a_case_that_fails_fails_it(steerbench, monkeypatch):
     cells = {("reference", "fp32"): 1e-6}
     errors = {"sum": 5e-7, "product": 2}
     cases = [
@@ -153,9 +151,6 @@ def two_cases(monkeypatch: pytest.MonkeyPatch) -> None:
         for subject, error in errors.items()
     ]
     monkeypatch.setattr("methods.checks.found", lambda name: cases)
-
-
-def test_the_last_line_of_stress_is_json_and_a_case_that_fails_fails_it(steerbench, two_cases):
     outcome = steerbench("stress", "--filter", "sum").ok()
     for text in ("sum", "long", "all is there", "reference", "fp32", "5.0e-07", "1.0e-06", "ok"):
         assert text in outcome.out

@@ -17,7 +17,6 @@ from sweeps.overrides import PLUG_INS, plug_ins
 
 from .test_documents import WITHOUT_LPIPS, mine  # noqa: F401 (a fixture)
 
-HELPER = "LEVEL = 0.5\n"
 RENDERER = """
 from mine.helper import LEVEL
 from stand_ins import Grey
@@ -41,7 +40,7 @@ def folder(steerbench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     package = tmp_path / "plug-in's" / "mine"
     package.mkdir(parents=True)
     (package / "__init__.py").touch()
-    (package / "helper.py").write_text(HELPER)
+    (package / "helper.py").write_text("LEVEL = 0.5\n")
     (package / "renderer.py").write_text(RENDERER)
     config = package.parent / "configs" / "method" / "mine.yaml"
     config.parent.mkdir(parents=True)
@@ -61,11 +60,6 @@ def call(steerbench, folder: Path):
     )
 
 
-def keys(tmp_path: Path) -> set[str]:
-    """The runs of the store."""
-    return {path.parent.name for path in tmp_path.glob("outputs/runs/*/record.json")}
-
-
 def test_a_change_in_a_module_is_a_new_run_of_a_new_process(call, folder, tmp_path, monkeypatch):
     call("run", "method=mine", *SMALL).ok()
     assert call("run", "method=mine", *SMALL).err.startswith("already measured")
@@ -76,7 +70,7 @@ def test_a_change_in_a_module_is_a_new_run_of_a_new_process(call, folder, tmp_pa
         assert f"mine/{name} was changed while this process runs" in refused.err
         monkeypatch.setattr(provenance, "_first", {})  # as a new process
         assert call("run", "method=mine", *SMALL).status == 0
-        assert len(keys(tmp_path)) == number
+        assert len([*tmp_path.glob("outputs/runs/*/record.json")]) == number
 
 
 THERE = "There are: diver, external, gaussians, kilonerf, mine, nerf, nerfbaselines, nerfstudio"
