@@ -23,10 +23,10 @@ from bench.types import Camera
 FLOAT32 = torch.finfo(torch.float32).eps
 
 
-def camera_at(eye: tuple[float, float, float], device: str = "cpu") -> Camera:
+def camera_at(eye: tuple[float, float, float]) -> Camera:
     """52 x 36 pixels, off-centre, looking at the middle of the unit cube."""
     up = torch.tensor((0.1, 0.2, 1.0))
-    c2w = look_at(torch.tensor(eye), torch.full((3,), 0.5), up).to(device)
+    c2w = look_at(torch.tensor(eye), torch.full((3,), 0.5), up)
     return Camera(c2w, fx=60.0, fy=55.0, cx=27.5, cy=16.25, width=52, height=36)
 
 

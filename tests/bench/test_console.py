@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
+from types import SimpleNamespace
 
 import pytest
 
@@ -11,18 +12,10 @@ from bench.console import ConsoleLog
 from bench.types import SteerbenchError
 
 
-class Clock:
-    """A clock that a test sets."""
-
-    now = 1000.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
 @pytest.fixture
-def clock() -> Clock:
-    return Clock()
+def clock() -> SimpleNamespace:
+    """The time `now`, which a test sets."""
+    return SimpleNamespace(now=1000.0)
 
 
 @pytest.fixture
@@ -30,7 +23,7 @@ def plain(monkeypatch, tmp_path, clock) -> ConsoleLog:
     """A log without a terminal."""
     for variable in ("FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
         monkeypatch.delenv(variable, raising=False)
-    return ConsoleLog(tmp_path, clock=clock)
+    return ConsoleLog(tmp_path, clock=lambda: clock.now)
 
 
 def test_messages_go_to_standard_error_as_they_are(plain, capsys):
@@ -65,7 +58,7 @@ def test_work_that_fails_or_is_short_is_not_called_done_and_the_next_is(plain, c
 
 
 def test_a_quiet_log_says_nothing(tmp_path, clock, capsys):
-    log = ConsoleLog(tmp_path, quiet=True, clock=clock)
+    log = ConsoleLog(tmp_path, quiet=True, clock=lambda: clock.now)
     log.info("hello")
     with log.progress("training", 10) as bar:
         clock.now += 60.0
@@ -79,7 +72,7 @@ def test_on_a_terminal_nested_bars_show_how_far_it_is_without_a_thread(
     kind = {"TTY_COMPATIBLE": "1", "TTY_INTERACTIVE": "1", "TERM": "xterm", "COLUMNS": "120"}
     for variable, value in kind.items():
         monkeypatch.setenv(variable, value)
-    terminal = ConsoleLog(tmp_path, clock=clock)
+    terminal = ConsoleLog(tmp_path, clock=lambda: clock.now)
     before = threading.active_count()
     with terminal.progress("outer [1]", 2) as outer:
         assert threading.active_count() == before

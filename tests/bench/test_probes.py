@@ -40,7 +40,6 @@ def test_own_times_of_nested_and_repeated_stages_are_kept_apart():
         "field/encode": 107 - 103,
         "other": (101 - 100) + (131 - 115) + (227 - 163),
     }
-    assert frame.total_ns == 227 - 100
 
 
 STAGES = st.recursive(
@@ -145,17 +144,11 @@ SIZE = 64 << 20
 SLACK = 8 << 20  # the kernel adds up resident pages in batches for every core
 
 
-def touch(size: int) -> None:
-    """Write to `size` bytes fresh from the system: an allocator may have some left to give."""
-    with mmap.mmap(-1, size) as region:
-        for page in range(0, size, mmap.PAGESIZE):
-            region[page] = 1
-
-
 def test_the_peak_of_a_region_is_what_it_touches_and_the_highest_of_several_is_kept():
     meter, idle = MemoryMeter("cpu"), MemoryMeter("cpu")
-    with meter:
-        touch(SIZE)
+    with meter, mmap.mmap(-1, SIZE) as fresh:  # an allocator may have some bytes left to give
+        for page in range(0, SIZE, mmap.PAGESIZE):
+            fresh[page] = 1
     first = meter.peak_bytes
     with idle:  # it knows nothing of what was freed before
         pass

@@ -127,24 +127,16 @@ def test_a_cut_a_frame_without_truth_or_of_another_size_leaves_no_pair(tiny_scen
     assert not any("flicker" in figures for figures in found)
 
 
-def test_the_last_of_so_many_frames_is_scored_with_lpips():
+def test_the_last_of_so_many_frames_is_scored_with_lpips_and_too_few_frames_say_so():
     protocol = EvaluationProtocol(name="some", lpips=("alex",), lpips_every=2)
     scoring = Scoring(protocol, {"alex": lambda *_: 0.5}, WHITE, shown=())
     picture = torch.zeros(16, 16, 3)
-    found = []
+    found, said = [], []
     for index in range(8):  # each second one has no truth
         scored = index % 2 == 0
         scores = scoring.score(index, picture, picture.byte(), scored=scored, cut=False)
         found += [scores["lpips_alex"]] if scored else []
+        said.append(scoring.missing([]).get("lpips_alex"))
     assert found == [pytest.approx(value, nan_ok=True) for value in (math.nan, 0.5, math.nan, 0.5)]
-
-
-def test_a_path_with_too_few_frames_for_lpips_says_so():
-    protocol = EvaluationProtocol(name="some", lpips=("alex",), lpips_every=2)
-    scoring = Scoring(protocol, {"alex": lambda *_: 0.5}, WHITE, shown=())
-    picture = torch.zeros(16, 16, 3)
-    scoring.score(0, picture, picture.byte(), cut=False)
-    expected = "protocol.lpips_every is 2, and the path has 1 frames to score"
-    assert scoring.missing([]) == {"lpips_alex": expected}
-    scoring.score(1, picture, picture.byte(), cut=False)
-    assert scoring.missing([]) == {}
+    few = "protocol.lpips_every is 2, and the path has 1 frames to score"
+    assert said == [few, few, *[None] * 6]

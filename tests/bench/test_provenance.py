@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import json
 import shutil
 import subprocess
 from importlib import metadata
@@ -23,44 +22,33 @@ commit = provenance.commit.__wrapped__
 MACHINE = provenance.machine()
 
 
-@pytest.fixture
-def checkout(monkeypatch, tmp_path) -> Path:
-    """A copy of the project with one file in each package."""
-    for package in ("bench", "methods", "sweeps"):
-        (tmp_path / package).mkdir()
-        (tmp_path / package / "a.py").write_text("A = 1\n")
-    monkeypatch.setattr(provenance, "ROOT", tmp_path)
-    monkeypatch.setattr(provenance, "__file__", str(tmp_path / "bench" / "a.py"))
-    return tmp_path
-
-
 def git(folder: Path, *arguments: str) -> str:
     identity = ("-c", "user.name=test", "-c", "user.email=test@example.org")
     command = ["git", "-C", str(folder), *identity, *arguments]
     return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
 
-def test_a_checkout_names_its_commit_and_whether_it_was_changed(checkout):
-    git(checkout, "init", "-q")
-    git(checkout, "add", ".")
-    git(checkout, "commit", "-q", "-m", "first")
-    head = git(checkout, "rev-parse", "--short=12", "HEAD")
+def test_a_checkout_names_its_commit_and_whether_it_was_changed(tree):
+    git(tree, "init", "-q")
+    git(tree, "add", ".")
+    git(tree, "commit", "-q", "-m", "first")
+    head = git(tree, "rev-parse", "--short=12", "HEAD")
     assert commit() == head
-    (checkout / "methods" / "a.py").write_text("A = 2\n")
+    (tree / "methods/fields/cpu.py").write_text("A = 2\n")
     assert commit() == f"{head}-dirty"
 
 
-def test_without_git_or_in_another_repository_the_version_is_named(checkout, monkeypatch):
-    git(checkout, "init", "-q")
-    git(checkout, "add", "sweeps")
-    git(checkout, "commit", "-q", "-m", "a project that has steerbench in its .venv")
+def test_without_git_or_in_another_repository_the_version_is_named(tree, monkeypatch):
+    git(tree, "init", "-q")
+    git(tree, "add", "methods")
+    git(tree, "commit", "-q", "-m", "a project that has steerbench in its .venv")
     assert commit() == metadata.version("steerbench")
     monkeypatch.setenv("PATH", "")
     assert commit() == metadata.version("steerbench")
 
 
-def test_the_machine_record_is_json_and_names_what_matters():
-    record = json.loads(json.dumps(provenance.machine()))
+def test_the_machine_record_names_what_matters():
+    record = provenance.machine()
     assert record["cuda"] == torch.version.cuda
     assert record["threads"] == torch.get_num_threads()
     assert record["cores"] >= 1
@@ -121,6 +109,7 @@ def tree(tmp_path, monkeypatch) -> Path:
     """A small project: a method in a module that imports a package of fields."""
     write(tmp_path / "here", FILES)
     monkeypatch.setattr(provenance, "ROOT", tmp_path / "here")
+    monkeypatch.setattr(provenance, "__file__", str(tmp_path / "here/bench/ruler.py"))
     return tmp_path / "here"
 
 
@@ -141,16 +130,15 @@ def test_a_file_that_is_changed_while_a_process_runs_ends_it(tree):
         ("methods/alone/learned.safetensors", True),
         ("methods/fields/__init__.py", True),
         ("methods/fields/cpu.py", True),
+        ("methods/fields/gpu.py", True),  # a new file beside an imported package
         ("methods/fields/inner/weights.safetensors", True),
         ("bench/ruler.py", True),
         ("bench/unused.py", False),
-        ("bench/notes.txt", False),
         ("methods/__init__.py", False),
         ("methods/alone/beside.py", False),
         ("methods/fields/cases.py", False),
         ("methods/fields/experiments.py", False),
         ("methods/fields/__pycache__/cpu.pyc", False),
-        ("sweeps/other.py", False),
     ],
 )
 def test_what_a_thing_stands_on_changes_its_digest_and_nothing_else(tree, name, counts):
@@ -160,13 +148,10 @@ def test_what_a_thing_stands_on_changes_its_digest_and_nothing_else(tree, name, 
     assert (digest(METHOD) != before) == counts
 
 
-def test_a_new_file_beside_an_imported_package_counts_and_so_does_a_new_name(tree):
-    digests = [digest(METHOD)]
-    write(tree, {"methods/fields/gpu.py": "A = 1\n"})
-    digests.append(digest(METHOD))
-    (tree / "methods/fields/gpu.py").rename(tree / "methods/fields/cuda.py")
-    digests.append(digest(METHOD))
-    assert len(set(digests)) == 3
+def test_the_name_of_a_file_counts(tree):
+    before = digest(METHOD)
+    (tree / "methods/fields/cpu.py").rename(tree / "methods/fields/cuda.py")
+    assert digest(METHOD) != before
 
 
 def test_the_digest_depends_neither_on_where_the_project_lies_nor_on_an_order(tree, monkeypatch):

@@ -173,10 +173,7 @@ def test_a_loop_goes_there_and_back_until_its_frames_are_used_up():
     for step, place in zip(path.steps, (0, 1, 2, 3, 4, 3, 2, 1, 0, 1, 2), strict=True):
         assert step.truth == there[place].truth
         assert torch.equal(step.camera.c2w, there[place].camera.c2w)
-    assert [step.truth for step in path.steps[::8]] == [0, 0]
     assert not any(step.cut for step in path.steps)
-    turns = [turn_deg(a.camera, b.camera) for a, b in pairwise(path.steps)]
-    assert turns == pytest.approx([1.0] * 10, abs=1e-3)
     assert path.name == "test-loop11-1deg"
     scene = orbit_of([0, 1, 2])
     assert [step.truth for step in loop(scene, frames=5, limit=2).steps] == [0, 1, 0, 1, 0]
@@ -216,19 +213,14 @@ def test_each_camera_is_approached_once_after_a_cut_from_a_motion_of_its_own(tin
     assert first.name == again.name != other.name
 
 
-POSE = torch.tensor([[1.0, 0, 0, 0.5], [0, -1, 0, 0.25], [0, 0, -1, 2.0]])
-
-
 @pytest.fixture
-def scene() -> Scene:
+def scene(tiny_scene) -> Scene:
     """Four data set units to a scene unit, the corner of the cube at (-1, -2, 0)."""
-    camera = Camera(POSE, 40.0, 40.0, 16.0, 12.0, 32, 24)
-    image = torch.zeros(24, 32, 3, dtype=torch.uint8)
-    split = Split([camera], [image], ["0"])
-    bounds = torch.tensor([[0.0, 0, 0], [1, 1, 1]])
+    pose = torch.tensor([[1.0, 0, 0, 0.5], [0, -1, 0, 0.25], [0, 0, -1, 2.0]])
+    camera = Camera(pose, 40.0, 40.0, 16.0, 12.0, 32, 24)
+    split = Split([camera], [torch.zeros(24, 32, 3, dtype=torch.uint8)], ["0"])
     origin = torch.tensor([-1.0, -2.0, 0.0])
-    splits = {"train": split, "test": split}
-    return Scene("cube", splits, torch.ones(3), bounds, 4.0, "cube", origin)
+    return replace(tiny_scene, splits={"test": split}, unit_length=4.0, origin=origin)
 
 
 def keyframe(**others: Any) -> dict[str, Any]:
@@ -236,9 +228,9 @@ def keyframe(**others: Any) -> dict[str, Any]:
     return {"camera_to_world": flat, "fov": 90.0} | others
 
 
-def stored(folder: Path, record: Any, name: str = "path.json") -> str:
-    (folder / name).write_text(json.dumps(record))
-    return str(folder / name)
+def stored(folder: Path, record: Any) -> str:
+    (folder / "path.json").write_text(json.dumps(record))
+    return str(folder / "path.json")
 
 
 def viewer(*keyframes: dict[str, Any]) -> dict[str, Any]:
@@ -350,23 +342,19 @@ def ring(degrees: list[float]) -> list[Camera]:
     return list(orbit_of(degrees).splits["test"].cameras)
 
 
-def test_a_spline_goes_through_its_keys_in_even_steps():
+def test_a_spline_goes_through_its_keys_in_even_steps_without_corners():
     keys = ring([0, 30, 50, 90])
-    pieces = leading(keys, TARGET, degrees=2.0)
+    pieces = leading(keys, TARGET, degrees=1.0)
     assert [piece[-1] for piece in pieces] == keys[1:]
     for first, piece in zip(keys, pieces, strict=False):
         turns = [turn_deg(*pair) for pair in pairwise([first, *piece])]
-        assert max(turns) <= 2.0 + 1e-2  # float32 poses
+        assert max(turns) <= 1.0 + 1e-2  # float32 poses
         assert min(turns) > 0.9 * max(turns)
-
-
-def test_a_spline_has_no_corners():
-    keys = ring([0, 30, 60, 90, 120])
-    path = [keys[0], *chain(*leading(keys, TARGET, degrees=1.0))]
+    path = [keys[0], *chain(*pieces)]
     steps = torch.stack([camera.c2w[:, 3].double() for camera in path]).diff(dim=0)
     ways = torch.nn.functional.normalize(steps, dim=1)
     bends = (ways[1:] * ways[:-1]).sum(dim=1).clamp(max=1).acos().rad2deg()
-    assert bends.max() < 2.0  # a circle bends by 1 degree a step, a chord's end by 30
+    assert bends.max() < 2.0  # a circle bends by 1 degree a step, a chord's end by 25 or more
 
 
 def test_a_camera_that_only_moves_is_led_in_steps_seen_from_the_target():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import math
 import subprocess
 import sys
@@ -111,14 +110,7 @@ def test_a_display_that_nobody_sells_is_refused():
 def test_a_package_that_is_missing_is_named_before_anything_is_measured(
     monkeypatch, column, package, extra
 ):
-    usual = builtins.__import__
-
-    def without(name, *args, **kwargs):
-        if name == package:
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-        return usual(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, package, None)
     protocol = EvaluationProtocol(name="mine", columns=(column,), lpips=())
     with pytest.raises(Unavailable, match=rf"{column} needs {package}: pip install .*\[{extra}\]"):
         protocol.load_lpips(None, None)

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from bench.cameras import look_at
-from bench.metrics import as_bytes
 from bench.types import Camera, Frame, Probe
 from bench.viewing import COARSE, FLUENT_MS, Ask, Painter, Turns, difference, divided, seen_from
 
@@ -103,7 +102,6 @@ def test_a_divided_picture_has_one_method_on_either_side_and_a_difference_shows_
     shown = difference(left, both)
     torch.testing.assert_close(shown[:, 4:], torch.full((4, 6, 3), 0.4))
     assert (shown[:, :2] == 0).all()
-    assert as_bytes(shown).dtype == np.uint8
 
 
 def test_the_camera_of_a_browser_is_the_pinhole_camera_of_its_pose() -> None:

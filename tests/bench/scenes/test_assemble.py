@@ -27,9 +27,7 @@ def with_training(scene: Scene, count: int) -> Scene:
     return replace(scene, splits={**scene.splits, "train": train})
 
 
-@pytest.mark.parametrize(
-    ("count", "held"), [(8, ["4"]), (13, ["4", "12"]), (24, ["4", "12", "20"])]
-)
+@pytest.mark.parametrize(("count", "held"), [(8, ["4"]), (13, ["4", "12"])])
 def test_each_training_picture_is_either_learned_from_or_held_out(tiny_scene, count, held):
     scene = with_training(tiny_scene, count)
     found = hold_out(scene, "validation", 8)

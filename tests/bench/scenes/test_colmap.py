@@ -48,9 +48,8 @@ def folder(tmp_path: Path) -> Callable[..., Path]:
     return make
 
 
-@pytest.mark.parametrize("kind", ["binary", "text"])
-def test_cameras_see_the_points_where_colmap_does(folder, log, kind) -> None:
-    root = folder(kind=kind)
+def test_cameras_see_the_points_where_colmap_does(folder, log) -> None:
+    root = folder()
     scene = colmap.load(root, log=log)
     found = pycolmap.Reconstruction(root / "sparse" / "0")
     assert list(scene.splits["test"].names) == ["000.png", "008.png"]

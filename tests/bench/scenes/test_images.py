@@ -23,7 +23,7 @@ from bench.scenes.images import (
     shrunk_camera,
 )
 from bench.types import Camera, SteerbenchError
-from tests.bench.scenes.conftest import encoded
+from tests.bench.scenes.conftest import encoded, picture
 
 HERE = Path("picture.png")
 
@@ -39,9 +39,7 @@ def half_up(value: Fraction) -> int:
 
 @pytest.mark.parametrize("factor", [2, 3, 5])
 def test_shrink_is_the_exact_mean_weighted_by_alpha(factor) -> None:
-    image = torch.randint(
-        256, (11, 17, 4), dtype=torch.uint8, generator=torch.Generator().manual_seed(factor)
-    )
+    image = torch.from_numpy(picture(factor, 17, 11))
     image[:factor, :factor, 3] = 0  # a block that nothing is seen in
     small = shrink(image, factor)
     assert small.shape == (11 // factor, 17 // factor, 4)
@@ -98,11 +96,9 @@ def test_a_header_that_announces_more_than_memory_holds_is_refused(tmp_path: Pat
 @pytest.fixture
 def files(tmp_path: Path) -> list[Path]:
     """Four pictures of 5 x 4 in files."""
-    generator = torch.Generator().manual_seed(0)
     paths = [tmp_path / f"{number}.png" for number in range(4)]
-    for path in paths:
-        pixels = torch.randint(256, (4, 5, 4), dtype=torch.uint8, generator=generator)
-        Image.fromarray(pixels.numpy()).save(path)
+    for number, path in enumerate(paths):
+        Image.fromarray(picture(number, 5, 4)).save(path)
     return paths
 
 

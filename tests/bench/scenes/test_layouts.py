@@ -20,12 +20,10 @@ from bench.scenes.layouts import LAYOUTS, POINTS, export
 from bench.trajectories import Trajectory, follow, orbit, smooth
 from bench.types import Camera, Scene, SteerbenchError, composite
 
-SIZE = {"width": 24, "train": 3, "test": 3}
-
 
 @pytest.fixture
 def scene(tmp_path, quiet_log) -> Scene:
-    return analytic.load("totem", **SIZE, root=tmp_path / "scenes", log=quiet_log)
+    return analytic.load("totem", width=24, train=3, test=3, root=tmp_path / "all", log=quiet_log)
 
 
 @pytest.fixture

@@ -15,8 +15,6 @@ from bench.types import SteerbenchError
 from tests.bench.scenes.conftest import picture
 
 MATRIX = "9 0 4.5 0\n0 8 2.5 0\n0 0 1 0\n0 0 0 1\n"
-NAMES = ("0_000", "0_001", "1_002", "2_003")
-FIRST_LINE = "9. 4.5 2.5 0.\n0. 0. 0.\n0.\n1.\n6 8\n"
 
 
 @pytest.fixture
@@ -27,7 +25,7 @@ def folder(tmp_path: Path) -> Path:
     (root / "pose").mkdir()
     (root / "bbox.txt").write_text("-1 -2 -1 1 2 1 0.4\n")
     (root / "intrinsics.txt").write_text(MATRIX)
-    for k, name in enumerate(NAMES):
+    for k, name in enumerate(("0_000", "0_001", "1_002", "2_003")):
         Image.fromarray(picture(k, channels=3)).save(root / "rgb" / f"{name}.png")
         pose = np.eye(4)
         pose[:3, 3] = (k, 0, -5)
@@ -71,7 +69,7 @@ def test_boxes_that_are_too_small_are_enlarged_further(folder, log, name, furthe
     [
         (MATRIX, (9, 8, 4.5, 2.5)),
         ("9 0 4.5\n0 8 2.5\n0 0 1\n", (9, 8, 4.5, 2.5)),
-        (FIRST_LINE, (9, 9, 4.5, 2.5)),
+        ("9. 4.5 2.5 0.\n0. 0. 0.\n0.\n1.\n6 8\n", (9, 9, 4.5, 2.5)),
     ],
 )
 def test_every_form_of_intrinsics(folder, log, text, expected) -> None:

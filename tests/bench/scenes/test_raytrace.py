@@ -26,8 +26,6 @@ from bench.types import EMPTY_ALPHA, Camera, SteerbenchError
 from tests.bench.scenes.conftest import camera_at
 
 RED = plain((1.0, 0.0, 0.0))
-CELL = math.sqrt(2) / 4
-"""Diagonal of the quarter-pixel cell that each of 16 samples stands for."""
 
 
 def sphere(radius: float, centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Part:
@@ -66,8 +64,9 @@ def test_silhouettes_of_a_sphere_and_a_thin_wire_have_their_closed_form_areas() 
     camera = camera_at((0.0, -4.0, 0.0))
     alpha = render(Solids([sphere(0.8)]), camera, torch.ones(3), samples=16).alpha
     radius = camera.fx * math.tan(math.asin(0.8 / 4))
-    # Only cells that the outline crosses can be counted wrongly, half of them either way.
-    assert abs(alpha.sum().item() - math.pi * radius**2) <= 2 * math.pi * radius * CELL
+    # Only quarter-pixel cells that the outline crosses can be counted wrongly, half either way.
+    diagonal = math.sqrt(2) / 4
+    assert abs(alpha.sum().item() - math.pi * radius**2) <= 2 * math.pi * radius * diagonal
     camera = camera_at((0.0, -4.0, 0.0), size=400)
     alpha = render(Solids([Part(Capsule(0.006, 1.0), RED)]), camera, torch.ones(3), 16).alpha
     width = 2 * camera.fx * math.tan(math.asin(0.006 / 4))
@@ -97,20 +96,17 @@ def test_depth_is_finite_exactly_where_there_is_opacity() -> None:
     assert ((frame.rgb >= 0) & (frame.rgb <= 1 + 1e-6)).all()
 
 
-class EverywhereBoxes(ProjectedBoxes):
-    """Knows nothing about where parts are."""
-
-    def spans(self, top: int, bottom: int) -> list[tuple[int, int, int]]:
-        return [(part, 0, self.width) for part in range(len(self.in_front))]
-
-
 @pytest.mark.parametrize("model", [totem, wires, mill])
 @pytest.mark.parametrize("eye", [(1.0, -3.5, 1.5), (0.3, 0.2, 0.3), (0.0, 0.1, 4.0)])
 def test_culling_by_boxes_changes_nothing(monkeypatch, model, eye) -> None:
     camera = camera_at(eye, size=24)
     monkeypatch.setattr(raytrace, "BAND_RAYS", 24 * 4 * 5)  # bands of five rows, the last of four
     culled = render(model(), camera, torch.ones(3), 4)
-    monkeypatch.setattr(raytrace, "ProjectedBoxes", EverywhereBoxes)
+
+    def everywhere(boxes: ProjectedBoxes, top: int, bottom: int) -> list[tuple[int, int, int]]:
+        return [(part, 0, boxes.width) for part in range(len(boxes.in_front))]
+
+    monkeypatch.setattr(ProjectedBoxes, "spans", everywhere)
     whole = render(model(), camera, torch.ones(3), 4)
     # Only rounding may differ, and it can turn a sample that grazes an edge.
     differing = ((culled.rgb - whole.rgb).abs().amax(-1) > 1e-4).sum()
