@@ -49,7 +49,7 @@ def observe(
     matter. Points of the surface have an opacity, too.
     """
     frame, fine, generator = _frame(height, width, channels, scale, matter, seed)
-    cells = cells_with(frame.alpha)
+    cells = cells_near(frame.alpha > 0).flatten().nonzero().squeeze(1)
     valid = torch.rand(height, width, scale**2, generator=generator) < 0.66
     valid = (valid & (frame.alpha > 0)[..., None]).float()
     picture = torch.rand(height, width, scale**2, 3, generator=generator) * valid[..., None]
@@ -99,11 +99,6 @@ def _scattered(fine: Tensor, share: float, features: int, generator: torch.Gener
     index = torch.randint(POINTS, fine.shape, generator=generator, dtype=torch.int32)
     shown = fine & (torch.rand(fine.shape, generator=generator) < share)
     return Points(points, torch.where(shown, index, -1))
-
-
-def cells_with(alpha: Tensor) -> Tensor:
-    """The cells near matter, where `alpha` [h, w] is more than 0."""
-    return cells_near(alpha > 0).flatten().nonzero().squeeze(1)
 
 
 def to_blocks(picture: Tensor, scale: int) -> Tensor:

@@ -46,7 +46,8 @@ def test_it_holds(case: Case, cell: Cell, device: str) -> None:
 @pytest.fixture
 def blocks_of_a_gpu() -> Iterator[None]:
     """The march has larger blocks where it is interpreted; no other kernel has."""
-    sized = [name for name in kernels("gpu") if "interpreted()" in source(f"{name}.gpu")]
+    written = {x: inspect.getsource(importlib.import_module(f"{x}.gpu")) for x in kernels("gpu")}
+    sized = [name for name, source in written.items() if "interpreted()" in source]
     assert sized == ["methods.kernels.march"]
     module = importlib.import_module("methods.kernels.march.gpu")
     with pytest.MonkeyPatch.context() as patch:
@@ -54,10 +55,6 @@ def blocks_of_a_gpu() -> Iterator[None]:
         importlib.reload(module)
     yield
     importlib.reload(module)
-
-
-def source(module: str) -> str:
-    return inspect.getsource(importlib.import_module(module))
 
 
 @pytest.mark.slow

@@ -7,20 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bench.types import Budget, Log, Scene
-from methods.diver.method import Diver
+from bench.types import Log, Scene
 from methods.instant_ngp.stage1 import TrainedField
 from methods.students.voxels import corners_of
-from tests.methods.small_students import SMALL
+from tests.methods.small_students import SMALL, fitted
 from tests.methods.trainings import GRID, TAUGHT, TEACHER, quality
 
 new = SMALL["diver"]
-
-
-def fitted(scene: Scene, log: Log, budget: Budget = TAUGHT, **options) -> Diver:
-    method = new(**options)
-    method.fit(scene, budget, log)
-    return method
 
 
 def test_it_begins_with_the_encoding_of_the_teacher(
@@ -64,7 +57,9 @@ def test_pruning_leaves_what_shows(ball_scene: Scene, teacher: TrainedField) -> 
 
 
 def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, shared_log: Log) -> None:
-    half, single = (fitted(ball_scene, shared_log, stored=kind) for kind in ("bf16", "fp32"))
+    half, single = (
+        fitted("diver", ball_scene, shared_log, 40, stored=kind) for kind in ("bf16", "fp32")
+    )
     corners = len(corners_of(half.baked.corners.voxels.coordinates)[1])
     merged = 32 * 32 + 32 + 32 + 1 + 32 * 32 + 32 * 27 + 32 + 3 * 32 + 3
     assert half.sizes() == {"corners": corners * 64, "voxels": 32**3 // 8, "decoder": 4 * merged}
@@ -79,4 +74,4 @@ def test_a_teacher_with_more_features_than_a_corner_is_refused(
 ) -> None:
     setup = replace(TEACHER, grid=replace(GRID, levels=17))
     with pytest.raises(ValueError, match="expected at most the 32 channels of a corner"):
-        fitted(ball_scene, shared_log, replace(TAUGHT, steps=1), teacher=setup)
+        new(teacher=setup).fit(ball_scene, replace(TAUGHT, steps=1), shared_log)

@@ -140,7 +140,6 @@ def test_rows_say_what_openvino_computes_beside_int8(
         "methods.engines.openvino_engine._capabilities", lambda openvino: capabilities
     )
     assert OpenVino("int8").computed(CPU) == f"int8+{rest}"
-    assert OpenVino("int8", "none").computed(CPU) == f"int8 uncalibrated+{rest}"
 
 
 @pytest.mark.parametrize(("products", "computed"), [(True, "bf16"), (False, "bf16 in fp32")])

@@ -15,7 +15,7 @@ from bench.probes import StageClock
 from bench.scenes import blender
 from bench.scenes.assemble import hold_out
 from bench.study import Variant
-from bench.types import Budget, NullProbe, Scene, SteerbenchError
+from bench.types import Budget, NullProbe, SteerbenchError
 from methods.gaussians import ply
 from methods.instant_ngp.method import InstantNgp
 from tests.methods.external.conftest import ROOT
@@ -23,12 +23,6 @@ from tests.methods.gaussians.test_ply import some
 from tests.methods.trainings import GRID, QUICK
 
 BUDGET = Budget("test", steps=7, samples=9)
-
-
-@pytest.fixture
-def moved_scene(tiny_scene: Scene) -> Scene:
-    """The unit cube is [-1.5, 1.5]^3 of the data set."""
-    return replace(tiny_scene, origin=torch.full((3,), -1.5))
 
 
 STORES = """
@@ -232,16 +226,13 @@ def test_a_setting_that_is_wrong_is_named(wrong, said, worker, external, tiny_sc
 def test_a_training_that_failed_leaves_nothing_to_load(
     worker, external, tiny_scene, quiet_log, tmp_path
 ):
-    lines = (
-        STORES
-        + """
+    fails = """
         def fit(self, job):
             (job.state / "half").write_text("of it")
             raise ValueError("too bad")
     """
-    )
     with pytest.raises(SteerbenchError, match="ValueError: too bad"):
-        external(worker(lines, after="serve(Stores)\n")).fit(tiny_scene, BUDGET, quiet_log)
+        external(worker(STORES + fails, after="serve(Stores)\n")).fit(tiny_scene, BUDGET, quiet_log)
     assert [path.name for path in tmp_path.glob("outputs/stages/external-*/*")] == ["lock"]
 
 

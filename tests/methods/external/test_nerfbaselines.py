@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 
@@ -59,21 +57,21 @@ register({"id": "mean", "method_class": "mean_method:Mean"})
 
 @pytest.mark.slow
 def test_a_registered_method_trains_renders_and_is_loaded(
-    nerfbaselines, external, tiny_scene: Scene, quiet_log, tmp_path, monkeypatch
+    nerfbaselines, external, moved_scene: Scene, quiet_log, tmp_path, monkeypatch
 ):
     (tmp_path / "mean_method.py").write_text(METHOD)
     (tmp_path / "mean_spec.py").write_text(SPEC)
     monkeypatch.setenv("NERFBASELINES_REGISTER", str(tmp_path / "mean_spec.py"))
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    scene = replace(tiny_scene, origin=torch.full((3,), -1.5))
-    train = [composite(image, scene.background) for image in scene.splits["train"].images]
+    given, background = moved_scene.splits["train"].images, moved_scene.background
+    train = [composite(picture, background) for picture in given]
     expected = torch.stack(train).mean(dim=(0, 1, 2))
     pictures, seconds = [], []
     for _ in range(2):
         options = {"id": "mean", "overrides": {"steps": 5}, "weights": "*.npy"}
         method = external("nerfbaselines", python=nerfbaselines, options=options)
-        method.fit(scene, Budget("test", steps=1, samples=1), quiet_log)
-        pictures.append(method.render(scene.splits["test"].cameras[0], NullProbe()).rgb)
+        method.fit(moved_scene, Budget("test", steps=1, samples=1), quiet_log)
+        pictures.append(method.render(moved_scene.splits["test"].cameras[0], NullProbe()).rgb)
         seconds.append(method.train_s)
         assert (method.name, method.sizes()) == ("mean", {"model": 128 + 3 * 8})
     torch.testing.assert_close(pictures[0][0, 0], expected, rtol=0, atol=1e-6)

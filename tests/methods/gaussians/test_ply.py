@@ -120,20 +120,16 @@ def test_bad_vertices_are_refused(
         ply.read(path, tiny_scene)
 
 
-def test_bad_files_are_refused(tiny_scene: Scene, tmp_path: Path) -> None:
+def test_a_missing_or_damaged_file_and_one_of_another_place_are_refused(
+    tiny_scene: Scene, tmp_path: Path
+) -> None:
     path = tmp_path / "a.ply"
     with pytest.raises(SteerbenchError, match="there is none"):
         ply.read(path, tiny_scene)
     ply.write(some(), tiny_scene, path)
+    with pytest.raises(SteerbenchError, match="none of 50 Gaussians lies inside the scene"):
+        ply.read(path, replace(tiny_scene, origin=torch.full((3,), 100.0)))
     for content in (path.read_bytes()[:-100], b"\x89PNG\r\n\x1a\n"):
         path.write_bytes(content)
         with pytest.raises(SteerbenchError, match="could not read one"):
             ply.read(path, tiny_scene)
-
-
-def test_gaussians_of_another_place_are_refused(tiny_scene: Scene, tmp_path: Path) -> None:
-    path = tmp_path / "a.ply"
-    ply.write(some(), tiny_scene, path)
-    elsewhere = replace(tiny_scene, origin=torch.full((3,), 100.0))
-    with pytest.raises(SteerbenchError, match="none of 50 Gaussians lies inside the scene"):
-        ply.read(path, elsewhere)

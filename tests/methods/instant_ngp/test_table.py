@@ -7,7 +7,7 @@ import torch
 
 from bench.types import Budget, Log, Scene, Split
 from methods.instant_ngp.method import InstantNgp
-from methods.instant_ngp.table import LONG, SHORT, SuitedGrid, detail, hash_grid
+from methods.instant_ngp.table import LONG, SHORT, detail, hash_grid
 from methods.kernels.encode import HashGrid
 from tests.methods.trainings import QUICK
 
@@ -31,14 +31,6 @@ def test_detail_is_counted_where_colours_change_on_matter():
     assert detail(split_of(picture)) == 0
 
 
-def test_colours_behind_transparent_pixels_do_not_count():
-    noise = torch.randint(256, (16, 16, 4), generator=torch.Generator().manual_seed(0))
-    noise = noise.to(torch.uint8)
-    noise[..., 3] = 0
-    assert detail(split_of(noise)) == 0
-    assert detail(split_of(noise[..., :3])) > 200
-
-
 def test_detail_is_a_mean_over_pictures_from_all_over_the_path():
     plain = torch.zeros(9, 9, 3, dtype=torch.uint8)
     dotted = plain.clone()
@@ -49,7 +41,6 @@ def test_detail_is_a_mean_over_pictures_from_all_over_the_path():
 
 def test_a_length_that_is_given_is_kept():
     assert hash_grid(log2_table=12, **SHAPE) == HashGrid(log2_table=12, **SHAPE)
-    assert not isinstance(hash_grid(log2_table=12, **SHAPE), SuitedGrid)
 
 
 @pytest.mark.parametrize(("fine", "expected"), [(10**6, SHORT), (0, LONG)])

@@ -216,12 +216,11 @@ def test_a_checkpoint_that_cannot_be_written_says_so(tmp_path: Path) -> None:
 def test_pictures_without_alpha_are_trained_on_as_they_are(ball_scene: Scene) -> None:
     split = ball_scene.splits["train"]
     opaque = replace(split, images=[image[..., :3] for image in split.images])
-    scene = replace(ball_scene, splits={"train": opaque, "test": opaque})
-    training = new_training(scene)
+    training = new_training(replace(ball_scene, splits={"train": opaque}))
     colours = torch.rand(9, 3)
     target, background = training._target(colours)
     assert torch.equal(target, colours)
-    assert torch.equal(background, scene.background)
+    assert torch.equal(background, ball_scene.background)
 
 
 def test_a_random_background_is_one_colour_for_a_ray_and_its_truth(ball_scene: Scene) -> None:

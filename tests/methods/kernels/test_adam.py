@@ -12,10 +12,7 @@ BACKENDS = ["reference", "cpu"]
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("share", [0.5, 1.0])
-def test_an_entry_makes_the_steps_of_adam_at_which_it_has_a_gradient(
-    share: float, backend: str
-) -> None:
+def test_an_entry_makes_the_steps_of_adam_at_which_it_has_a_gradient(backend: str) -> None:
     """As if it were alone, whatever the others do; torch leaves out what has no gradient."""
     generator = torch.Generator().manual_seed(0)
     table = torch.randn(50, 2, generator=generator)
@@ -24,7 +21,7 @@ def test_an_entry_makes_the_steps_of_adam_at_which_it_has_a_gradient(
     state = AdamState.like(table)
     for step in range(20):
         grad = torch.randn(50, 2, generator=generator)
-        grad[torch.rand(50, generator=generator) >= share] = 0
+        grad[torch.rand(50, generator=generator) >= 0.5] = 0
         grad[:5, 1] *= step % 2  # where it is 0, the moments of the feature go on
         for entry, own in zip(entries, grad, strict=True):
             entry.grad = own.clone() if own.any() else None

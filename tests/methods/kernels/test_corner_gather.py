@@ -16,15 +16,11 @@ DIRECTIONS = torch.nn.functional.normalize(torch.randn(4, 3, generator=RANDOM), 
 
 
 def test_weights_have_a_gradient_by_the_reference_only() -> None:
-    generator = torch.Generator().manual_seed(0)
-    table = torch.rand(8, 3, generator=generator)
-    corners = torch.arange(8, dtype=torch.int32)[None]
-    voxel = torch.zeros(1, dtype=torch.int32)
-    weights = torch.full((1, 8), 0.125, requires_grad=True)
-    corner_gather(table, corners, voxel, weights, backend="reference").sum().backward()
-    torch.testing.assert_close(weights.grad, table.sum(dim=1)[None])
+    table, weights = torch.arange(80.0).view(20, 4), WEIGHTS.clone().requires_grad_()
+    corner_gather(table, CORNERS, VOXEL, weights, backend="reference").sum().backward()
+    torch.testing.assert_close(weights.grad, table.sum(dim=1)[CORNERS.long()][VOXEL.long()])
     with pytest.raises(ValueError, match="no gradient for weights"):
-        corner_gather(table, corners, voxel, weights, backend="cpu")
+        corner_gather(table, CORNERS, VOXEL, weights, backend="cpu")
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
@@ -49,20 +45,15 @@ def test_a_buffer_gets_the_gradient_whether_or_not_the_table_asks_for_one(
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"voxel": torch.tensor([2], dtype=torch.int32)}, "rows of the 2 voxels"),
-        ({"voxel": torch.tensor([-1], dtype=torch.int32)}, "rows of the 2 voxels"),
-        ({"voxel": torch.tensor([0])}, "int32"),
-        ({"weights": torch.zeros(2, 8)}, "weights"),
-        ({"weights": torch.zeros(1, 8, dtype=torch.float64)}, "float32"),
+        ({"voxel": VOXEL.where(VOXEL < 3, 4)}, "rows of the 4 voxels"),
+        ({"voxel": VOXEL.where(VOXEL > 0, -1)}, "rows of the 4 voxels"),
+        ({"voxel": VOXEL.long()}, "int32"),
+        ({"weights": WEIGHTS[1:]}, "weights"),
+        ({"weights": WEIGHTS.double()}, "float32"),
         ({"grad_buffer": torch.zeros(3, 3)}, "grad_buffer"),
     ],
 )
 def test_wrong_input_is_refused(changed: dict[str, torch.Tensor], message: str) -> None:
-    given = {
-        "table": torch.zeros(16, 3),
-        "corners": torch.arange(16, dtype=torch.int32).view(2, 8),
-        "voxel": torch.zeros(1, dtype=torch.int32),
-        "weights": torch.zeros(1, 8),
-    }
+    given = {"table": torch.zeros(20, 3), "corners": CORNERS, "voxel": VOXEL, "weights": WEIGHTS}
     with pytest.raises(ValueError, match=message):
         corner_gather(**given | changed, backend="cpu")

@@ -18,9 +18,11 @@ def test_auto_goes_by_the_device() -> None:
     assert resolve("auto", "cuda:0") == "reference"
 
 
-def test_unknown_backend_names_the_nearest() -> None:
+def test_a_backend_that_is_unknown_or_of_another_device_is_refused() -> None:
     with pytest.raises(Unavailable, match=r"'refrence'.*did you mean 'reference'"):
         resolve("refrence", "cpu")
+    with pytest.raises(Unavailable, match="serves CPU tensors, these are on 'cuda'"):
+        resolve("cpu", "cuda")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="here it can be used")
@@ -51,11 +53,6 @@ def test_for_a_while_a_kernel_is_computed_by_its_reference_whatever_is_asked_for
     assert called == {kernel}
     with pytest.raises(ValueError, match="no gradient for directions"):
         spherical_harmonics(directions, backend="cpu")
-
-
-def test_cpu_backend_refuses_tensors_of_another_device() -> None:
-    with pytest.raises(Unavailable, match="serves CPU tensors, these are on 'cuda'"):
-        resolve("cpu", "cuda")
 
 
 def test_an_interpreted_backend_is_not_compiled(monkeypatch: pytest.MonkeyPatch) -> None:

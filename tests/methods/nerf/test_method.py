@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import nn
 
 from bench.types import Log, Scene
 from methods.kernels.composite import STOP
 from methods.nerf.field import NerfField
-from methods.nerf.method import Nerf
 from methods.rendering.sampling import Sampling
 from methods.students.fields import FieldLessons
 from tests.methods.conftest import Work
-from tests.methods.trainings import EXACT_TEACHER, TAUGHT
+from tests.methods.small_students import fitted
+from tests.methods.trainings import EXACT_TEACHER
 
 LONG = EXACT_TEACHER.training.march_step
 """Step of the rays, in the usual ones."""
 
 
 def test_skipping_changes_no_picture_and_saves_products(ball_scene: Scene, shared_log: Log) -> None:
-    method = Nerf(teacher=EXACT_TEACHER, training=FieldLessons(rate=1e-3), stop=STOP)
-    method.fit(ball_scene, replace(TAUGHT, steps=80, renderer_steps=20), shared_log)
+    lessons = FieldLessons(rate=1e-3)
+    method = fitted("nerf", ball_scene, shared_log, 20, training=lessons, stop=STOP)
     assert method.sizes() == {"network": 4 * 595_844, "occupancy": 128**3 // 8}
     camera = ball_scene.splits["test"].cameras[0]
     skipping, dense = Work(), Work()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -15,7 +14,7 @@ from methods.instant_ngp.stage1 import train_field
 from methods.kernels.encode import encode
 from methods.kernels.types import Occupancy
 from methods.nsvf.field import NsvfField
-from tests.methods.small_students import SMALL, budget
+from tests.methods.small_students import SMALL, budget, fitted
 from tests.methods.trainings import EXACT_GRID, TEACHER
 
 BUDGET = budget("nsvf", 4)
@@ -87,8 +86,7 @@ def test_the_network_is_that_of_the_publication() -> None:
 
 
 def test_its_step_is_in_voxels(ball_scene: Scene, shared_log: Log) -> None:
-    method = SMALL["nsvf"]()
-    method.fit(ball_scene, replace(BUDGET, renderer_steps=2), shared_log)
+    method = fitted("nsvf", ball_scene, shared_log)
     assert method.how.step == 0.5 / 32
     assert SMALL["nsvf"](step=0.25).sampling(BUDGET).step == 0.25 / 32
 

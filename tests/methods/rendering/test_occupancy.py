@@ -22,8 +22,6 @@ from tests.methods.solids import Solid, slab
 UNIT_CUBE = torch.tensor([[0.0] * 3, [1.0] * 3])
 WHOLE = torch.ones(RESOLUTION, RESOLUTION, RESOLUTION, dtype=torch.bool)
 AROUND = [look_at_the_middle(turn / 4, lift) for turn in range(4) for lift in (-0.5, 0.5)]
-
-
 GENERATOR = torch.Generator().manual_seed(0)
 
 
@@ -50,10 +48,7 @@ def test_what_one_camera_sees_cannot_be_learnt() -> None:
 def test_cells_at_a_camera_cannot_be_learnt() -> None:
     inside = replace(AROUND[0], c2w=AROUND[0].c2w.clone())
     inside.c2w[:, 3] = torch.tensor([0.51, 0.51, 0.51])
-    without, with_it = (
-        learnable_cells(UNIT_CUBE, AROUND),
-        learnable_cells(UNIT_CUBE, [*AROUND, inside]),
-    )
+    without, with_it = (learnable_cells(UNIT_CUBE, x) for x in (AROUND, [*AROUND, inside]))
     lost = (without & ~with_it).nonzero()
     assert len(lost) == (3 * 4) ** 3  # the camera's brick and those that touch it
     assert ((lost + 0.5) / RESOLUTION - 0.51).abs().max() < 2 / 32

@@ -81,12 +81,11 @@ def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
     gradient = torch.autograd.grad(loss(), parameters)
     assert all(g.abs().max() > 0 for g in gradient)
     generator = torch.Generator().manual_seed(0)
-    for group in (parameters[:1], parameters[1:6], parameters[6:]):
-        slope, step = 0.0, 1e-8  # so short that it hardly ever crosses the kink of a ReLU
+    for part in (slice(1), slice(1, 6), slice(6, None)):
+        group, step = parameters[part], 1e-8  # so short that it hardly ever crosses a ReLU's kink
         directions = [torch.randn(p.shape, generator=generator).double() for p in group]
-        for p, d in zip(group, directions, strict=True):
-            place = next(i for i, q in enumerate(parameters) if q is p)
-            slope += (gradient[place] * d).sum().item()
+        pairs = zip(gradient[part], directions, strict=True)
+        slope = sum((g * d).sum().item() for g, d in pairs)
         values = []
         with torch.no_grad():
             for sign in (1, -2):

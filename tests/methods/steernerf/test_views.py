@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from bench.metrics import psnr
-from bench.types import Log, NullProbe, Scene, composite
+from bench.types import Log, Scene, composite
 from methods.engines import Built
 from methods.steernerf import pipeline
 from methods.steernerf.kernels.spans import Spans
@@ -66,29 +66,15 @@ def test_what_a_network_is_built_on_is_defined_away_from_matter_too(
     assert all(inputs.isfinite().all() for (inputs,) in views.inputs(2))
 
 
-def test_frames_are_rendered_as_in_training(
-    ball_scene: Scene, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    views, seen = views_of(ball_scene, quiet_log), []
-    render = Pipeline.render
-
-    def watched(self, camera, buffer, rendering, probe):
-        seen.append(rendering)
-        return render(self, camera, buffer, rendering, NullProbe())
-
-    monkeypatch.setattr(Pipeline, "render", watched)
-    views.inputs(2)
-    assert seen == 2 * [views.joint.rendering(views.pipeline.model)]
-
-
-def test_a_frame_is_recorded_behind_as_many_as_the_buffer_holds_and_one_more(
+def test_a_frame_is_recorded_as_in_training_behind_as_many_as_the_buffer_holds_and_one_more(
     ball_scene: Scene, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rendered, features = [], Pipeline.features
 
-    def counted(self, view, preceding, *rest):
+    def counted(self, view, preceding, rendering, probe):
+        assert rendering == small_joint().rendering(self.model)
         rendered.append((view.full.c2w, len(preceding)))
-        return features(self, view, preceding, *rest)
+        return features(self, view, preceding, rendering, probe)
 
     monkeypatch.setattr(Pipeline, "features", counted)
     frames, again, other = (

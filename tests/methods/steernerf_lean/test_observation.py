@@ -132,14 +132,6 @@ def test_its_opacity_is_that_of_a_layer_of_the_field() -> None:
     torch.testing.assert_close(surface.values[index, -1], opacity, rtol=1e-5, atol=1e-6)
 
 
-def test_where_no_pixel_has_a_depth_there_is_none() -> None:
-    nowhere, work = torch.full((64, 16), torch.inf), Work()
-    points = surface_points(misty_field("fp32"), nowhere, torch.arange(64), VIEW, work)
-    assert not work.done["surface_samples"]
-    assert points.values.shape == (0, CHANNELS + 1)
-    assert (points.index == -1).all()
-
-
 def test_in_pieces_it_is_the_same_and_the_same_work(monkeypatch: pytest.MonkeyPatch) -> None:
     work, whole = Work(), new_surface(NullProbe())
     monkeypatch.setattr(observation, "CACHED_SAMPLES", 50)  # the last of four is shorter

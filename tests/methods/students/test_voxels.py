@@ -27,11 +27,6 @@ def test_corners_are_where_they_belong_and_none_is_there_twice() -> None:
     assert corners.dtype == torch.int32
 
 
-def test_no_voxel_has_no_corner() -> None:
-    corners, vertices = corners_of(torch.zeros(0, 3, dtype=torch.int32))
-    assert (corners.shape, vertices.shape, vertices.dtype) == ((0, 8), (0, 3), torch.int32)
-
-
 @pytest.mark.parametrize("resolution", [1, 5, 8, 16, 24, 32, 37])
 def test_voxels_are_those_that_reach_into_occupied_cells(resolution: int) -> None:
     occupancy = scattered(0.02)
