@@ -67,7 +67,11 @@ def test_what_cannot_be_exported_or_imported_is_named(run, steerbench, exported)
     rows = Store(Path("outputs")).rows()
     (few,) = set(rows["run"]) - {exported[0]}
     for key, place, said in (
-        (few, "other", "expected all 2 scored frames as pictures, got 1; measure it with pict"),
+        (
+            few,
+            "other",
+            "expected all 2 scored frames as pictures, got 1; measure it with pictures=2",
+        ),
         (exported[0], "theirs", "theirs: expected a new or an empty folder"),
     ):
         assert said in steerbench("export", "nerfbaselines", key, "--to", place).refused()

@@ -102,6 +102,7 @@ def placed(place: tuple[int, int], value: float):
     ("change", "message"),
     [
         (lambda r: r.update(frames=[]), r"frames: expected a list with at least one entry"),
+        (lambda r: r.pop("frames"), r"frames: expected a list .* got nothing"),
         (lambda r: r["frames"].append(3), r"frames\[3\]: expected an object, got 3"),
         (lambda r: frame(r).pop("file_path"), r"frames\[1\].file_path: expected a path"),
         (lambda r: frame(r).pop("transform_matrix"), r"frames\[1\].transform_matrix: .* 4x4"),
@@ -110,7 +111,9 @@ def placed(place: tuple[int, int], value: float):
         (placed((0, 0), -1), r"transform_matrix: .* right-handed .* mirrored"),
         (placed((3, 2), 0.5), r"transform_matrix\[3\]: expected \[0, 0, 0, 1\]"),
         (lambda r: r.pop("camera_angle_x"), r"camera_angle_x: .* got nothing"),
-        (lambda r: r.update(camera_angle_x=3.2), r"camera_angle_x: .* above 1e-09 and below 3.14"),
+        (lambda r: r.update(camera_angle_x=0), r"camera_angle_x: .* above 1e-09 and below 3.14"),
+        (lambda r: r.update(camera_angle_x=3.2), r"camera_angle_x: .* got 3.2"),
+        (lambda r: r.update(camera_angle_x="0.7"), r"camera_angle_x: .* got '0.7'"),
         (lambda r: r.update(camera_angle_x=10**400), r"camera_angle_x: expected a finite number"),
         *(
             (lambda r, path=path: frame(r).update(file_path=path), f"file_path: expected {said}")

@@ -1,4 +1,4 @@
-"""The depthwise convolution of cells against that of a dense picture, strides and threads."""
+"""The depthwise convolution of cells against that of a dense picture, and finite differences."""
 
 from __future__ import annotations
 
@@ -42,19 +42,36 @@ CELLS = {
     "one": torch.ones(1, 1, 1, dtype=torch.bool),
     "none": torch.zeros(2, 4, 5, dtype=torch.bool),
 }
+KINDS = pytest.mark.parametrize("kind", CELLS)
 
 
-@pytest.mark.parametrize("kind", CELLS)
+@KINDS
+def test_neighbours_are_the_cells_around_row_by_row(kind: str) -> None:
+    cells = CELLS[kind]
+    places = [tuple(place) for place in cells.nonzero().tolist()]
+    number = {place: i for i, place in enumerate(places)}
+    want = [
+        [
+            number.get((picture, row + down, column + right), -1)
+            for down in (-1, 0, 1)
+            for right in (-1, 0, 1)
+        ]
+        for picture, row, column in places
+    ]
+    got = neighbours_of(cells)
+    assert got.dtype == torch.int32
+    assert got.shape == (len(places), TAPS)
+    assert got.tolist() == want
+
+
+@KINDS
 def test_cells_are_convolved_as_in_a_dense_picture_and_so_are_gradients(kind: str) -> None:
-    """By the places of `neighbours_of`, and in their order: all weights differ."""
     cells, channels = CELLS[kind], 5
     count = int(cells.sum())
     x = draw(count, channels).double().requires_grad_()
     weight = draw(TAPS, channels, seed=1).double().requires_grad_()
     grad = draw(count, channels, seed=2).double()
-    neighbours = neighbours_of(cells)
-    assert neighbours.dtype == torch.int32
-    outs = depthwise(x, neighbours, weight, backend="reference"), dense(cells, x, weight)
+    outs = depthwise(x, neighbours_of(cells), weight, backend="reference"), dense(cells, x, weight)
     found = ((out, *torch.autograd.grad(out, (x, weight), grad)) for out in outs)
     for got, want in zip(*found, strict=True):
         torch.testing.assert_close(got, want, rtol=0, atol=1e-12)

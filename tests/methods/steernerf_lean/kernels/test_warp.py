@@ -11,7 +11,8 @@ from torch import Tensor
 
 from bench.cameras import look_at
 from bench.types import Camera
-from methods.steernerf_lean.kernels.warp import TOLERANCE, enlarge
+from methods.steernerf_lean.kernels.warp import TOLERANCE
+from methods.steernerf_lean.kernels.warp import enlarge as enlarge_cells
 from methods.steernerf_lean.kernels.warp import warp as warp_cells
 from tests.methods.observations import to_picture
 
@@ -47,12 +48,18 @@ def uneven_depth() -> Tensor:
     return depth
 
 
+def enlarge(depth: Tensor, scale: int, backend: str) -> Tensor:
+    """Of all cells, [h, w, s^2]."""
+    cells = torch.arange(depth.numel())
+    return enlarge_cells(depth, cells, scale, backend=backend).view(*depth.shape, -1)
+
+
 def warp(
     picture: Tensor, source: Camera, depth: Tensor, camera: Camera, scale: int, backend: str
 ) -> tuple[Tensor, Tensor]:
     """Into all cells, whose depth is [h, w] enlarged: [h, w, s^2, C] and [h, w, s^2]."""
     cells = torch.arange(depth.numel())
-    fine = enlarge(depth, cells, scale, backend=backend)
+    fine = enlarge_cells(depth, cells, scale, backend=backend)
     values, valid = warp_cells(picture, source, fine, cells, camera, scale, backend=backend)
     return values.view(*depth.shape, *values.shape[1:]), valid.view(*depth.shape, -1)
 
@@ -127,6 +134,23 @@ def test_a_picture_is_the_definition(scale: int, channels: int) -> None:
     assert 0.3 < valid.mean() < 0.95
 
 
+@pytest.mark.parametrize(
+    ("backend", "dtype"), [("reference", torch.float64), ("cpu", torch.float32)]
+)
+@pytest.mark.parametrize("scale", [4, 3, 1])
+def test_an_enlarged_depth_is_the_definition(scale: int, backend: str, dtype: torch.dtype) -> None:
+    depth = uneven_depth().to(dtype)
+    enlarged = to_picture(enlarge(depth, scale, backend=backend)[..., None], scale)[..., 0]
+    rows, eps = depth.tolist(), torch.finfo(dtype).eps
+    for row in range(len(enlarged)):
+        for column in range(enlarged.shape[1]):
+            x, y = ((at + 0.5) / scale - 0.5 for at in (column, row))
+            # A mean, after eight roundings.
+            want = pytest.approx(plain_depth(rows, x, y), rel=4 * eps, abs=0)
+            assert enlarged[row, column].item() == want
+    assert 0.05 < enlarged.isinf().float().mean() < 0.5
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_without_a_depth_and_behind_the_source_nothing_is_known(backend: str) -> None:
     camera = straight(12, 8)
@@ -151,6 +175,6 @@ def test_wrong_arguments_are_named() -> None:
     with pytest.raises(ValueError, match="computes with float32"):
         warp_cells(picture.double(), camera, depth, cells, camera, 4, backend="cpu")
     with pytest.raises(ValueError, match=r"depth: expected shape \[any, any\], got \[96\]"):
-        enlarge(depth.flatten(), cells, 4)
+        enlarge_cells(depth.flatten(), cells, 4)
     with pytest.raises(ValueError, match="computes with float32"):
-        enlarge(depth.double(), cells, 4, backend="cpu")
+        enlarge_cells(depth.double(), cells, 4, backend="cpu")
