@@ -83,7 +83,7 @@ class Comparison:
 
     @property
     def _verdict(self) -> str:
-        if self.here is NOT_MEASURED:
+        if math.isnan(self.here.by):
             return UNKNOWN
         low, high = self.here.by - self.here.half, self.here.by + self.here.half
         margin = math.log(self.claim.margin) if _by_ratio(self.claim.metric) else self.claim.margin
@@ -144,9 +144,8 @@ def gap(metric: str, one: Repeated, other: Repeated) -> Gap:
     if not pairs:
         return NOT_MEASURED
     of_scenes: dict[object, list[float]] = {}
-    for pair in pairs:
-        scene, *_ = _identity(pair[0], metric)
-        of_scenes.setdefault(scene, []).append(_apart(metric, *pair))
+    for run, twin in pairs:
+        of_scenes.setdefault(run.record["scene"]["digest"], []).append(_apart(metric, run, twin))
     # The seeds of a scene share what is particular to it: of several scenes, each is one sample.
     means = [float(np.mean(of)) for of in of_scenes.values()]
     by = float(np.mean(means))
@@ -183,9 +182,8 @@ def _apart(metric: str, run: Run, twin: Run) -> float:
 
 def _frame_pairs(metric: str, run: Run, twin: Run) -> np.ndarray:
     """The figures [N, 2] of the frames that both runs have."""
-    one, other = _of_frames(metric, run), _of_frames(metric, twin)
-    common = one.index.intersection(other.index)
-    return np.stack([one[common].to_numpy(), other[common].to_numpy()], axis=1)
+    both = (_of_frames(metric, each) for each in (run, twin))
+    return pd.concat(both, axis=1, join="inner").to_numpy()
 
 
 def _over_frames(metric: str, run: Run, twin: Run) -> tuple[float, str]:

@@ -11,7 +11,7 @@ from bench.run import UNITS
 from reports.runs import Repeated, Run
 from reports.tables import NOT_AVAILABLE, QUALITY, Table, decimal, megabytes
 
-Write = Callable[[float | None], str]
+Write = Callable[[float], str]
 
 COST: dict[str, tuple[str, Write]] = {
     "frame_ms": ("ms / frame ↓", partial(decimal, decimals=1)),
@@ -89,10 +89,10 @@ def marked(
 ) -> list[str | None]:
     """A column: what `written` returns for each line, the best and the second best with `marks`.
 
-    Only among figures under the same conditions; the second of two, and stages, get no mark.
+    They are those that `ranks` names; stages get no mark.
     """
     places = {} if metric.startswith("stage_ms.") else ranks(lines, metric, write)
-    forms = dict(enumerate(marks if len(places) > 2 else marks[:1], 1))
+    forms = dict(enumerate(marks, 1))
     texts = [written(line, metric, write) for line in lines]
     return [text and forms.get(places.get(n, 0), "%s") % text for n, text in enumerate(texts)]
 
@@ -101,8 +101,8 @@ def ranks(lines: Sequence[Repeated], metric: str, write: Write | None = None) ->
     """The rank, from 1, of each of `lines` among those under the same conditions, by its index.
 
     Figures that look the same when written (by `write`, or in the usual format) share a rank. A
-    line that is alone under its conditions has no rank, and none has one in a metric without a
-    better side.
+    rank is less than their number: a line that is alone has none, nor has the second of two. None
+    has one in a metric without a better side.
     """
     label, usual = metric_format(metric)
     if not label.endswith(("↑", "↓")):
@@ -117,12 +117,12 @@ def ranks(lines: Sequence[Repeated], metric: str, write: Write | None = None) ->
     for figures in known.values():
         ordered = sorted(figures.values(), reverse=label.endswith("↑"))
         texts = list(dict.fromkeys(map(write, ordered)))
-        if len(figures) > 1:
-            places |= {row: texts.index(write(value)) + 1 for row, value in figures.items()}
+        ranked = {row: texts.index(write(value)) + 1 for row, value in figures.items()}
+        places |= {row: place for row, place in ranked.items() if place < len(figures)}
     return places
 
 
-def conditions_of(runs: Sequence[Run], facts: Sequence[str] = COMMON) -> str:
+def conditions_of(runs: Sequence[Run]) -> str:
     """Scene, resolution, trajectory and so on of `runs`, as text; lists all values of a fact."""
-    values = {name: dict.fromkeys(str(run.facts[name]) for run in runs) for name in facts}
+    values = {name: dict.fromkeys(str(run.facts[name]) for run in runs) for name in COMMON}
     return ", ".join(f"{name} {' / '.join(several)}" for name, several in values.items())

@@ -13,17 +13,8 @@ from reports.paper_tables import Lines, PaperTable
 from reports.runs import Repeated
 from reports.tables import decimal
 
-DECIMALS = {
-    "psnr": 2,
-    "ssim": 3,
-    "lpips": 3,
-    "flicker": 4,
-    "fps": 2,
-    "frame": 2,
-    "stage": 2,
-    "size": 1,
-}
-"""Decimals with which the paper prints a metric, by the first part of its name."""
+DECIMALS = {"ssim": 3, "lpips": 3, "frame": 2, "size": 1}
+"""Decimals of the paper where pages have others, by the first part of a metric's name."""
 
 ESCAPES = str.maketrans(
     {
@@ -110,14 +101,12 @@ def csv(tables: Sequence[PaperTable], measured: Lines) -> str:
     return pd.DataFrame(rows).to_csv(index=False)
 
 
-def _written(metric: str, value: float | None) -> str:
-    """A figure with the paper's number of decimals, sizes in MB; as usual if it has none of it."""
+def _written(metric: str, value: float) -> str:
+    """A figure with the paper's number of decimals, sizes in MB."""
     family = re.split(r"[._]", metric)[0]
     if family not in DECIMALS:
         return metric_format(metric)[1](value)
-    if family == "size" and value is not None:
-        value /= 1e6
-    return decimal(value, DECIMALS[family])
+    return decimal(value / 1e6 if family == "size" else value, DECIMALS[family])
 
 
 def _escaped(text: str) -> str:

@@ -67,8 +67,7 @@ def stage_bars(runs: Sequence[Run], path: Path) -> None:
     axes = figure.subplots()
     ends = np.zeros(len(runs))
     for number, stage in enumerate(stages):
-        lines = [Repeated(run.label, [run]) for run in runs]
-        widths = np.array([sum(line.mean(x) or 0.0 for x in parts[stage]) for line in lines])
+        widths = np.array([sum(run.figure(x) or 0.0 for x in parts[stage]) for run in runs])
         colour = "lightgrey" if STAGE + stage == OTHER else COLOURS[number % len(COLOURS)]
         axes.barh(range(len(runs)), widths, left=ends, height=0.6, label=stage, color=colour)
         ends = ends + widths

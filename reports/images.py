@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import uniform_filter
@@ -190,9 +191,7 @@ def write_image(frame: Frame, path: Path) -> None:
 
 def _error_colours(size: tuple[int, int]) -> Image.Image:
     """A panel with the colours of an error map, from no error on."""
-    from matplotlib import colormaps  # takes 0.3 s
-
-    colours = colormaps["inferno"](np.linspace(0, 1, size[0]), bytes=True)[None, :, :3]
+    colours = matplotlib.colormaps["inferno"](np.linspace(0, 1, size[0]), bytes=True)[None, :, :3]
     panel = Image.new("RGB", size, PAPER)
     panel.paste(Image.fromarray(colours).resize((size[0], LINE_PX)), (0, 0))
     return panel

@@ -46,6 +46,7 @@ def write_paper_page(
     compared = [x for table in tables for x in comparisons(table, lines.get(table.name, ()))]
     if all(each.here is NOT_MEASURED for each in compared):
         compared = []
+    every: list[Part] = [f"## {PAGE['comparisons']}", claim_table(compared)] if compared else []
     facts = conditions(runs).items() if runs else ()
     said = {name: value for name, value in facts if " / " not in value}  # once for all tables
     parts: list[Part] = [
@@ -58,7 +59,7 @@ def write_paper_page(
         *(part for table in tables for part in section(table, lines.get(table.name, ()), said)),
         *(part for plot in PAGE["plots"] for part in _plot(plot, tables, lines)),
         *(part for images in PAGE["images"] for part in _images(images, lines)),
-        *_every_comparison(compared),
+        *every,
         f"## Runs\n\nTheir keys in the store, and the commands:\n\n```\n{sources}\n```",
     ]
     return publish(parts, folder, runs)
@@ -70,11 +71,6 @@ def _conclusions(found: Sequence[Comparison]) -> Iterator[Part]:
     if found:
         yield from (f"## {PAGE['conclusions']}", finding_table(found))
         yield PAGE["verdicts"].format(sampled=sampled, count=len(found)).strip()
-
-
-def _every_comparison(found: Sequence[Comparison]) -> Iterator[Part]:
-    if found:
-        yield from (f"## {PAGE['comparisons']}", claim_table(found))
 
 
 def _plot(plot: Mapping[str, Any], tables: Sequence[PaperTable], lines: Lines) -> Iterator[Part]:

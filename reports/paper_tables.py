@@ -14,7 +14,7 @@ from reports.claims import Claim, Comparison, apart, compare, gap, told
 from reports.comparison import COMMON, marked, metric_format, written
 from reports.outliers import REFERENCES
 from reports.runs import Repeated, Run, missing_figures
-from reports.tables import ABSENT, NOT_AVAILABLE, Table
+from reports.tables import ABSENT, Table
 
 METHOD = "method"
 AFTER, SHARES = "method.after", (0.25, 0.5)
@@ -191,14 +191,7 @@ def _table(path: Path, data_sets: Sequence[str]) -> PaperTable:
         name = line.get("label") or label.format(*job.values())
         lines.append(Line(name, job, figures, line.get("every_seed", False)))
     claims = [
-        Claim(
-            x["metric"],
-            x.get("alike") or x["rising"],
-            x["margin"],
-            alike="alike" in x,
-            says=x.get("says", ""),
-            main=x.get("main", False),
-        )
+        Claim(alike="alike" in x, lines=x.pop("alike", None) or x.pop("rising"), **x)
         for x in content.pop("claims")
     ]
     only = content.pop("beside", [line.label for line in lines])
@@ -327,14 +320,13 @@ def distance_table(table: PaperTable, measured: Mapping[str, Repeated]) -> Table
 def _scenes(metrics: Sequence[str], lines: Sequence[Repeated]) -> Table:
     """Means over seeds, one line per scene and line."""
     shown = [
-        (f"{scene}: {line.label}", Repeated(line.label, line.by_scene[scene]))
+        Repeated(f"{scene}: {line.label}", line.by_scene[scene])
         for scene in sorted({scene for line in lines for scene in line.by_scene})
         for line in lines
         if scene in line.by_scene
     ]
     cells = tuple(
-        (name, *(written(of_scene, metric) or NOT_AVAILABLE for metric in metrics))
-        for name, of_scene in shown
+        (each.label, *(written(each, metric) or ABSENT for metric in metrics)) for each in shown
     )
     heads = ("measured", *(metric_format(metric)[0] for metric in metrics))
-    return Table("Each scene", heads, cells, sources=tuple(of_scene.keys for _, of_scene in shown))
+    return Table("Each scene", heads, cells, sources=tuple(each.keys for each in shown))

@@ -61,8 +61,7 @@ class Figures:
     @classmethod
     def of(cls, run: Run, limits: Mapping[str, Limit] = LIMITS) -> Figures:
         """The figures of `run` that have a limit."""
-        every = {metric: run.values.get(metric, math.nan) for metric in limits}
-        values = {metric: value for metric, value in every.items() if not math.isnan(value)}
+        values = {x: of for x, of in run.values.items() if x in limits and not math.isnan(of)}
         steady, frames = run.steady, {}
         for metric in values:
             if metric not in steady or metric == "peak_bytes":  # older runs have that column
@@ -119,7 +118,7 @@ def changes(
 
 def _change(metric: str, limit: Limit, pairs: Sequence[tuple[Figures, Figures]]) -> Change:
     values = np.array([[run.values.get(metric, math.nan) for run in pair] for pair in pairs])
-    frames = [_hiding_nothing(frames_apart(metric, *pair), limit) for pair in pairs]
+    frames = [_hiding_nothing(_frames_apart(metric, *pair), limit) for pair in pairs]
     pairwise = zip(frames, values, strict=True)
     by_seed = np.array([x.mean() if len(x) > 1 else _apart(*pair) for x, pair in pairwise])
     by_seed = _hiding_nothing(by_seed, limit)
@@ -139,7 +138,7 @@ def _change(metric: str, limit: Limit, pairs: Sequence[tuple[Figures, Figures]])
     return Change(metric, before, after, by, interval, verdict)
 
 
-def frames_apart(metric: str, old: Figures, new: Figures) -> np.ndarray:
+def _frames_apart(metric: str, old: Figures, new: Figures) -> np.ndarray:
     """New less old of the frames that both have, in the order of the path."""
     one, other = old.frames.get(metric, {}), new.frames.get(metric, {})
     return np.array([_apart(one[name], other[name]) for name in one if name in other])

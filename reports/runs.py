@@ -87,7 +87,7 @@ class Run:
     @cached_property
     def facts(self) -> pd.Series:
         """The columns that are equal in all rows: method, scene, protocol, device and so on."""
-        return self.rows.iloc[0]
+        return self.rows.drop(columns=list(FIGURES), errors="ignore").iloc[0]
 
     @property
     def views(self) -> tuple[object, ...]:
@@ -124,7 +124,7 @@ class Run:
             "seed": str(row["seed"]),
             "commit": row["commit"],
             "computed on": _listed(computed),
-            **({"times": record["times"]} if "times" in record else {}),  # older runs have none
+            "times": record.get("times", "not recorded"),  # older runs have none
             "peak memory": record["peak_bytes"],
             "machine": f"{machine['cpu']}, {machine['threads']} threads, {memory}",
             "beside it": str(Neighbours(**seen)) if seen else "not recorded",
@@ -280,14 +280,15 @@ def over_scenes(runs: Sequence[Run]) -> Run:
         value=("value", lambda values: values.sum(skipna=False) / len(runs)),
         n=("n", "sum"),
     )
-    names = [name for name in map(str, runs[0].rows) if name not in FIGURES]
+    names = map(str, runs[0].facts.index)
     facts = {name: _joined([run.facts[name] for run in runs]) for name in names}
     facts["scene"] = f"mean of {', '.join(str(run.facts['scene']) for run in runs)}"
     key = facts["run"] = content_key({"mean of": [run.key for run in runs]})[:16]
     if "fps" in rows.index:  # of the mean time, as in a run
         rows.loc["fps", "value"] = 1000 / rows["value"]["frame_ms"]
     rows = rows.reset_index().assign(lo=math.nan, hi=math.nan, **facts)
-    return Run(key, runs[0].label, rows, partial(_frames, runs), _record(runs), runs[0].pictures)
+    frames = cache(partial(_frames, runs))
+    return Run(key, runs[0].label, rows, frames, _record(runs), runs[0].pictures)
 
 
 def _frames(runs: Sequence[Run]) -> pd.DataFrame:

@@ -139,7 +139,8 @@ def _time(rows: pd.DataFrame, suffix: str) -> Table:
     lines = []
     if total := value.get("frame_ms"):
         lines = [(name, decimal(ms, 2), share(ms, total)) for name, ms in stages.items()]
-        lines.append(("frame", decimal(total, 2), share(sum(stages.values()), total)))
+        of_stages = share(sum(stages.values()), total) if stages else ""
+        lines.append(("frame", decimal(total, 2), of_stages))
         for each in ("p50", "p95", "p99"):
             lines.append((f"frame, {each}", decimal(value[f"frame_ms.{each}"], 2), ""))
         lines.append(("FPS", decimal(value["fps"], 2), ""))

@@ -10,16 +10,12 @@ import shutil
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from bench.errors import SteerbenchError, Unavailable, install_command
 from reports.runs import Run
-
-FACTS = ("method", "scene", "resolution", "trajectory", "budget", "protocol", "seed", "device")
-"""Columns of the rows that say what was measured."""
 
 
 def to_wandb(run: Run, outputs: Path) -> None:
@@ -73,11 +69,10 @@ def tracker(name: str) -> Callable[[Run, Path], None]:
     return TRACKERS[name]
 
 
-def settings(run: Run) -> dict[str, Any]:
+def settings(run: Run) -> dict[str, str]:
     """What was measured, by which command, at which commit and on which machine."""
-    facts = {name: str(run.facts[name]) for name in FACTS}
-    record = {name: run.record[name] for name in ("command", "commit")}
-    return facts | record | {"cpu": run.record["machine"]["cpu"]}
+    facts = {str(name): str(fact) for name, fact in run.facts.items()}
+    return facts | {"command": run.record["command"], "cpu": run.record["machine"]["cpu"]}
 
 
 def headline(run: Run) -> dict[str, float]:

@@ -29,19 +29,9 @@ function compare(a, b, sign) {
   return sign * (typeof a === "number" ? a - b : alphabet.compare(a, b));
 }
 
-const LONG = 200; // rows, of a table in which only those in sight are laid out
-
-/** Fix the widths of the columns: then a row can be laid out without all others. */
-function fixColumns(table) {
-  const widths = [...table.tHead.rows[0].cells].map((head) => head.getBoundingClientRect().width);
-  table.style.setProperty("--columns", widths.map((width) => `${width}px`).join(" "));
-  table.classList.add("long");
-}
-
 function makeSortable(table) {
   const body = table.tBodies[0];
   const original = [...body.rows];
-  if (original.length > LONG) fixColumns(table);
   const heads = [...table.tHead.rows[0].cells];
   heads.forEach((head, column) => {
     if (!head.textContent.trim()) return;
@@ -81,9 +71,8 @@ function makeFilterable(table) {
 
 for (const table of document.querySelectorAll(".table table")) {
   const rows = [...(table.tBodies[0]?.rows ?? [])];
-  const grouped = rows.some((row) => !row.cells[0].textContent); // belong to the row above
   const named = table.tHead.textContent.trim();
-  if (rows.length > 1 && named && !grouped) makeSortable(table);
+  if (rows.length > 1 && named) makeSortable(table);
   const ofOneRun = rows[0]?.dataset.runs && new Set(rows.map((row) => row.dataset.runs)).size === 1;
   if (rows.length > 4 && named && !ofOneRun) makeFilterable(table);
 }

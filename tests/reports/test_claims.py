@@ -20,6 +20,7 @@ from reports.claims import (
     OPEN,
     OPPOSITE,
     SMALLER,
+    UNKNOWN,
     Claim,
     Comparison,
     Gap,
@@ -63,6 +64,7 @@ def comparison(claim: Claim, by: float, half: float, paper: float, proves=True) 
         (-0.1, 0.2, math.nan, OPEN),
         (-0.5, 0.4, math.nan, OPPOSITE),
         (0.5, math.nan, 1.0, OPEN),
+        (math.nan, math.nan, 1.0, UNKNOWN),  # a figure is missing
     ],
 )
 def test_a_verdict_tells_sign_and_size_of_the_whole_interval(by, half, paper, verdict):

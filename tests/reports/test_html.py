@@ -206,37 +206,6 @@ def test_a_click_on_a_head_sorts_numbers_as_numbers_the_best_above_and_the_missi
     assert left.startswith("c\t")
 
 
-LONG = """
-const lefts = (row) => [...row.cells].map((cell) => Math.round(cell.getBoundingClientRect().left));
-const found = [...document.querySelectorAll("table")].map((table) => {
-  const [head, body] = [table.tHead.rows[0], table.tBodies[0]];
-  head.cells[1].querySelector("button").click();
-  return {
-    apart: getComputedStyle(body.rows[0]).contentVisibility === "auto",
-    aligned: [...body.rows].every((row) => String(lefts(row)) === String(lefts(head))),
-    sorted: [...body.rows].map((row) => Number(row.cells[1].textContent)),
-  };
-});
-return { found };
-"""
-
-
-@needs_browser
-def test_rows_of_a_long_table_are_laid_out_apart_below_their_heads(tmp_path):
-    lines = tuple(
-        ("name" * (1 + row % 7), str(row * 331 % 1009), "0" * (row % 5)) for row in range(300)
-    )
-    tables = [
-        Table(name, ("name", "PSNR, dB ↑", "ms"), lines[:rows])
-        for name, rows in (("a", 50), ("b", 300))
-    ]
-    short, long = in_browser(publish.html_page(["# Title", *tables], []), LONG, tmp_path)["found"]
-    assert (short["apart"], long["apart"]) == (False, True)
-    for one, rows in ((short, 50), (long, 300)):
-        assert one["aligned"]
-        assert one["sorted"] == sorted((row * 331 % 1009 for row in range(rows)), reverse=True)
-
-
 LOOK = """
 const one = (name) => document.querySelector(name);
 const frame = one(".frame");

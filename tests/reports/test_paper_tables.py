@@ -23,7 +23,7 @@ from reports.publish import markdown
 from reports.runs import Repeated, Run
 from reports.tables import ABSENT, QUALITY
 from sweeps.overrides import CONFIGS
-from tests.reports.conftest import TABLES, changed
+from tests.reports.conftest import TABLES, changed, elsewhere
 
 _, SECOND = DATA_SETS
 BOTH = {table.name: table for table in paper_tables(CONFIGS / "experiment", [FIRST, SECOND])}
@@ -191,6 +191,14 @@ def test_a_cell_of_figures_is_measured_or_absent(run):
     assert shown.columns == ("measured", *labels)
     assert shown.lines[0] == ("here: seed 1 failed", "30.46", "12.0", ABSENT, "8.00")
     assert shown.lines[1] == ("elsewhere", *[ABSENT] * 4)
+
+
+def test_the_second_of_two_has_no_mark_beside_two_of_another_machine(run):
+    table = replace(TABLE, lines=[Line(name, {"method": name}) for name in "abcd"])
+    runs = {name: changed(run, {"psnr": psnr}) for psnr, name in enumerate("abcd", 1)}
+    runs |= {name: elsewhere(runs[name]) for name in "cd"}
+    shown = figure_table(table, {name: Repeated(name, [of]) for name, of in runs.items()})
+    assert [line[1] for line in shown.lines] == ["1.00", "**2.00**", "3.00", "**4.00**"]
 
 
 def test_the_best_is_bold_and_the_second_of_three_italic(run):

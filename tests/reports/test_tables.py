@@ -40,6 +40,8 @@ def test_a_run_has_its_quality_time_and_memory(rows):
         "model": ("25.20",),
         "peak, rendering": ("1,000.00",),
     }
+    untold = tables.run_tables(rows[~rows["metric"].str.startswith("stage_ms.")])
+    assert cells(untold[1])["frame"] == ("200.00", "")
 
 
 def test_work_stands_beside_what_skipping_nothing_takes(rows):
