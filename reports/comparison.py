@@ -89,7 +89,7 @@ def marked(
 ) -> list[str | None]:
     """A column: what `written` returns for each line, the best and the second best with `marks`.
 
-    They are those that `ranks` names; stages get no mark.
+    The second of two gets no mark (see `ranks`), and no stage does.
     """
     places = {} if metric.startswith("stage_ms.") else ranks(lines, metric, write)
     forms = dict(enumerate(marks, 1))
@@ -101,8 +101,8 @@ def ranks(lines: Sequence[Repeated], metric: str, write: Write | None = None) ->
     """The rank, from 1, of each of `lines` among those under the same conditions, by its index.
 
     Figures that look the same when written (by `write`, or in the usual format) share a rank. A
-    rank is less than their number: a line that is alone has none, nor has the second of two. None
-    has one in a metric without a better side.
+    line that is alone under its conditions has no rank, nor has the last of several, so that the
+    second of two has none. No line has one in a metric without a better side.
     """
     label, usual = metric_format(metric)
     if not label.endswith(("↑", "↓")):

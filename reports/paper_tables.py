@@ -190,10 +190,7 @@ def _table(path: Path, data_sets: Sequence[str]) -> PaperTable:
             figures["frame_ms"] = 1000 / figures["fps"]
         name = line.get("label") or label.format(*job.values())
         lines.append(Line(name, job, figures, line.get("every_seed", False)))
-    claims = [
-        Claim(alike="alike" in x, lines=x.pop("alike", None) or x.pop("rising"), **x)
-        for x in content.pop("claims")
-    ]
+    claims = [_claim(**declared) for declared in content.pop("claims")]
     only = content.pop("beside", [line.label for line in lines])
     named = {job.get(METHOD) for job in jobs}
     beyond = next((method for method in further if method not in named), None)
@@ -202,6 +199,12 @@ def _table(path: Path, data_sets: Sequence[str]) -> PaperTable:
     halves = [(name, _table(path, [name])) for name in others]
     beside = [half.block(x, [y for y in half.lines if y.label in only], x) for x, half in halves]
     return replace(table, data_set=data_set, beyond=beyond, beside=beside)
+
+
+def _claim(**declared: Any) -> Claim:
+    """A claim about lines that an experiment declares as `rising` or as `alike`."""
+    alike = "alike" in declared
+    return Claim(lines=declared.pop("alike" if alike else "rising"), alike=alike, **declared)
 
 
 def _by_data_set(declared: Any) -> Mapping[str, Any]:

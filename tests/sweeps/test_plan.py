@@ -201,7 +201,7 @@ def test_tables_of_times_are_in_half_precision_where_the_cpu_has_it(
 
 
 def test_a_scene_is_compared_with_the_figures_of_its_data_set(monkeypatch):
-    """An embedded scene belongs to the paper's first data set, unless it stands in for another."""
+    """Embedded scenes are compared with the first data set, unless they stand in for another."""
     monkeypatch.setitem(DATA_SETS["Tanks & Temples"], "stand_ins", ["wires"])
     words = ["scene=wires,totem", "scene.downscale=2", "budget=tiny", "seed=0"]
     scenes = scenes_of(words)
