@@ -31,7 +31,7 @@ would depend on machine and scene. `TIMES` can be compared on one machine only."
 
 @dataclass(frozen=True)
 class Claim:
-    """`metric` grows from each of the `lines` (labels) to the next or, if `alike`, hardly changes.
+    """`metric` grows from each of the `lines` (labels) to the next or, if `alike`, hardly grows.
 
     Differences that are apart by no more than `margin` count as equal: in the unit of the metric,
     or as a factor where figures are compared by their ratio. A finding of the paper `says` in words
@@ -87,10 +87,8 @@ class Comparison:
             return UNKNOWN
         low, high = self.here.by - self.here.half, self.here.by + self.here.half
         margin = math.log(self.claim.margin) if _by_ratio(self.claim.metric) else self.claim.margin
-        if self.claim.alike:
-            if -margin <= low and high <= margin:
-                return AS
-            return LARGER if low > margin else OPPOSITE if high < -margin else OPEN
+        if self.claim.alike:  # "hardly any loss" holds of a gain, too
+            return AS if high <= margin else LARGER if low > margin else OPEN
         if high < 0:
             return OPPOSITE
         if low > 0 and math.isnan(self.paper):
@@ -107,14 +105,14 @@ def compare(
 ) -> Iterator[Comparison]:
     """A claim between all of its neighbours among `lines`; `published` is the paper's metric.
 
-    Where the paper has the opposite order, on another data set, the claim is turned round. Where it
-    gives the metric, but not of both lines, it claims nothing about them.
+    Where the paper has the opposite order, on another data set, a claim of growth is turned round.
+    Where it gives the metric, but not of both lines, it claims nothing about them.
     """
     for smaller, larger in pairwise(claim.lines):
         paper = apart(claim.metric, *(published.get(x, math.nan) for x in (smaller, larger)))
         if published and math.isnan(paper):
             continue
-        if paper < 0:
+        if paper < 0 and not claim.alike:
             smaller, larger, paper = larger, smaller, -paper
         if smaller in lines and larger in lines:
             here = gap(claim.metric, lines[smaller], lines[larger])

@@ -79,11 +79,13 @@ def test_a_verdict_tells_sign_and_size_of_the_whole_interval(by, half, paper, ve
         (0.02, 0.08, AS),
         (0.05, 0.06, OPEN),
         (0.2, 0.05, LARGER),
-        (-0.2, 0.05, OPPOSITE),
+        (-0.2, 0.05, AS),  # hardly any loss holds of a gain
         (0.0, math.nan, OPEN),
     ],
 )
-def test_lines_are_alike_if_the_whole_interval_is_within_the_margin(by, half, verdict):
+def test_lines_are_alike_if_the_second_is_not_above_the_first_by_more_than_the_margin(
+    by, half, verdict
+):
     assert comparison(ALIKE, by, half, 0.02).verdict == verdict
 
 
@@ -188,10 +190,10 @@ def test_one_perfect_frame_does_not_make_two_lines_alike(run):
 
 
 def compared(
-    run: Run, published: Mapping[str, float], measured: Mapping[str, float]
+    run: Run, published: Mapping[str, float], measured: Mapping[str, float], claim: Claim = RISING
 ) -> list[Comparison]:
     lines = {label: Repeated(label, [shifted(run, by)]) for label, by in measured.items()}
-    return list(compare(replace(RISING, lines=["one", "two", "three"]), lines, published))
+    return list(compare(replace(claim, lines=["one", "two", "three"]), lines, published))
 
 
 def test_neighbours_are_compared_if_both_were_measured_and_the_paper_gives_both_or_none(run):
@@ -205,6 +207,15 @@ def test_neighbours_are_compared_if_both_were_measured_and_the_paper_gives_both_
     assert len(unknown) == 2
     assert all(math.isnan(x.paper) for x in unknown)
     assert compared(run, {}, {"one": 0.0, "three": 1.0}) == []
+
+
+def test_only_growth_is_turned_round_where_the_paper_has_the_opposite_order(run):
+    """That three preceding frames gain no more than two stays a claim about the third."""
+    both = {"one": 31.04, "two": 31.0}, {"one": 0.0, "two": 0.3}
+    (turned,), (alike,) = compared(run, *both), compared(run, *both, ALIKE)
+    assert (turned.smaller, turned.paper) == ("two", pytest.approx(0.04))
+    assert (alike.smaller, alike.paper) == ("one", pytest.approx(-0.04))
+    assert alike.verdict == LARGER + BY_ONE
 
 
 def test_a_claim_is_turned_round_where_the_paper_has_the_opposite_order(run):
