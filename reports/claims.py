@@ -18,7 +18,7 @@ from reports.tables import ABSENT, Table, decimal
 AS, LARGER, SMALLER = "as in the paper", "larger", "smaller"
 AT_MOST = "smaller, if any"
 AGREES = "same direction"
-"""Of a difference whose size the paper does not give."""
+"""Of a difference whose size the paper does not give, or whose interval is too wide to tell one."""
 OPPOSITE, OPEN, UNKNOWN = "opposite", "cannot be told", "not measured"
 BY_ONE = " (one seed)"
 """Ends a verdict from the frames of one training, which another training may reverse."""
@@ -97,7 +97,9 @@ class Comparison:
             return LARGER
         if high < self.paper - margin:
             return SMALLER if low > 0 else AT_MOST
-        return AS if low > 0 else OPEN
+        if low > 0:
+            return AS if self.here.half <= max(self.paper, margin) else AGREES
+        return OPEN
 
 
 def compare(

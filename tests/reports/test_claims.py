@@ -55,6 +55,8 @@ def comparison(claim: Claim, by: float, half: float, paper: float, proves=True) 
         (0.55, 0.35, 1.0, AS),  # at most 0.90: the margin is 0.10
         (0.5, 0.35, 1.0, SMALLER),
         (10.0, 0.25, 1.19, LARGER),
+        (2.0, 1.5, 1.0, AGREES),  # from 0.5 to 3.5: no size can be told
+        (0.12, 0.1, 0.05, AS),  # or none but that it is small
         (0.5, 0.5, 1.0, OPEN),  # up to 1.0, as in the paper
         (0.3, 0.5, 1.0, AT_MOST),
         (-0.1, 0.2, 1.0, AT_MOST),
