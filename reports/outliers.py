@@ -75,7 +75,7 @@ def far_from_reference(runs: Sequence[Run]) -> Iterator[Outlier]:
         below = known - _psnr(run)
         whole = share == 1 and run.facts["resolution"] == published["resolution"]
         if whole and below > REFERENCE_DB:
-            why = f"PSNR {below:.1f} dB below the {known} dB of {published['method']}"
+            why = f"PSNR {below:.1f} dB below the published {known} dB of {published['method']}"
             yield Outlier(run.key, why)
 
 

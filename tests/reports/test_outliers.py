@@ -83,7 +83,7 @@ def test_a_known_scene_is_compared_with_its_published_psnr(make):
         make("other", width=800),
     ]
     assert list(far_from_reference(runs)) == [
-        Outlier("bad", "PSNR 22.6 dB below the 35.59 dB of Instant-NGP")
+        Outlier("bad", "PSNR 22.6 dB below the published 35.59 dB of Instant-NGP")
     ]
 
 
