@@ -42,8 +42,8 @@ def test_methods_are_as_good_as_the_recorded_baseline(tmp_path, lpips_weights, r
     """The limits are what other rounding does to one training, rounded up: docs/log.md. A change
     must also be sure over three trainings.
 
-    Whoever changes a method on purpose, even the order of its random numbers, records them anew:
-    `steerbench check --record`.
+    After a deliberate change to a method, even to the order of its random numbers, run `steerbench
+    check --record`.
     """
     for method in METHODS:
         done = called(tmp_path, "run", *RUN, *method, f"weights_dir={lpips_weights}")
