@@ -129,6 +129,12 @@ def tiny_scene() -> Scene:
     return Scene("tiny", splits, torch.ones(3), bounds, unit_length=3.0, digest="0123456789abcdef")
 
 
+@pytest.fixture
+def moved_scene(tiny_scene: Scene) -> Scene:
+    """The unit cube is [-1.5, 1.5]^3 of the data set."""
+    return replace(tiny_scene, origin=torch.full((3,), -1.5))
+
+
 def _tiny_split(count: int, seed: int) -> Split:
     generator = torch.Generator().manual_seed(seed)
     images = [

@@ -193,5 +193,5 @@ def test_the_ends_of_the_way_between_two_cameras_are_the_cameras():
 
 
 def test_the_viewing_target_is_the_centre_of_the_bounds(tiny_scene):
-    scene = replace(tiny_scene, bounds=torch.tensor([[0.0, 0.2, 0.4], [1.0, 0.8, 0.6]]))
-    assert viewing_target(scene).tolist() == pytest.approx([0.5, 0.5, 0.5])
+    scene = replace(tiny_scene, bounds=torch.tensor([[0.0, 0.2, 0.4], [1.0, 0.4, 0.6]]))
+    assert viewing_target(scene).tolist() == pytest.approx([0.5, 0.3, 0.5])

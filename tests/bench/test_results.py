@@ -92,14 +92,13 @@ def test_values_come_back_bit_for_bit_and_text_stays_text(tmp_path_factory, valu
     assert set(rows["method"]) == set(rows["precision"]) == {text}
 
 
-@pytest.mark.parametrize("exception", [ValueError, KeyboardInterrupt])
-def test_a_run_that_is_interrupted_leaves_nothing(store, exception):
+def test_a_run_that_is_interrupted_leaves_nothing(store):
     def write() -> None:
         with store.write("abc") as folder:
             (folder / "record.json").write_text("{}")
-            raise exception
+            raise KeyboardInterrupt
 
-    with pytest.raises(exception):
+    with pytest.raises(KeyboardInterrupt):
         write()
     assert list(store.folder.iterdir()) == []
 

@@ -102,7 +102,6 @@ def test_every_kernel_has_cases_for_all_its_backends(kernel: str) -> None:
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_backends_have_the_same_signatures(kernel: str) -> None:
-    assert availability()["reference"] == availability()["cpu"] == ""
     names = [name for name in dispatch.served(kernel) if not availability()[name]]
     versions = [vars(importlib.import_module(f"{kernel}.{name}")) for name in names]
     shared = set.intersection(*map(set, versions))

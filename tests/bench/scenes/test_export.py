@@ -12,13 +12,6 @@ import torch
 from bench.errors import SteerbenchError
 from bench.scenes import blender, transforms
 from bench.scenes.export import write_blender
-from bench.types import Scene
-
-
-@pytest.fixture
-def moved_scene(tiny_scene: Scene) -> Scene:
-    """The unit cube is [-1.5, 1.5]^3 of the data set."""
-    return replace(tiny_scene, origin=torch.full((3,), -1.5))
 
 
 def test_a_scene_that_was_written_is_read_bit_by_bit(moved_scene, quiet_log, tmp_path: Path):

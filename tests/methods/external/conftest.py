@@ -5,14 +5,11 @@ from __future__ import annotations
 import gc
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from textwrap import dedent
 
 import pytest
-import torch
 
-from bench.types import Scene
 from methods.external.method import External
 
 ROOT = Path(__file__).parents[3]
@@ -29,12 +26,6 @@ GREY = """
         def render(self, camera):
             return np.full((camera.height, camera.width, 3), self.level)
 """
-
-
-@pytest.fixture
-def moved_scene(tiny_scene: Scene) -> Scene:
-    """The unit cube is [-1.5, 1.5]^3 of the data set."""
-    return replace(tiny_scene, origin=torch.full((3,), -1.5))
 
 
 @pytest.fixture
