@@ -19,7 +19,7 @@ AS, LARGER, SMALLER = "as in the paper", "larger", "smaller"
 AT_MOST = "smaller, if any"
 AGREES = "same direction"
 """Of a difference whose size the paper does not give, or whose size cannot be told here."""
-OPPOSITE, OPEN, UNKNOWN = "opposite", "cannot be told", "not measured"
+OPPOSITE, OPEN, UNKNOWN = "opposite", "inconclusive", "not measured"
 BY_ONE = " (one seed)"
 """Ends a verdict from the frames of one training, which another training may reverse."""
 

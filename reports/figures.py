@@ -183,7 +183,7 @@ def quality_over_training(curves: Sequence[Curve], ceiling: Repeated | None, pat
     for axes in panels[len(titles) :]:
         axes.set_axis_off()
     for axes, title in zip(panels, titles, strict=False):
-        _label(axes, "steps of stage 2")
+        _label(axes, "steps of stage 2, log scale")
         axes.set_title(title, fontsize="medium")
         for number, curve in enumerate(curve for curve in curves if curve.panel == title):
             bars = np.nan_to_num([line.half("psnr") for line in curve.points.values()])
