@@ -92,13 +92,14 @@ def test_values_come_back_bit_for_bit_and_text_stays_text(tmp_path_factory, valu
     assert set(rows["method"]) == set(rows["precision"]) == {text}
 
 
-def test_a_run_that_is_interrupted_leaves_nothing(store):
+@pytest.mark.parametrize("exception", [ValueError, KeyboardInterrupt])
+def test_a_run_that_is_interrupted_leaves_nothing(store, exception):
     def write() -> None:
         with store.write("abc") as folder:
             (folder / "record.json").write_text("{}")
-            raise KeyboardInterrupt
+            raise exception
 
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(exception):
         write()
     assert list(store.folder.iterdir()) == []
 

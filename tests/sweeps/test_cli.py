@@ -57,6 +57,7 @@ def test_list_shows_choices_backends_and_why_an_engine_cannot_be_used(steerbench
         (["rsults"], "unknown command 'rsults'. Did you mean results?"),
         (["results", "--fromat", "csv"], "unknown argument '--fromat'. Did you mean --format?"),
         (["results", "--format", "cvs"], "invalid choice: 'cvs'"),
+        (["kernels", "--repeats", "0"], "--repeats: expected 1 or more, got 0"),
         (["parity", "--frames", "many"], "--frames: expected 1 or more, got many"),
         (["paper", "--table", "tabel1"], "unknown table 'tabel1'. Did you mean table1"),
         (["scenes", "verify", os.curdir], "expected a folder chair or drums or"),

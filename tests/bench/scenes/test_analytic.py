@@ -119,12 +119,13 @@ def test_the_pictures_of_a_folder_have_the_views_of_their_scene(tmp_path, log):
     torch.testing.assert_close(matrices[:, :3, 3], expected.float())
 
 
-def test_a_broken_write_leaves_nothing(tmp_path, monkeypatch, log):
+@pytest.mark.parametrize("fault", [KeyboardInterrupt, OSError("no space left on device")])
+def test_a_broken_write_leaves_nothing(tmp_path, monkeypatch, log, fault):
     def fail(*args: object, **kwargs: object) -> None:
-        raise KeyboardInterrupt
+        raise fault
 
     monkeypatch.setattr(analytic, "picture", fail)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises((KeyboardInterrupt, SteerbenchError)):
         analytic.load("void", **SMALL, root=tmp_path, log=log)
     assert list(tmp_path.iterdir()) == []
 

@@ -101,6 +101,7 @@ def placed(place: tuple[int, int], value: float):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        (lambda r: r.update(frames=[]), r"frames: expected a list with at least one entry"),
         (lambda r: r.pop("frames"), r"frames: expected a list .* got nothing"),
         (lambda r: r["frames"].append(3), r"frames\[3\]: expected an object, got 3"),
         (lambda r: frame(r).pop("file_path"), r"frames\[1\].file_path: expected a path"),
@@ -112,6 +113,7 @@ def placed(place: tuple[int, int], value: float):
         (lambda r: r.pop("camera_angle_x"), r"camera_angle_x: .* got nothing"),
         (lambda r: r.update(camera_angle_x=0), r"camera_angle_x: .* above 1e-09 and below 3.14"),
         (lambda r: r.update(camera_angle_x=3.2), r"camera_angle_x: .* got 3.2"),
+        (lambda r: r.update(camera_angle_x="0.7"), r"camera_angle_x: .* got '0.7'"),
         (lambda r: r.update(camera_angle_x=10**400), r"camera_angle_x: expected a finite number"),
         *(
             (lambda r, path=path: frame(r).update(file_path=path), f"file_path: expected {said}")

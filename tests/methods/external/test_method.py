@@ -91,6 +91,23 @@ def test_depths_are_converted_to_scene_units(worker, external, moved_scene, quie
     assert (frame.alpha == 0).all()
 
 
+def test_cameras_are_in_the_units_of_the_data_set(worker, external, moved_scene, quiet_log):
+    lines = """
+    class Looks(Grey):
+        def render(self, camera):
+            values = [*camera.c2w.flatten(), camera.fx, camera.fy, camera.cx, camera.cy]
+            picture = np.zeros((camera.height, camera.width, 3))
+            picture[0, :16, 0] = values
+            return picture
+    """
+    method = external(worker(lines, after="serve(Looks)\n"))
+    method.fit(moved_scene, BUDGET, quiet_log)
+    camera = moved_scene.splits["test"].cameras[1]
+    shown = method.render(camera, NullProbe()).rgb[0, :16, 0]
+    pose = move_camera(camera, 3.0, moved_scene.origin).c2w.flatten()
+    assert torch.equal(shown, torch.cat((pose, torch.tensor([60.0, 60.0, 20.0, 16.0]))))
+
+
 def test_it_sees_only_training_pictures(worker, external, moved_scene, quiet_log, tmp_path: Path):
     lines = f"""
     import json, shutil

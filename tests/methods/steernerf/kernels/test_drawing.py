@@ -81,6 +81,12 @@ def test_memory_is_used_where_it_has_room_and_nothing_needs_a_gradient() -> None
     assert learnt.data_ptr() != memory.data_ptr()
 
 
+def test_gradients_of_what_is_shown_in_float64() -> None:
+    present, values, index = features(dtype=torch.float64)
+    given = present.requires_grad_(), values.requires_grad_()
+    assert torch.autograd.gradcheck(lambda *x: shown(*x, index, 3, backend="reference"), given)
+
+
 @pytest.mark.parametrize("aligned", [True, False])
 def test_gradients_of_a_picture_in_float64(aligned: bool) -> None:
     rgb = torch.rand(2, 3, 3, dtype=torch.float64, requires_grad=True)
