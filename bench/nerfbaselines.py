@@ -22,7 +22,7 @@ import pandas as pd
 
 from bench.errors import explained, unexpected
 from bench.results import IMPORTED, STEADY, Measurement
-from bench.run import UNITS, score_rows, single
+from bench.rows import UNITS, score_rows, single
 from bench.scenes.files import describe, read_json
 from bench.types import Camera
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from bench import metrics, video_metrics
 from bench.errors import unexpected
+from bench.probes import device_waits
 from bench.provenance import sha256
 from bench.published import locate
 from bench.trajectories import Trajectory
@@ -57,7 +58,9 @@ class EvaluationProtocol:
     mixed with those of another. A method keeps its preceding frames along the trajectory ("steady")
     or is reset before every frame ("cold"). The flicker needs true pictures of consecutive frames:
     those with a ground truth have one ("split"), or the scene renders it for the other frames
-    ("exact"), which takes about half a second at 400 x 400. So do the further `columns`.
+    ("exact"), which takes about half a second at 400 x 400. So do the further `columns`. Of several
+    `rounds`, the first is scored, and the others give times and work. Methods that are measured in
+    turns may be `compared`, picture by picture, with the first of them.
     """
 
     name: str = "steerbench-1"
@@ -70,6 +73,9 @@ class EvaluationProtocol:
     memory: str = "steady"
     flicker: str = "split"
     stages: bool = True  # whether to time the stages of a frame: a GPU is waited for at each
+    rounds: int = 1  # through the trajectory
+    compared: bool = False  # with the first in turns: `psnr_to_first`, `worst_to_first`
+    waits: bool = False  # whether to note where the host waits for a GPU
     columns: tuple[str, ...] = ()  # further metrics, of `COLUMNS`
     fps: float = 30.0  # frames a second at which the path is seen, for the JOD
     display: str = "standard_4k"  # on which it is seen, a name of `cvvdp`
@@ -81,7 +87,7 @@ class EvaluationProtocol:
             if getattr(self, option) not in allowed:
                 value = repr(getattr(self, option))
                 raise unexpected(f"protocol.{option}", " or ".join(allowed), value)
-        for option, least in (("warmup", 0), ("lpips_every", 1)):
+        for option, least in (("warmup", 0), ("lpips_every", 1), ("rounds", 1)):
             if (got := getattr(self, option)) < least:
                 raise unexpected(f"protocol.{option}", f"{least} or more", got)
         if not set(self.columns) <= set(COLUMNS):
@@ -104,7 +110,11 @@ class EvaluationProtocol:
 
     def check(self, scene: Scene, trajectory: Trajectory) -> None:
         """Raise SteerbenchError before any training if the frames could not be scored afterwards:
-        another background, no exact pictures for the flicker, a frame smaller than a window."""
+        another background, no exact pictures for the flicker, a frame smaller than a window; or if
+        waits are to be noted and there is no GPU."""
+        if self.waits:
+            with device_waits():
+                pass
         if self.flicker == "exact" and scene.exact is None:
             raise SteerbenchError(
                 f"protocol.flicker=exact: scene {scene.name} has no exact pictures, expected an "
@@ -117,7 +127,8 @@ class EvaluationProtocol:
                 f"protocol {self.name} scores on {self.background}, but scene {scene.name} has "
                 f"background [{got}]: change scene.background, or use another protocol"
             )
-        for width, height in {(s.camera.width, s.camera.height) for s in trajectory.steps}:
+        scored = (step.camera for step in trajectory.steps if step.truth is not None)
+        for width, height in {(camera.width, camera.height) for camera in scored}:
             for metric in self.metric_names:
                 metrics.check_size(metric, width, height)
 

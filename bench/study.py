@@ -22,44 +22,46 @@ def turned(label: str, setting: str, values: Iterable[object], *more: str) -> li
 
 @dataclass(frozen=True)
 class Axis:
-    """A setting that the cost of a frame grows with."""
+    """A setting that quality and cost of a frame grow with, and that needs a training a value."""
 
     label: str  # how a value is shown, "K = {}"
-    setting: str  # its name, "method.model.channels"
+    setting: str  # its name, "method.model.channels"; of the logarithm of a size, "log2_..."
     values: tuple[int, ...]  # to measure
-    size: tuple[float, ...] | None = None  # of each value in the power-law fit; None: the value
+
+    def size(self, value: int) -> float:
+        """What the cost is a power of."""
+        return 2.0**value if self.setting.rpartition(".")[2].startswith("log2_") else value
 
 
 @dataclass(frozen=True)
 class Study:
-    """What can be varied in a method, and which stages it has; every attribute is optional."""
+    """What can be varied in a method, and which stages it has; every attribute is optional.
+
+    The axes that tables of the paper vary (`sweeps/configs/experiment`) need not be declared.
+    """
 
     # By knob, the variants that need no new training (engines and precisions need not be declared),
     # and those that need a training of their own.
     knobs: Mapping[str, Sequence[Variant]] = field(default_factory=dict)
     trained: Mapping[str, Sequence[Variant]] = field(default_factory=dict)
     exact: tuple[str, ...] = ()  # settings that give up no accuracy of the trained model for speed
-    # By what is skipped, the setting that switches this skipping off with `false`; settings shared
-    # by all lines of the study of skips; further savings, each on top of all skips.
+    # By what is skipped, the setting that switches this skipping off with `false`; further savings,
+    # each on top of all skips.
     skips: Mapping[str, str] = field(default_factory=dict)
-    skips_with: tuple[str, ...] = ()
     savings: Sequence[Variant] = ()
-    # By name, what the cost of a frame grows with, beside pixels and threads.
-    axes: Mapping[str, Axis] = field(default_factory=dict)
-    # By stage, the part of a frame that it counts towards, with all stages nested in it. Other
-    # stages are parts of their own.
+    axes: Mapping[str, Axis] = field(default_factory=dict)  # by name, beside pixels and threads
+    # By stage, the part of a frame that it counts towards, with all stages nested in it; "network"
+    # is the part that an engine computes. Other stages are parts of their own.
     parts: Mapping[str, str] = field(default_factory=dict)
-    network_stage: str = ""  # the stage that the engine computes
-    network_size: str = ""  # the name of the network in `Method.sizes`
-    beside: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # settings of other methods
     chosen: tuple[str, ...] = ()  # the method's own settings that no training depends on
 
-    def part_of(self, stage: str) -> str:
-        """The part of a frame that `stage` (for example "field/march") counts towards."""
-        outer = stage
-        while outer and outer not in self.parts:
-            outer = outer.rpartition("/")[0]
-        return self.parts.get(outer, stage)
+
+def part_of(stage: str, parts: Mapping[str, str]) -> str:
+    """The part of a frame that `stage` (for example "field/march") counts towards."""
+    outer = stage
+    while outer and outer not in parts:
+        outer = outer.rpartition("/")[0]
+    return parts.get(outer, stage)
 
 
 def study_of(method: Any) -> Study:

@@ -24,7 +24,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
-from bench.cameras import move_camera
+from bench.cameras import frame_camera, move_camera
 from bench.errors import unexpected
 from bench.motion import between, lens_between, preceding, rotation_between, viewing_target
 from bench.provenance import sha256
@@ -81,6 +81,15 @@ class Trajectory:
         for step in self.steps:
             counts.append(counts[-1] + 1 if counts and not step.cut else 0)
         return counts
+
+
+def resized(trajectory: Trajectory, width: int, height: int) -> Trajectory:
+    """The trajectory with frames of another size, which have no ground truth: only times count."""
+    steps = (
+        replace(step, camera=frame_camera(step.camera, width, height), truth=None)
+        for step in trajectory.steps
+    )
+    return replace(trajectory, steps=tuple(steps))
 
 
 def resolution(sizes: Iterable[tuple[int, int]]) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 from bench.errors import SteerbenchError
-from bench.run import UNITS
+from bench.rows import UNITS
 from reports.runs import Repeated, Run
 from reports.tables import NOT_AVAILABLE, QUALITY, Table, decimal, megabytes
 

@@ -176,6 +176,7 @@ def _table(path: Path, data_sets: Sequence[str]) -> PaperTable:
     grid = {name: str(values).split(",") for name, values in params.items()}
     _, *further = grid.pop(METHOD, [""])
     declared, label = content.pop("lines"), content.pop("label", "{}")
+    content.pop("axis", None)  # for studies
     jobs = [line["job"] for line in declared if "job" in line] or [
         {name: value} for name, values in grid.items() for value in values
     ]

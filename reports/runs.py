@@ -16,7 +16,7 @@ from bench.errors import SteerbenchError
 from bench.intervals import half_interval
 from bench.neighbours import Neighbours
 from bench.results import COLD, STEADY, WHOLE, Store, content_key, unreadable
-from bench.run import phase_rows
+from bench.rows import phase_rows
 from reports.tables import phases, run_tables
 
 FIGURES = ("metric", "unit", "phase", "value", "n", "lo", "hi")

@@ -81,6 +81,14 @@ def decimal(value: float | None, decimals: int) -> str:
     return f"{round(value, decimals) + 0.0:,.{decimals}f}"
 
 
+def amount(value: float) -> str:
+    """A count: 12,345 or 1.23 M."""
+    for size, letter in ((1e9, "G"), (1e6, "M")):
+        if value >= size:
+            return f"{decimal(value / size, 2)} {letter}"
+    return decimal(value, 0)
+
+
 def megabytes(size: float | None) -> str:
     """Bytes as MB = 10^6 bytes."""
     return decimal(None if size is None else size / 1e6, 2)

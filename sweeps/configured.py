@@ -6,7 +6,7 @@ All raise SteerbenchError, which names the setting, if one is wrong or cannot be
 from __future__ import annotations
 
 import inspect
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, lru_cache
 from pathlib import Path
@@ -42,6 +42,7 @@ class Settings:
     backend: str
     threads: int | None
     pictures: int
+    frame_size: Sequence[int] | None
     outputs: str
     weights_dir: str | None
     tracker: str | None
@@ -60,6 +61,9 @@ def checked_settings(config: DictConfig) -> Settings:
         raise unexpected("threads", "1 or more, or null", settings.threads)
     if settings.pictures < 0:
         raise unexpected("pictures", "0 or more", settings.pictures)
+    size = settings.frame_size
+    if size is not None and (len(size) != 2 or min(size) < 1):
+        raise unexpected("frame_size", "[WIDTH, HEIGHT], each 1 or more, or null", size)
     if settings.tracker is not None:
         tracker(settings.tracker)
     if not DEVICE.fullmatch(settings.device):

@@ -12,9 +12,10 @@ import sys
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import as_completed
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -28,20 +29,23 @@ from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from bench.console import ConsoleLog
-from bench.errors import explained
+from bench.errors import SteerbenchError, Unavailable, explained
 from bench.results import content_key
 from bench.sharing import whole
 from bench.study import study_of
 from reports.runs import load
 from reports.tables import decimal
 from sweeps.configured import build, trained
-from sweeps.measurement import Job, JobFailed, obtain, reason
+from sweeps.measurement import Job, JobFailed, obtain, reason, stored
 from sweeps.overrides import CONFIGS, composed, explain, setting, target_of
 from sweeps.processes import device_lock, on_gpu, processes, set_up
 from sweeps.terminal import time_left
 
 OF_MEASUREMENT = ("engine", "precision", "protocol", "pictures")
 """Settings of run.yaml that no training depends on."""
+
+Group = list[tuple[int, Job]]
+"""Jobs that are measured together, each with its number among all."""
 
 W = TypeVar("W")
 R = TypeVar("R")
@@ -160,7 +164,7 @@ def read(folder: Path) -> list[Ended]:
     return sorted((Ended(**json.loads(text)) for text in texts), key=lambda job: job.number)
 
 
-def attempt(numbered: Sequence[tuple[int, Job]], total: int, folder: Path) -> list[Exception]:
+def attempt(numbered: Group, total: int, folder: Path) -> list[Exception]:
     """Obtain the runs of jobs that are measured together; print, and record in `folder`, how each
     ended.
 
@@ -224,6 +228,62 @@ def _progress(folder: Path, total: int) -> str:
     measured = sum(job.measured for job in ended)
     left = time_left(seconds, measured, total - len(ended))
     return f"; {len(ended)} of {total} jobs done{left}"
+
+
+# All jobs of a command
+
+
+def run_jobs(jobs: Sequence[Job], launcher: Launcher) -> int:
+    """Run the jobs, equal ones only once; return how many of those that can run here failed.
+
+    Goes scene by scene, and measures what has the first seed, then what has the next. Where there
+    is room in this process, the models that the store lacks are trained before, in parallel;
+    otherwise each job trains what it needs.
+    """
+    distinct = {job.key: job for job in reversed(jobs)}
+    jobs = [job for job in jobs if distinct[job.key] is job]
+    scenes, seeds = [job.scene for job in jobs], [job.config.seed for job in jobs]
+    jobs.sort(key=lambda job: (scenes.index(job.scene), seeds.index(job.config.seed)))
+    ahead, failed = launcher.in_process and room(jobs[0].config) > 1, 0
+    of_scenes = [list(some) for _, some in groupby(jobs, lambda job: job.scene)]
+    for some in of_scenes if ahead else [jobs]:
+        groups, measured = _groups(some, look_up=ahead)
+        if ahead:
+            train_ahead(some, measured)
+        total = sum(map(len, groups))
+        failed += sum(launcher.run(partial(_attempted, total=total), groups))
+    return failed
+
+
+def _groups(jobs: Sequence[Job], look_up: bool) -> tuple[list[Group], set[str]]:
+    """The jobs that are measured in turns, together.
+
+    With `look_up`, without those that the store has; and the keys of these.
+    """
+    by_turns: dict[str, list[Job]] = {}
+    for job in jobs:
+        by_turns.setdefault(job.turns or job.key, []).append(job)
+    groups: list[Group] = []
+    measured: set[str] = set()
+    for together in by_turns.values():
+        found: dict[str, Job] = {}
+        with suppress(SteerbenchError):  # a job that cannot start says so when it is measured
+            found = stored(together) if look_up else {}
+        for run, job in found.items():
+            say(job, run)
+        known = {job.key for job in found.values()}
+        if left := [job for job in together if job.key not in known]:
+            groups.append(list(enumerate(left, sum(map(len, groups)))))
+        measured |= known
+    return groups, measured
+
+
+def _attempted(group: Group, total: int) -> int:
+    """Attempt jobs that are measured together; return how many failed that can run here."""
+    for number, job in group:
+        print(f"{number + 1} of {total}, {job.name}", file=sys.stderr)
+    errors = attempt(group, total, Path(HydraConfig.get().runtime.output_dir))
+    return sum(not isinstance(error, Unavailable) for error in errors)
 
 
 # Trainings in parallel, because small ones gain little from a second core

@@ -17,14 +17,15 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, explained, unexpected
+from bench.measure import MethodFailed, Task, measure
 from bench.provenance import computed_by
 from bench.results import Store, content_key
-from bench.run import MethodFailed, Task, measure
 from bench.sharing import whole
+from bench.trajectories import resized
 from bench.types import Log, Method
-from reports.runs import load
+from reports.runs import Run, load, readable
 from reports.trackers import tracker
-from sweeps.configured import build, checked_settings, scene_folder, scene_of
+from sweeps.configured import build, checked_settings, scene_digest, scene_folder, scene_of
 from sweeps.overrides import target_of
 from sweeps.processes import device_lock
 
@@ -77,6 +78,7 @@ class Job:
     command: Sequence[str]  # the words that make it alone, for the record
     name: str = ""  # at the terminal
     turns: str = ""
+    scene: str = ""  # its scene in a data set, empty without a data set
 
     @cached_property
     def settings(self) -> dict[str, Any]:
@@ -178,22 +180,30 @@ def _ready(jobs: Sequence[Job], log: Log) -> list[_Ready]:
     """The `jobs`, ready to be measured.
 
     With `turns`, each key includes the keys of all of them: if one job changes, all are measured
-    again.
+    again. Where pictures are compared with those of the first, nothing is measured without it.
     """
-    ready = []
+    ready: list[_Ready] = []
     for job in jobs:
         try:
             ready.append(_prepared(job, log))
         except Exception as error:
-            if len(jobs) == 1:
+            if len(jobs) == 1 or _needed(job, jobs):
                 raise
             raise JobFailed(job) from error
     if not jobs[0].turns:
         return ready
     if any(each.task.budget != ready[0].task.budget for each in ready):
         raise SteerbenchError("budget: expected the same for all that is measured in turns")
-    beside = sorted(content_key(each.parts) for each in ready)
-    return [replace(each, parts={**each.parts, "beside": beside}) for each in ready]
+    keys = [content_key(each.parts) for each in ready]
+    shared: dict[str, Any] = {"beside": sorted(keys)}
+    if ready[0].task.protocol.compared:
+        shared["compared_with"] = keys[0]
+    return [replace(each, parts={**each.parts, **shared}) for each in ready]
+
+
+def _needed(job: Job, jobs: Sequence[Job]) -> bool:
+    """Whether the pictures of all `jobs` are compared with those of `job`."""
+    return job is jobs[0] and bool(job.config.protocol.get("compared"))
 
 
 def _prepared(job: Job, log: Log) -> _Ready:
@@ -202,6 +212,8 @@ def _prepared(job: Job, log: Log) -> _Ready:
     method, budget, protocol = (build(config, name) for name in ("method", "budget", "protocol"))
     scene = scene_of(config)
     trajectory = build(config, "trajectory", scene)
+    if settings.frame_size:
+        trajectory = resized(trajectory, *settings.frame_size)
     weights = Path(settings.weights_dir) if settings.weights_dir else None
     files = (*getattr(method, "reads", ()), *trajectory.reads)
     parts = {
@@ -246,12 +258,16 @@ def _measure(ready: Sequence[_Ready], log: Log) -> None:
         measurements = measure([each.method for each in ready], ready[0].task, log)
     except MethodFailed as failed:
         (job,) = (each.job for each in ready if each.method is failed.method)
+        if _needed(job, [each.job for each in ready]) and failed.__cause__:
+            raise failed.__cause__ from None
         raise JobFailed(job) from failed.__cause__
     for each in ready if len(ready) > 1 else ():
         each.job.store.remove(each.run)
     for each, measurement in zip(ready, measurements, strict=True):
         command, place = shlex.join(each.job.command), scene_folder(each.job.config)
         record = {**measurement.record, "command": command, "scene_path": place}
+        if each.task.protocol.compared:
+            record["compared_with"] = ready[0].run
         each.job.store.save(each.parts, replace(measurement, record=record))
 
 
@@ -267,3 +283,29 @@ def send(config: DictConfig, run: str, label: str) -> None:
         log.info(f"sent to {config.tracker}: {run}")
     except Exception as error:  # third-party library: any exception
         log.info(f"not sent to {config.tracker}: {run}: {reason(error)}")
+
+
+def newest(store: Store) -> dict[str, list[Run]]:
+    """The latest run of each job and scene, by job key, newest first.
+
+    A job has several if its settings fit scenes in different folders.
+    """
+    of_jobs: dict[str, dict[str, Run]] = {}
+    for run in reversed(readable(store)):
+        parts = run.record["made_of"]
+        if "config" in parts:
+            of_job = of_jobs.setdefault(job_key(parts["config"], parts.get("turns", "")), {})
+            of_job.setdefault(run.record["scene"]["digest"], run)
+    return {job: list(of_scenes.values()) for job, of_scenes in of_jobs.items()}
+
+
+def of_scene(run: Run, config: DictConfig) -> bool:
+    """Whether `run`, which has the settings of `config`, also has its scene.
+
+    The settings do not tell apart folders with the same last name. If the folder does not exist
+    here, only this name counts.
+    """
+    folder = scene_folder(config)
+    if folder is None or run.record.get("scene_path") == folder or not Path(folder).is_dir():
+        return True
+    return run.record["scene"]["digest"] == scene_digest(config)

@@ -55,13 +55,14 @@ def composed(words: Sequence[str], **options: bool) -> DictConfig:
 
 
 def settled(config: DictConfig) -> DictConfig:
-    """`config` as a run needs it: without the declaration of a table, which only reports read, and
-    with the validation trajectory if split=validation asks for it.
+    """`config` as a run needs it: without the declaration of a table or a study, which only plans
+    read, and with the validation trajectory if split=validation asks for it.
 
     From here on only the trajectory determines which pictures are scored, hence held out.
     """
     with open_dict(config):
-        config.pop("table", None)
+        for declared in ("table", "study"):
+            config.pop(declared, None)
     asked, there = (OmegaConf.select(config, name) for name in ("split", "trajectory.split"))
     if asked == VALIDATION and there != VALIDATION:
         node = OmegaConf.load(CONFIGS / "trajectory" / f"{VALIDATION}.yaml")

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from sweeps.commands.breakdown import DENSE
 
 from bench.results import Store
-from sweeps.commands.breakdown import DENSE
 
 pytestmark = pytest.mark.slow
 

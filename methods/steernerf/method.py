@@ -11,7 +11,7 @@ from typing import ClassVar
 import torch
 
 from bench.provenance import digest
-from bench.study import Axis, Study, Variant, turned
+from bench.study import Study, Variant, turned
 from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.engines import Built, Engine
@@ -33,7 +33,6 @@ SKIPS = {
     "hidden and faint samples": f"{HOW}.skip.hidden",
     "background": f"{HOW}.skip.background",
 }
-TABLES = (14, 16, 17, 19)  # sizes of the hash table, log2 T
 
 RANGES = turned("range", f"{HOW}.range.epsilon", (0.01, 0.03, 0.1), f"{HOW}.range.mode=paper")
 STUDY = Study(
@@ -45,12 +44,7 @@ STUDY = Study(
         "stop": turned("stop", f"{HOW}.stop", ("1e-1", "3e-2", "1e-3", "1e-4")),
         "range reduction": RANGES,
     },
-    trained={
-        "L, trained": turned("L", "method.model.frames", (0, 1, 3)),
-        "K, trained": turned("K", "method.model.channels", (3, 9)),
-        "log2 T, trained": turned("log2 T", "method.grid.log2_table", (15, 19)),
-        "field, trained": turned("field", "method.precision", ("fp32",)),
-    },
+    trained={"field, trained": turned("field", "method.precision", ("fp32",))},
     exact=(
         f"{HOW}.range.mode=off",
         f"{HOW}.step=1",
@@ -59,11 +53,6 @@ STUDY = Study(
     ),
     skips=SKIPS,
     savings=(Variant("all, and range reduction", (f"{HOW}.range.mode=paper",)),),
-    axes={
-        "L": Axis("L = {}", "method.model.frames", (0, 1, 2, 3)),
-        "K": Axis("K = {}", "method.model.channels", (3, 6, 9)),
-        "T": Axis("T = 2^{}", "method.grid.log2_table", TABLES, tuple(2.0**n for n in TABLES)),
-    },
     parts={
         "field": "field",
         "depth_reprojection": "reprojection",
@@ -72,9 +61,6 @@ STUDY = Study(
         "renderer2d/network": "network",
         "finish": "finish",
     },
-    network_stage="renderer2d/network",
-    network_size="renderer2d",
-    beside={"Instant-NGP": ("method=ngp",)},
     chosen=("rendering", "after", "engine"),
 )
 """What studies vary, and the stages of a frame."""

@@ -4,6 +4,8 @@
 code beside the sources until they change. A kernel is compiled by computing its cases, which covers
 all types of inputs.
 
+`--experiments` prints run time against error of those whose exact answer is known.
+
 `--worth` prints what the fast version of each kernel brings to each method. A method is trained for
 a moment. Then it renders the same frames, and trains as briefly again, in turns: with all kernels
 as they are, and with one of them computed by its reference.
@@ -13,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import math
 import os
 import sys
 import tempfile
@@ -20,7 +23,8 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import as_completed
 from contextlib import AbstractContextManager, nullcontext
-from math import inf
+from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -28,20 +32,20 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from bench.accuracy import render_in_turns
 from bench.case import failed, timed_rows
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, unexpected
+from bench.experiments import experiment_rows
+from bench.measure import Task, measure
 from bench.types import Camera, Frame, Method, NullProbe, Probe, Scene
 from methods import checks
 from methods.kernels import compiled
 from methods.kernels.dispatch import forced, kernel_calls
 from reports.tables import Table, decimal
-from sweeps.configured import build, checked_settings
+from sweeps.configured import build, checked_settings, scene_of
 from sweeps.overrides import choices, composed, swept
 from sweeps.processes import device_lock, processes
 from sweeps.terminal import print_rows, show
-from sweeps.variants import Row, common_ground
 
 COLUMNS = (
     *("kernel", "case", "backend", "dtype", "error", "tolerance"),
@@ -55,7 +59,14 @@ OF_WORTH = (
 )
 """`brings`: the share that the fast version saves of a frame or of a training, the larger one."""
 
-SETTINGS = ("scene=totem", "scene.width=100", "trajectory=orbit", "budget=tiny")
+OF_EXPERIMENTS = ("computed", "knob", "setting", "largest error ↓", "ms ↓", "observed order")
+
+SETTINGS = (
+    *("scene=totem", "scene.width=100", "trajectory=orbit", "budget=tiny", "protocol=study-1"),
+    "protocol.compared=false",
+)
+
+Row = dict[str, Any]
 
 AS_IT_IS = ""  # in place of the name of a kernel: none is computed by its reference
 
@@ -66,7 +77,11 @@ def main(options: argparse.Namespace) -> int:
         return _compile()
     if options.overrides and not options.worth:
         raise unexpected("settings", "none without --worth", " ".join(options.overrides))
-    if options.worth:
+    if options.experiments:
+        with device_lock("cpu", log := ConsoleLog(Path())):
+            rows = experiment_rows(checks.found("experiments"), options.repeats, log)
+        table = experiment_table(rows)
+    elif options.worth:
         rows = _worth(options)
         title = "What the fast version of a kernel brings"
         table = Table(title, OF_WORTH, tuple(map(_line_of_worth, rows)))
@@ -116,7 +131,7 @@ def _saving_most_first(rows: Sequence[Row]) -> list[Row]:
     reference_ms = {computed(row): row.get("ms") for row in rows if row["backend"] == "reference"}
     shown = (row for row in rows if row["backend"] != "reference" or row["status"] != "ok")
     compared = [{**row, "reference_ms": reference_ms.get(computed(row))} for row in shown]
-    return sorted(compared, key=lambda row: row.get("ms", -inf) - (row["reference_ms"] or 0.0))
+    return sorted(compared, key=lambda row: row.get("ms", -math.inf) - (row["reference_ms"] or 0.0))
 
 
 def _line(row: Mapping[str, Any]) -> tuple[str, ...]:
@@ -157,22 +172,28 @@ def _rows_of_worth(words: Sequence[str], options: argparse.Namespace) -> list[Ro
     config = composed(words)
     settings = checked_settings(config)
     log = ConsoleLog(Path(settings.outputs))
-    scene, path, protocol = common_ground(config, options.frames)
+    scene, budget = scene_of(config), build(config, "budget")
+    path = build(config, "trajectory", scene)
+    protocol = replace(build(config, "protocol"), rounds=1 + options.repeats)
+    task = Task(scene, path, protocol, budget, settings.seed, pictures=0)
     with device_lock(settings.device, log), tempfile.TemporaryDirectory() as folder:
+        quiet = ConsoleLog(Path(folder), quiet=True)
         with kernel_calls() as in_training:
             method = _fitted(config, scene, folder)
         with kernel_calls() as in_frames, torch.no_grad():
-            for step in path.steps:
+            method.reset()
+            for step in path.steps[: method.memory + 1]:
                 method.render(step.camera, NullProbe())
-        kernels = (AS_IT_IS, *wanted(in_frames))
+        kernels = (AS_IT_IS, *sorted(wanted(in_frames)))
         # Each line has the same training, but frames before of its own.
-        lines: dict[str, Any] = {x: Forced(_fitted(config, scene, folder), x) for x in kernels}
-        rendered = render_in_turns(lines, scene, path, protocol, options.repeats, log)
+        lines = [Forced(_fitted(config, scene, folder), kernel) for kernel in kernels]
+        rendered = measure(lines, task, quiet)
         trained: dict[str, list[float]] = {one: [] for one in (AS_IT_IS, *wanted(in_training))}
         for _ in range(options.repeats):
             for kernel, seconds in trained.items():
                 seconds.append(_training_s(config, scene, kernel))
-    frame_ms = {row["setting"]: row["ms"] for row in rendered}
+    rows = (of.rows.set_index("metric")["value"] for of in rendered)
+    frame_ms = {kernel: of["frame_ms"] for kernel, of in zip(kernels, rows, strict=True)}
     return [
         {
             "method": method.name,
@@ -230,3 +251,32 @@ def _line_of_worth(row: Row) -> tuple[str, ...]:
         cells += [decimal(own, digits), decimal(other, digits), decimal(ratio, 2)]
         saved += [] if ratio is None else [1 - 1 / ratio]
     return (row["method"], row["kernel"], *cells, f"{max(saved):.0%}")
+
+
+def experiment_table(rows: Sequence[Row]) -> Table:
+    """One line per experiment: its first and last setting, and the observed order."""
+    lines = []
+    for subject, some in groupby(rows, lambda row: row["subject"]):
+        first, *others = some
+        ends = [first, *others[-1:]]
+        order = ""
+        if first["order"] is not None:
+            span = f"{_setting(first['order_from'])} to {_setting(first['order_to'])}"
+            order = f"{first['order']:.2f} ({span})"
+        figures = zip(*map(_trial, ends), strict=True)
+        lines.append((subject, first["knob"], *map(" to ".join, figures), order))
+    title = "Run time against error, where the exact answer is known"
+    return Table(title, OF_EXPERIMENTS, tuple(lines))
+
+
+def _trial(row: Row) -> tuple[str, str, str]:
+    return _setting(row["setting"]), f"{row['error']:.1e}", decimal(row["ms"], 2)
+
+
+def _setting(value: float | str) -> str:
+    """A short number, with powers of two below 1 as fractions; text is unchanged."""
+    if isinstance(value, str):
+        return value
+    if 0 < value < 1 and math.frexp(value)[0] == 0.5:
+        return f"1/{1 / value:.0f}"
+    return f"{value:g}"

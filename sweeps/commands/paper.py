@@ -7,31 +7,22 @@ import argparse
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
-from functools import partial
-from itertools import chain, groupby
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
-
-from bench.errors import SteerbenchError, Unavailable
+from bench.errors import SteerbenchError
 from bench.results import Store
 from reports import export
 from reports.outliers import outlier_table, outliers
 from reports.paper_page import write_paper_page
-from reports.runs import Repeated, Run, over_common_frames, over_scenes, readable
-from sweeps.configured import scene_digest, scene_folder
-from sweeps.execute import Launcher, attempt, divided, room, say, train_ahead
-from sweeps.measurement import job_key, stored
+from reports.runs import Repeated, Run, over_common_frames, over_scenes
+from sweeps.execute import Launcher, divided, run_jobs
+from sweeps.measurement import newest, of_scene
 from sweeps.overrides import composed
 from sweeps.plan import DataSet, Planned, chosen, data_sets, find, plan, scenes_of
 from sweeps.terminal import console, show
-
-Group = list[tuple[int, Planned]]
-"""Jobs that are measured together, each with its number among all."""
 
 DATA = "data="  # prefix of the word that names the folder of a data set
 
@@ -54,7 +45,7 @@ def main(options: argparse.Namespace) -> int:
     outputs = Path(jobs[0].config.outputs)
     failed = 0
     if options.command == "paper":
-        failed = _run(jobs, Launcher([*options.config_dir, *of_hydra], outputs))
+        failed = run_jobs(jobs, Launcher([*options.config_dir, *of_hydra], outputs))
     runs = newest(Store(outputs))
     broken = outliers(list(chain(*runs.values())))
     folder = options.report or outputs / "paper"
@@ -80,59 +71,6 @@ def data_set(words: Sequence[str]) -> tuple[list[str], DataSet | None]:
     return settings, find(named[-1].removeprefix(DATA)) if named else None
 
 
-def _run(jobs: Sequence[Planned], launcher: Launcher) -> int:
-    """Run the jobs, equal ones only once; return how many of those that can run here failed.
-
-    Goes scene by scene: measures all lines of all tables with the first seed, then with the next.
-    Where there is room in this process, the models that the store lacks are trained before, in
-    parallel; otherwise each job trains what it needs.
-    """
-    distinct = {job.key: job for job in reversed(jobs)}
-    jobs = [job for job in jobs if distinct[job.key] is job]
-    scenes, seeds = [job.scene for job in jobs], [job.config.seed for job in jobs]
-    jobs.sort(key=lambda job: (scenes.index(job.scene), seeds.index(job.config.seed)))
-    ahead, failed = launcher.in_process and room(jobs[0].config) > 1, 0
-    of_scenes = [list(some) for _, some in groupby(jobs, lambda job: job.scene)]
-    for some in of_scenes if ahead else [jobs]:
-        groups, measured = _groups(some, look_up=ahead)
-        if ahead:
-            train_ahead(some, measured)
-        total = sum(map(len, groups))
-        failed += sum(launcher.run(partial(_attempted, total=total), groups))
-    return failed
-
-
-def _groups(jobs: Sequence[Planned], look_up: bool) -> tuple[list[Group], set[str]]:
-    """The jobs that are measured in turns, together.
-
-    With `look_up`, without those that the store has; and the keys of these.
-    """
-    by_turns: dict[str, list[Planned]] = {}
-    for job in jobs:
-        by_turns.setdefault(job.turns or job.key, []).append(job)
-    groups: list[Group] = []
-    measured: set[str] = set()
-    for together in by_turns.values():
-        found: dict[str, Planned] = {}
-        with suppress(SteerbenchError):  # a job that cannot start says so when it is measured
-            found = stored(together) if look_up else {}
-        for run, job in found.items():
-            say(job, run)
-        known = {job.key for job in found.values()}
-        if left := [job for job in together if job.key not in known]:
-            groups.append(list(enumerate(left, sum(map(len, groups)))))
-        measured |= known
-    return groups, measured
-
-
-def _attempted(group: Group, total: int) -> int:
-    """Attempt jobs that are measured together; return how many failed that can run here."""
-    for number, job in group:
-        print(f"{number + 1} of {total}, {job.name}", file=sys.stderr)
-    errors = attempt(group, total, Path(HydraConfig.get().runtime.output_dir))
-    return sum(not isinstance(error, Unavailable) for error in errors)
-
-
 def _check(store: Store) -> int:
     runs = list(chain(*newest(store).values()))
     broken = outliers(runs)
@@ -149,20 +87,6 @@ class Outcome(NamedTuple):
     job: Planned
     run: Run | None
     gap: str | None
-
-
-def newest(store: Store) -> dict[str, list[Run]]:
-    """The latest run of each job and scene, by job key, newest first.
-
-    A job has several if its settings fit scenes in different folders.
-    """
-    of_jobs: dict[str, dict[str, Run]] = {}
-    for run in reversed(readable(store)):
-        parts = run.record["made_of"]
-        if "config" in parts:
-            of_job = of_jobs.setdefault(job_key(parts["config"], parts.get("turns", "")), {})
-            of_job.setdefault(run.record["scene"]["digest"], run)
-    return {job: list(of_scenes.values()) for job, of_scenes in of_jobs.items()}
 
 
 def gather(jobs: Sequence[Planned], runs: Mapping[str, Sequence[Run]]) -> dict[str, list[Repeated]]:
@@ -187,18 +111,6 @@ def _outcome(job: Planned, runs: Sequence[Run]) -> Outcome:
         why = failure and f"failed when it was tried again: {failure}"
         return Outcome(job, replace(run, label=job.line), why)
     return Outcome(job, None, f"failed: {failure}" if failure else "not measured yet")
-
-
-def of_scene(run: Run, config: DictConfig) -> bool:
-    """Whether `run`, which has the settings of `config`, also has its scene.
-
-    The settings do not tell apart folders with the same last name. If the folder does not exist
-    here, only this name counts.
-    """
-    folder = scene_folder(config)
-    if folder is None or run.record.get("scene_path") == folder or not Path(folder).is_dir():
-        return True
-    return run.record["scene"]["digest"] == scene_digest(config)
 
 
 def _lines(of_block: Mapping[str, Sequence[Outcome]]) -> list[Repeated]:

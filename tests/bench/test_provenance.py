@@ -14,8 +14,8 @@ import torch
 
 from bench import provenance
 from bench.errors import SteerbenchError
+from bench.measure import measure
 from bench.provenance import computed_by, libraries
-from bench.run import measure
 from methods.instant_ngp.stage1 import train_field
 
 commit = provenance.commit.__wrapped__

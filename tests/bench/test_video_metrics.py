@@ -16,9 +16,9 @@ from PIL import Image
 from torch import Tensor
 
 from bench.cameras import cast, pixel_grid
+from bench.measure import Task, measure
 from bench.metrics import as_bytes, flicker, psnr
 from bench.protocol import EvaluationProtocol, Scoring
-from bench.run import Task, measure
 from bench.scenes import analytic
 from bench.trajectories import from_split
 from bench.types import Budget, Camera, SteerbenchError, Unavailable, composite

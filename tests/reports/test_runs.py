@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from bench.results import COLD, STEADY
-from bench.run import phase_rows
+from bench.rows import phase_rows
 from reports.paper_tables import Line, PaperTable, section
 from reports.publish import markdown
 from reports.runs import Repeated, Run, over_common_frames, over_scenes

@@ -86,11 +86,8 @@ class Shades(Grey):
         exact=("method.skip.left=false",),
         skips={"left half": "method.skip.left", "right half": "method.skip.right"},
         savings=[Variant("all, and half as bright", ("method.level=0.25",))],
-        axes={"N": Axis("N = 2^{}", "method.log2_layers", (0, 3), (1.0, 8.0))},
-        parts={"paint": "painting"},
-        network_stage="paint/network",
-        network_size="level",
-        beside={"a twin": ("method=shades",), "plain grey": ("method=grey",)},
+        axes={"N": Axis("N = 2^{}", "method.log2_layers", (0, 3))},
+        parts={"paint": "painting", "paint/network": "network"},
     )
 
     def __init__(

@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 from hydra.utils import get_object
 from omegaconf import OmegaConf
+from sweeps.variants import declared
 
 from bench.study import Study, Variant
 from methods.steernerf_lean.method import PAPERS
 from sweeps.overrides import CONFIGS, choices, composed, leaves
-from sweeps.variants import declared
 
 GROUPS = ("method", "scene", "trajectory", "protocol", "budget")
 CHOICES = [f"{group}={name}" for group in GROUPS for name in choices(group)]

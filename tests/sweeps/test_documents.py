@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
+from sweeps.variants import METHOD
 
 from sweeps import cli, overrides
 from sweeps.overrides import choices, composed, swept
 from sweeps.plan import chosen, plan
-from sweeps.variants import METHOD
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"

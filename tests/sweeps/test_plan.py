@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from sweeps.commands.breakdown import with_engine
 
 from bench.errors import SteerbenchError
 from methods.engines import openvino_engine
 from reports.paper_tables import DATA_SETS
-from sweeps.commands.breakdown import with_engine
 from sweeps.commands.paper import data_set
 from sweeps.measurement import described
 from sweeps.overrides import composed, setting

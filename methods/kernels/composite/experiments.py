@@ -14,7 +14,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from bench.accuracy import Experiment, Trial
+from bench.experiments import Experiment, Trial
 from bench.types import Rays
 from methods.kernels.composite import composite
 from methods.kernels.march import march

@@ -6,12 +6,12 @@ import math
 
 import pytest
 import torch
+from sweeps.commands.scaling import growth
+from sweeps.variants import fitted
 
 from bench.errors import SteerbenchError, Unavailable
 from bench.study import Study
-from sweeps.commands.scaling import growth
 from sweeps.overrides import engine_kinds
-from sweeps.variants import fitted
 from tests.sweeps.conftest import STAND_INS, Outcome
 
 FRAMES = ["--frames", "2", "--repeats", "1"]

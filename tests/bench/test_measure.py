@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-import bench.run
+import bench.measure
 from bench.intervals import path_interval
+from bench.measure import MethodFailed, Task, measure
 from bench.metrics import psnr, quantise
 from bench.protocol import EvaluationProtocol
 from bench.results import COLUMNS
-from bench.run import MethodFailed, Task, measure
 from bench.trajectories import from_split
 from bench.types import Budget, SteerbenchError, composite
 
@@ -171,7 +171,7 @@ def test_the_memory_of_a_process_is_measured_before_scoring_leaves_any_in_it(
             regions.extend(offset_method.calls[self.before :])
 
     regions: list[str] = []
-    monkeypatch.setattr(bench.run, "MemoryMeter", Meter)
+    monkeypatch.setattr(bench.measure, "MemoryMeter", Meter)
     run(offset_method, protocol=replace(QUICK, warmup=warmup))
     assert regions == metered
 

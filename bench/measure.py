@@ -1,4 +1,5 @@
-"""One run: Method x Scene x Trajectory x Protocol -> rows.
+"""One run: Method x Scene x Trajectory x Protocol -> rows. The only loop that renders frames for
+figures is here: `_render`.
 
 Quality, time and memory of a run come from the same rendering of the same frames.
 """
@@ -6,6 +7,7 @@ Quality, time and memory of a run come from the same rendering of the same frame
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
@@ -16,23 +18,19 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
+from torch import Tensor
 
 from bench.allocator import give_back
-from bench.intervals import path_interval
-from bench.metrics import Lpips
+from bench.errors import unexpected
+from bench.metrics import Lpips, psnr_of_mse
 from bench.neighbours import Neighbours, Watch
-from bench.probes import MemoryMeter, StageClock
+from bench.probes import FrameRecord, Line, MemoryMeter, StageClock, device_waits
 from bench.protocol import ERROR_RANGE, PICTURES, EvaluationProtocol, Scoring, check_frame
-from bench.results import COLD, STEADY, WHOLE, Measurement
+from bench.results import COLD, STEADY, Measurement
+from bench.rows import UNITS, phase_rows, single
+from bench.study import study_of
 from bench.trajectories import Trajectory, spread
 from bench.types import Budget, Log, Method, Scene
-
-QUANTILES = (50, 95, 99)
-UNITS = {
-    **{"psnr": "dB", "tpsnr": "dB", "jod": "JOD", "fps": "1/s", "work": "1/frame", "train_s": "s"},
-    **{"frame_ms": "ms", "wall_ms": "ms", "stage_ms": "ms", "size_bytes": "B", "peak_bytes": "B"},
-}
-"""Units of metrics, by name up to the first dot; other metrics have no unit."""
 
 
 @dataclass(frozen=True)
@@ -71,12 +69,16 @@ def measure(methods: Sequence[Method], task: Task, log: Log) -> list[Measurement
     """Fit `methods` to the scene of `task`; render its trajectory under the clock and score it.
 
     Several methods render each frame one after the other, so that their times come from the same
-    minutes. Peak memory of the process is that of all methods together. Raises SteerbenchError if
-    the scene does not fit the protocol, or a method rendered values that are not finite; of several
-    methods, MethodFailed for whatever one of them raises.
+    minutes. The first round through the trajectory is scored; with `protocol.rounds`, times and
+    work come from that further round whose mean time of the steady frames is the lower median.
+    Peak memory of the process is that of all methods together. Raises SteerbenchError if the scene
+    does not fit the protocol, or a method rendered values that are not finite; of several methods,
+    MethodFailed for whatever one of them raises.
     """
     lpips, missing = task.protocol.load_lpips(task.weights_dir, log)
     task.protocol.check(task.scene, task.trajectory)
+    if task.protocol.compared:
+        _check_steady(methods, task.trajectory)
     for split in task.scene.splits.values():
         list(split.images)  # decode now, so damaged files raise here, not during training or timing
     for method in methods:
@@ -93,6 +95,16 @@ def measure(methods: Sequence[Method], task: Task, log: Log) -> list[Measurement
     return measurements
 
 
+def _check_steady(methods: Sequence[Method], trajectory: Trajectory) -> None:
+    """Raise SteerbenchError unless a frame with a ground truth has, since the last cut, as many
+    frames before it as the method with the longest memory uses."""
+    start, steps = max(method.memory for method in methods), trajectory.steps
+    pairs = zip(trajectory.preceding, steps, strict=True)
+    if not any(before >= start and step.truth is not None for before, step in pairs):
+        expected = f"a frame with a ground truth and {start} frames before it, without a cut"
+        raise unexpected(trajectory.name, expected, f"none in {len(steps)}; give more frames")
+
+
 class _Take:
     """A method being measured: its clock, memory meter, scoring, and a row per rendered frame."""
 
@@ -104,7 +116,9 @@ class _Take:
         shown = {scored[n] for n in spread(len(scored), task.pictures)}
         scene = task.scene
         self.scoring = Scoring(task.protocol, lpips, scene.background, shown, scene.surface)
-        self.rows: list[dict[str, Any]] = []
+        self.rows: list[dict[str, Any]] = []  # of the first round
+        self.apart: list[Apart] = []  # of its steady frames with a ground truth
+        self.waits: list[dict[Line, int]] = []  # of its steady frames, if the protocol counts them
 
     def metered(self, *, warm: bool = False) -> AbstractContextManager[object]:
         """The meter, around a frame whose memory counts; around others, nothing.
@@ -141,6 +155,32 @@ class _Take:
             return "read here, after the device has finished its work"
         return "read by the process that rendered; wall_ms: read here, with the way there and back"
 
+    def timed(self, warmup: int) -> tuple[list[FrameRecord], list[float]]:
+        """The records of the frames that are reported: of the only round or, of several, of that
+        timed one whose mean time of the steady frames is the lower median; all such means, in ms.
+        The first `warmup` records are of no round."""
+        count = len(self.rows)
+        records = self.clock.frames[warmup:]
+        rounds = [records[begin : begin + count] for begin in range(0, len(records), count)]
+        rounds = rounds[1:] or rounds
+        steady = [n for n, row in enumerate(self.rows) if row["phase"] == STEADY] or range(count)
+        means = [statistics.fmean(of[n].total_ns for n in steady) / 1e6 for of in rounds]
+        return rounds[means.index(statistics.median_low(means))], means
+
+
+@dataclass(frozen=True)
+class Apart:
+    """How far a picture is from that of the first method measured in turns, rounded alike."""
+
+    mse: float
+    worst: float  # largest difference of any channel, on a scale of 1
+
+    @classmethod
+    def of(cls, picture: Tensor, first: Tensor) -> Apart:
+        """Both [H, W, 3]."""
+        difference = picture.double() - first.double()
+        return cls(difference.square().mean().item(), difference.abs().max().item())
+
 
 def _measurement(
     take: _Take, task: Task, missing: Mapping[str, str], neighbours: Neighbours, in_turns: int
@@ -149,10 +189,15 @@ def _measurement(
     scene, trajectory, protocol, budget = task.scene, task.trajectory, task.protocol, task.budget
     method, scoring, sizes = take.method, take.scoring, take.method.sizes()
     peak_bytes, source = take.peak(in_turns)
-    frames = _frame_table(take.rows, scoring.names)
+    records, means = take.timed(len(take.clock.frames) - protocol.rounds * len(take.rows))
+    costs = map(_costs, records)
+    rows_of_frames = [row | cost for row, cost in zip(take.rows, costs, strict=True)]
+    frames = _frame_table(rows_of_frames, scoring.names)
     of_phases = ((phase, frames[frames["phase"] == phase]) for phase in (STEADY, COLD))
     summary = [
         *(row | {"phase": phase} for phase, of in of_phases if len(of) for row in phase_rows(of)),
+        *_of_rounds(means if protocol.rounds > 1 else []),
+        *_of_first(take.apart),
         *(single(f"size_bytes.{part}", size) for part, size in sizes.items()),
         *([single("size_bytes.total", sum(sizes.values()))] if sizes else []),
         single("peak_bytes", peak_bytes),
@@ -176,24 +221,54 @@ def _measurement(
         "protocol": asdict(protocol),
         "budget": asdict(budget),
         "scene": {"name": scene.name, "digest": scene.digest, "unit_length": scene.unit_length},
+        "parts": dict(study_of(method).parts),
         "missing": {**missing, **scoring.missing(known)},
         "neighbours": neighbours._asdict(),
         "peak_bytes": source,
         "times": take.times,
+        "waits": _waits(take.waits),
         "error_map": f"absolute error, mean over the channels, black 0 to yellow {ERROR_RANGE}",
     }
     return Measurement(rows, frames, scoring.images, record)
 
 
+def _of_rounds(means: Sequence[float]) -> list[dict[str, Any]]:
+    """Rows of the fastest and the slowest of several rounds, by their mean time of a frame."""
+    if not means:
+        return []
+    return [single("frame_ms.fastest", min(means)), single("frame_ms.slowest", max(means))]
+
+
+def _of_first(apart: Sequence[Apart]) -> list[dict[str, Any]]:
+    """Rows of how far the pictures are from those of the first method in turns: the PSNR from the
+    MSE over all frames, inf if they are equal, and the largest difference of a channel."""
+    if not apart:
+        return []
+    mse = statistics.fmean(each.mse for each in apart)
+    worst = max(each.worst for each in apart)
+    return [single("psnr_to_first", psnr_of_mse(mse)), single("worst_to_first", worst)]
+
+
+def _waits(of_frames: Sequence[Mapping[Line, int]]) -> list[dict[str, Any]]:
+    """Where the host waits for the GPU in a steady frame, the most frequent first."""
+    total: dict[Line, int] = {}
+    for frame in of_frames:
+        for line, count in frame.items():
+            total[line] = total.get(line, 0) + count
+    return [
+        {"waits": count / len(of_frames), "line": line.place, "source": line.source}
+        for line, count in sorted(total.items(), key=lambda item: -item[1])
+    ]
+
+
 def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
-    """Warm up, then render the sequence in order; what other processes used in the second part."""
-    steps, preceding = task.trajectory.steps, task.trajectory.preceding
+    """Warm up, then render the sequence in order, as many rounds as the protocol has; what other
+    processes used while it was timed."""
+    steps, rounds = task.trajectory.steps, task.protocol.rounds
     warmup = spread(len(steps), task.protocol.warmup)
-    frames = len(takes) * (len(warmup) + len(steps))
+    frames = len(takes) * (len(warmup) + rounds * len(steps))
     with torch.no_grad(), log.progress("rendering", frames) as progress:
-        for take in takes:
-            with _named(take.method, len(takes) > 1):
-                take.method.reset()
+        _reset(takes)
         for number, take in product(warmup, takes):
             settled = number > 0 or len(warmup) == 1  # in the first, kernels may be compiled
             if settled:
@@ -205,58 +280,86 @@ def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
             ):
                 take.method.render(steps[number].camera, take.clock)
             progress.advance(note="warming up")
-        for take in takes:
-            with _named(take.method, len(takes) > 1):
-                take.method.reset()
         watch = Watch()
-        for index, take in product(range(len(steps)), takes):
-            with _named(take.method, len(takes) > 1):
-                _draw(take, task, index, preceding[index])
-            scores = [row["psnr"] for row in take.rows if "psnr" in row]
-            progress.advance(note=f"{np.mean(scores):.2f} dB" if scores else "")
+        for number in range(rounds):
+            _reset(takes)
+            if number == 1:
+                watch = Watch()
+            for index in range(len(steps)):
+                first: Tensor | None = None
+                for take in takes:
+                    with _named(take.method, len(takes) > 1):
+                        picture = _draw(take, task, index, first, scored=number == 0)
+                    first = picture if first is None else first
+                    scores = [row["psnr"] for row in take.rows if "psnr" in row]
+                    progress.advance(note=f"{np.mean(scores):.2f} dB" if scores else "")
         return watch.seen()
 
 
-def _draw(take: _Take, task: Task, index: int, before: int) -> None:
-    """Render and score the next frame of a method; `before` frames precede it since the last cut.
+def _reset(takes: Sequence[_Take]) -> None:
+    for take in takes:
+        with _named(take.method, len(takes) > 1):
+            take.method.reset()
+
+
+def _draw(take: _Take, task: Task, index: int, first: Tensor | None, *, scored: bool) -> Tensor:
+    """Render the frame `index` with a method and return its picture; in the round that is `scored`
+    also score it, and compare it with the picture of the `first` method, if there is one.
 
     The method is not told of cuts, because a user who steers a camera does not announce a jump.
     """
-    method, step = take.method, task.trajectory.steps[index]
-    if task.protocol.memory == "cold":
+    method, step, protocol = take.method, task.trajectory.steps[index], task.protocol
+    before = task.trajectory.preceding[index]
+    if protocol.memory == "cold":
         method.reset()
         before = 0
-    with take.metered(), take.clock.frame():
+    waited = scored and protocol.waits
+    with (
+        device_waits() if waited else nullcontext() as waits,
+        take.metered(),
+        take.clock.frame(),
+    ):
         frame = method.render(step.camera, take.clock)
     check_frame(frame, step.camera, method.name, index)
+    if not scored:
+        return frame.rgb
     phase = COLD if before < method.memory else STEADY
-    record = take.clock.frames[-1]
-    figures: dict[str, Any] = {
-        "frame": index,
-        "phase": phase,
+    if phase == STEADY and waits is not None:
+        take.waits.append(dict(waits))
+    figures: dict[str, Any] = {"frame": index, "phase": phase}
+    truth: Tensor | None = None
+    if step.truth is not None:
+        split = task.scene.splits[task.trajectory.split]
+        figures["name"], truth = split.names[step.truth], split.images[step.truth]
+    elif protocol.flicker == "exact" and task.scene.exact is not None:
+        truth = task.scene.exact(step.camera)
+    if protocol.compared and phase == STEADY and step.truth is not None:
+        shown = protocol.rounded(frame.rgb).cpu()
+        take.apart.append(
+            Apart.of(shown, shown if first is None else protocol.rounded(first).cpu())
+        )
+    scores = take.scoring.score(
+        index,
+        frame.rgb,
+        truth,
+        scored=step.truth is not None,
+        cut=step.cut,
+        camera=step.camera,
+        depth=frame.depth,
+    )
+    take.rows.append(figures | scores)
+    return frame.rgb
+
+
+def _costs(record: FrameRecord) -> dict[str, float]:
+    """The figures of time and work of a frame."""
+    return {
         "frame_ms": record.total_ns / 1e6,
         **({} if record.wall_ns is None else {"wall_ms": record.wall_ns / 1e6}),
         **{f"stage_ms.{name}": ns / 1e6 for name, ns in record.stages_ns.items()},
         **{f"work.{name}": done for name, done in record.done.items()},
         **{f"work.{name}.dense": dense for name, dense in record.dense.items()},
     }
-    truth: torch.Tensor | None = None
-    if step.truth is not None:
-        split = task.scene.splits[task.trajectory.split]
-        figures["name"], truth = split.names[step.truth], split.images[step.truth]
-    elif task.protocol.flicker == "exact" and task.scene.exact is not None:
-        truth = task.scene.exact(step.camera)
-    scored = step.truth is not None
-    scores = take.scoring.score(
-        index,
-        frame.rgb,
-        truth,
-        scored=scored,
-        cut=step.cut,
-        camera=step.camera,
-        depth=frame.depth,
-    )
-    take.rows.append(figures | scores)
 
 
 def _frame_table(table: list[dict[str, Any]], scores: Sequence[str]) -> pd.DataFrame:
@@ -267,48 +370,3 @@ def _frame_table(table: list[dict[str, Any]], scores: Sequence[str]) -> pd.DataF
     times = [name for name in ("frame_ms", "wall_ms") if name in frames]
     columns = ["frame", "name", "phase", *scores, *times, *touched]
     return frames.reindex(columns=columns).fillna(dict.fromkeys(touched, 0))
-
-
-def phase_rows(frames: pd.DataFrame) -> list[dict[str, Any]]:
-    """Mean and interval of every column, quantiles of the frame time, frames per second.
-
-    `frames` are at least one, in path order, with columns `frame`, `name` and `phase`, scores,
-    times, work.
-    """
-    columns = list(map(str, frames))
-    scores = columns[columns.index("phase") + 1 : columns.index("frame_ms")]
-    parts = [name for name in columns if name.startswith(("stage_ms.", "work."))]
-    times = frames["frame_ms"]
-    ms = mean_row("frame_ms", times)
-    return [
-        *score_rows(frames, scores),
-        ms,
-        *(single(f"frame_ms.p{part}", np.percentile(times, part)) for part in QUANTILES),
-        # No upper end if the interval of the time reaches 0.
-        {"metric": "fps", "n": ms["n"], "value": 1000 / ms["value"], "lo": 1000 / ms["hi"]}
-        | {"hi": 1000 / ms["lo"] if ms["lo"] > 0 else math.nan},
-        *(mean_row(name, frames[name]) for name in columns if name == "wall_ms"),
-        *(mean_row(name, frames[name]) for name in parts),
-    ]
-
-
-def score_rows(frames: pd.DataFrame, scores: Sequence[str]) -> list[dict[str, Any]]:
-    """Mean and interval of each of `scores`; of the flicker only where a frame has one."""
-    named = [name for name in scores if name != "flicker" or frames[name].notna().any()]
-    return [mean_row(name, frames[name]) for name in named]
-
-
-def mean_row(metric: str, values: pd.Series) -> dict[str, Any]:
-    """The row of a metric: mean and interval over the frames, in path order, that have a value."""
-    known = values.dropna().to_numpy(dtype=float)
-    value = known.mean() if len(known) else math.nan
-    half = path_interval(known)
-    figures = {"value": value, "n": len(known), "lo": value - half, "hi": value + half}
-    return {"metric": metric} | figures
-
-
-def single(metric: str, value: float) -> dict[str, Any]:
-    """The row of a single figure; it belongs to the whole run unless its phase is replaced."""
-    known = int(not math.isnan(value))
-    row = {"metric": metric, "value": float(value), "n": known, "lo": math.nan, "hi": math.nan}
-    return row | {"phase": WHOLE}

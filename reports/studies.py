@@ -1,0 +1,365 @@
+"""The views of the studies of methods, from stored runs: tables, and the frontier as a plot.
+
+Some lines are measured in several groups, beside others: those that all of them are compared with.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from bench.experiments import observed_order
+from bench.probes import OTHER
+from bench.study import part_of
+from reports.figures import frontier_plot
+from reports.images import Part, Picture
+from reports.runs import Run
+from reports.tables import Table, amount, decimal, megabytes, share, spread
+
+ON_FRONTIER = "— (frontier)"
+STAGE, WORK, DENSE = "stage_ms.", "work.", ".dense"
+
+
+@dataclass(frozen=True)
+class StudyLine:
+    """A variant of a method, and with which others it is compared.
+
+    `settings` are words of `steerbench run`; `value` is its place on the axis that the study
+    varies. Lines with the same `group` (a knob, an axis) are compared with each other, those
+    `in_turns` frame by frame.
+    """
+
+    method: str
+    group: str
+    label: str
+    settings: tuple[str, ...] = ()
+    value: float = math.nan
+    in_turns: bool = True
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A line with what was measured of it. Times are in ms a frame, of the lower median round and
+    of the fastest and slowest one."""
+
+    line: StudyLine
+    run: Run
+    ms: float
+    fastest: float
+    slowest: float
+    lost: float = math.nan  # PSNR, against the first line, in dB
+    instead: str = ""  # the best line that takes no longer; on the frontier itself
+
+    @classmethod
+    def of(cls, line: StudyLine, run: Run) -> Measured:
+        """What `run`, the run of `line`, says."""
+        values = run.values
+        ms = values["frame_ms"]
+        fastest, slowest = (values.get(f"frame_ms.{end}", ms) for end in ("fastest", "slowest"))
+        return cls(line, run, ms, fastest, slowest)
+
+    def figure(self, metric: str) -> float:
+        """A figure of the run; nan if it has none."""
+        return self.run.values.get(metric, math.nan)
+
+    @property
+    def tail(self) -> float:
+        """How much longer the slowest frames take: 99th percentile over the median."""
+        return self.figure("frame_ms.p99") / self.figure("frame_ms.p50")
+
+    @property
+    def parts(self) -> dict[str, float]:
+        """The ms of each part of a frame, as the method groups its stages."""
+        found: dict[str, float] = {}
+        for metric, value in self.run.values.items():
+            if metric.startswith(STAGE):
+                part = part_of(metric.removeprefix(STAGE), self.run.record["parts"])
+                found[part] = found.get(part, 0.0) + value
+        return found
+
+    @property
+    def work(self) -> dict[str, float]:
+        """The work of a frame by counter."""
+        return {
+            metric.removeprefix(WORK): value
+            for metric, value in self.run.values.items()
+            if metric.startswith(WORK) and not metric.endswith(DENSE)
+        }
+
+
+def pooled(found: Sequence[Measured]) -> list[Measured]:
+    """Each line once, with times that can be compared.
+
+    Lines of different groups were not timed in the same minutes. Their times are scaled so that the
+    line which all groups have, the last of several, takes as long in each as in their median. Lost
+    is the PSNR of the first line less that of a line.
+    """
+    groups: dict[str, dict[str, Measured]] = {}
+    for each in found:
+        groups.setdefault(each.line.group, {})[each.line.label] = each
+    labels = dict.fromkeys(each.line.label for each in found)
+    common = [label for label in labels if all(label in group for group in groups.values())]
+    pace = dict.fromkeys(groups, 1.0)
+    if common:
+        times = {name: group[common[-1]].ms for name, group in groups.items()}
+        usual = statistics.median_low(times.values())
+        pace = {name: usual / ms for name, ms in times.items()}
+    once = {}
+    for label in labels:
+        several = [
+            _paced(group[label], pace[name]) for name, group in groups.items() if label in group
+        ]
+        middle = statistics.median_low(each.ms for each in several)
+        usual_one = next(each for each in several if each.ms == middle)
+        ends = min(x.fastest for x in several), max(x.slowest for x in several)
+        once[label] = replace(usual_one, fastest=ends[0], slowest=ends[1])
+    first = next(iter(once.values())).figure("psnr")
+    return [replace(each, lost=first - each.figure("psnr")) for each in once.values()]
+
+
+def _paced(each: Measured, pace: float) -> Measured:
+    times = each.ms, each.fastest, each.slowest
+    ms, fastest, slowest = (pace * time for time in times)
+    return replace(each, ms=ms, fastest=fastest, slowest=slowest)
+
+
+def by_method(found: Iterable[Measured]) -> dict[str, list[Measured]]:
+    """The lines of each method, each once."""
+    methods: dict[str, list[Measured]] = {}
+    for each in found:
+        methods.setdefault(each.line.method, []).append(each)
+    return {name: pooled(of) for name, of in methods.items()}
+
+
+def accuracy(found: Sequence[Measured]) -> list[Part]:
+    """Run time against error of all settings of a method, fastest first; the frontier is bold."""
+    parts: list[Part] = []
+    for method, lines in by_method(found).items():
+        rated = on_frontier(lines)
+        plot = partial(frontier_plot, list(map(_point, rated)))
+        shows = f"{method}: error of a frame against its time, one point a setting"
+        parts += [_accuracy_table(method, rated), Picture(f"frontier-{method}", shows, plot)]
+    return parts
+
+
+def on_frontier(lines: Sequence[Measured]) -> list[Measured]:
+    """The lines, each with the best one that takes no longer."""
+    best = best_instead([x.ms for x in lines], [-x.figure("psnr") for x in lines])
+    return [
+        replace(line, instead=lines[instead].line.label)
+        for line, instead in zip(lines, best, strict=True)
+    ]
+
+
+def _point(line: Measured) -> dict[str, Any]:
+    """A line as `frontier_plot` reads it."""
+    return {
+        "setting": line.line.label,
+        "knob": line.line.group,
+        "unchanged": not line.line.settings,
+        "ms": line.ms,
+        "ms_lo": line.fastest,
+        "ms_hi": line.slowest,
+        "psnr": line.figure("psnr"),
+        "psnr_to_first": line.figure("psnr_to_first"),
+        "instead": line.instead,
+    }
+
+
+def _accuracy_table(method: str, lines: Sequence[Measured]) -> Table:
+    lines = sorted(lines, key=lambda line: line.ms)
+    best = [line.instead == line.line.label for line in lines]
+    cells = tuple(
+        (
+            line.line.label,
+            decimal(line.ms, 1),
+            spread(line.fastest, line.slowest),
+            decimal(line.figure("psnr"), 2),
+            decimal(line.lost, 2),
+            _apart(line),
+            ON_FRONTIER if good else line.instead,
+        )
+        for line, good in zip(lines, best, strict=True)
+    )
+    columns = (
+        *("setting", "ms / frame ↓", "of rounds", "PSNR, dB ↑", "lost, dB ↓"),
+        *("PSNR to the first, dB ↑", "better at no more time"),
+    )
+    bold = frozenset((row, 0) for row, good in enumerate(best) if good)
+    title = f"{method}: run time against error of a frame, {_where(lines)}"
+    return Table(title, columns, cells, bold, _sources(lines))
+
+
+def parity(found: Sequence[Measured]) -> list[Part]:
+    """Every engine and precision beside the first, torch in fp32."""
+    columns = (*COMPARED, "p99 / p50 ↓", "worst pixel ↓", "network, ms ↓", "model, MB ↓")
+    parts: list[Part] = []
+    for method, lines in by_method(found).items():
+        cells = tuple(
+            (
+                *_compared(line),
+                decimal(line.tail, 2),
+                decimal(line.figure("worst_to_first"), 4),
+                decimal(line.parts.get("network"), 2),
+                megabytes(line.figure("size_bytes.total")),
+            )
+            for line in lines
+        )
+        title = f"{method}: engines and precisions, {_where(lines)}"
+        parts.append(Table(title, ("engine, precision", *columns), cells, sources=_sources(lines)))
+    return parts
+
+
+def skips(found: Sequence[Measured]) -> list[Part]:
+    """A frame without each of the skips: how it differs, and its work as a share of all work, that
+    of the last line."""
+    parts: list[Part] = []
+    for method, lines in by_method(found).items():
+        every = lines[-1].work
+        cells = tuple(
+            (
+                *_compared(line),
+                *(_shared(line.work.get(name, 0.0), of) for name, of in every.items()),
+            )
+            for line in lines
+        )
+        columns = ("skipped", *COMPARED, *(name.replace("_", " ") for name in every))
+        title = f"{method}: mean work of a frame, and its share of all; {_where(lines)}"
+        parts.append(Table(title, columns, cells, sources=_sources(lines)))
+    return parts
+
+
+def breakdown(found: Sequence[Measured]) -> list[Part]:
+    """The ms of a frame that each of its parts takes itself, and where the host waits for a GPU."""
+    there = dict.fromkeys(part for line in found for part in line.parts)
+    named = dict.fromkeys(part for line in found for part in line.run.record["parts"].values())
+    parts = [*(part for part in named if part in there)]
+    parts += [part for part in there if part not in (*parts, OTHER)]
+    parts.append(OTHER)
+    cells = tuple(
+        (
+            line.line.label,
+            *(decimal(line.parts.get(part, 0.0), 1) for part in parts),
+            decimal(line.ms, 1),
+            spread(line.fastest, line.slowest),
+            decimal(line.tail, 2),
+            decimal(1e3 / line.ms, 2),
+            decimal(line.figure("psnr"), 2),
+        )
+        for line in found
+    )
+    columns = ("", *parts, "frame ↓", "of rounds", "p99 / p50 ↓", "FPS ↑", "PSNR, dB ↑")
+    title = f"ms of a frame, and what of it each part takes itself; {_where(found)}"
+    tables: list[Part] = [Table(title, columns, cells, sources=_sources(found))]
+    for line in found:
+        if waits := line.run.record["waits"]:
+            total = decimal(sum(each["waits"] for each in waits), 1)
+            rows = tuple((decimal(x["waits"], 1), x["line"], x["source"]) for x in waits)
+            title = f"{line.line.label}: {total} waits for the GPU a frame"
+            tables.append(Table(title, ("waits", "line", "source"), rows))
+    return tables
+
+
+def scaling(found: Sequence[Measured]) -> list[Part]:
+    """How time, work and memory of a frame grow along each axis: all lines, and below those of an
+    axis the exponent of each figure."""
+    methods: dict[str, dict[str, list[Measured]]] = {}
+    for each in found:
+        methods.setdefault(each.line.method, {}).setdefault(each.line.group, []).append(each)
+    return [_scaling_table(method, axes) for method, axes in methods.items()]
+
+
+def _scaling_table(method: str, axes: Mapping[str, Sequence[Measured]]) -> Table:
+    every = [line for lines in axes.values() for line in lines]
+    counters = dict.fromkeys(name for line in every for name in line.work)
+    figures: dict[str, tuple[str, Callable[[float], str]]] = {
+        "frame_ms": ("ms / frame ↓", partial(decimal, decimals=1)),
+        **{f"{WORK}{name}": (name.replace("_", " "), amount) for name in counters},
+        "peak_bytes": ("peak, MB ↓", megabytes),
+        "size_bytes.total": ("model, MB ↓", megabytes),
+    }
+    cells: list[tuple[str, ...]] = []
+    sources: list[tuple[str, ...]] = []
+    for axis, lines in axes.items():
+        for line in lines:
+            of_line = (write(line.figure(name)) for name, (_, write) in figures.items())
+            cells.append((line.line.label, *of_line, decimal(line.tail, 2)))
+            sources.append((line.run.key,))
+        values = [line.line.value for line in lines]
+        powers = (growth(values, [line.figure(name) for line in lines]) for name in figures)
+        cells.append((f"exponent of {axis}", *(decimal(power, 2) for power in powers), ""))
+        sources.append(())
+    columns = ("", *(label for label, _ in figures.values()), "p99 / p50 ↓")
+    return Table(f"{method}: {_where(every)}", columns, tuple(cells), sources=tuple(sources))
+
+
+VIEWS: Mapping[str, Callable[[Sequence[Measured]], list[Part]]] = {
+    view.__name__: view for view in (accuracy, parity, skips, breakdown, scaling)
+}
+"""What each study shows of the lines that were measured, by the name of the study."""
+
+COMPARED = ("PSNR to the first, dB ↑", "PSNR, dB ↑", "lost, dB ↓", "frame, ms ↓", "of rounds")
+
+
+def _compared(line: Measured) -> tuple[str, ...]:
+    """The label, and the cells of the columns `COMPARED`."""
+    return (
+        line.line.label,
+        _apart(line),
+        decimal(line.figure("psnr"), 2),
+        decimal(line.lost, 3),
+        decimal(line.ms, 1),
+        spread(line.fastest, line.slowest),
+    )
+
+
+def _apart(line: Measured) -> str:
+    """The PSNR to the pictures of the first line."""
+    apart = line.figure("psnr_to_first")
+    return "the same" if apart == math.inf else decimal(apart, 1)
+
+
+def _shared(part: float, whole: float) -> str:
+    return f"{amount(part)} ({share(part, whole)})"
+
+
+def _where(lines: Sequence[Measured]) -> str:
+    """Scene, path and size of the frames."""
+    facts = ("scene", "trajectory", "resolution")
+    several = [dict.fromkeys(str(line.run.facts[name]) for line in lines) for name in facts]
+    return ", ".join(next(iter(of)) for of in several if len(of) == 1)
+
+
+def _sources(lines: Sequence[Measured]) -> tuple[tuple[str, ...], ...]:
+    return tuple((line.run.key,) for line in lines)
+
+
+def best_instead(cost: Sequence[float], error: Sequence[float]) -> list[int]:
+    """For each setting, the index of the best setting that costs no more.
+
+    Best is the least `error`, then the least `cost`, then the lowest index: on the Pareto frontier
+    the setting itself, elsewhere one that dominates it.
+    """
+    costs, errors = np.asarray(cost, float), np.asarray(error, float)
+    best: list[int] = [0] * len(costs)
+    least = -1
+    for index in np.lexsort((errors, costs)):  # the cheapest first; lexsort keeps the order of ties
+        if least < 0 or errors[index] < errors[least]:
+            least = int(index)
+        best[index] = least
+    return best
+
+
+def growth(values: Sequence[float], figures: Sequence[float]) -> float:
+    """The exponent p of figure ~ value^p by least squares on the logarithms; nan if fewer than two
+    distinct values have a figure above 0."""
+    used = [(v, f) for v, f in zip(values, figures, strict=True) if v > 0 and f > 0]
+    if len({value for value, _ in used}) < 2:
+        return math.nan
+    return observed_order(*zip(*used, strict=True))

@@ -1,0 +1,99 @@
+"""`steerbench accuracy`, `parity`, `skips`, `breakdown` and `scaling`: the studies of methods.
+
+The lines of a study are runs in the store, as those of a sweep; a study shows them in its own way.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shlex
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from bench.errors import unexpected
+from bench.provenance import commit, machine
+from reports.images import Part
+from reports.publish import publish
+from reports.studies import VIEWS, Measured, by_method
+from reports.tables import Table
+from sweeps.execute import Launcher, divided, run_jobs
+from sweeps.measurement import newest, of_scene
+from sweeps.studies import StudyJob, jobs_of, subjects
+from sweeps.terminal import console, show
+
+
+def main(options: argparse.Namespace) -> int:
+    """Measure what the store lacks of a study, print its tables and write its page; return 1 if a
+    line failed that can run here."""
+    study = options.command
+    within = None
+    if study == "accuracy" and options.within is not None:
+        within = decibels(options.within)
+    words, of_hydra = divided(options.overrides)
+    more = {"trained": options.trained} if study == "accuracy" else {}
+    found = subjects(study, words)
+    jobs = jobs_of(study, found, {"only": options.only, **more})
+    outputs = Path(jobs[0].config.outputs)
+    failed = run_jobs(jobs, Launcher([*options.config_dir, *of_hydra], outputs))
+    lines = list(_measured(jobs))
+    if not lines:
+        return 1
+    parts = VIEWS[study](lines)
+    for part in parts:
+        if isinstance(part, Table):
+            show(part)
+    if within is not None:
+        for text in _recommended(lines, jobs, within):
+            console().print(text, markup=False, soft_wrap=True)
+    folder = options.report or outputs / study
+    page = publish(_page(options, parts), folder, [line.run for line in lines])
+    print(f"report: {page}", file=sys.stderr)
+    return int(failed > 0)
+
+
+def _measured(jobs: Sequence[StudyJob]) -> Iterator[Measured]:
+    """The lines that the store has."""
+    runs = newest(jobs[0].store)
+    for job in jobs:
+        for run in runs.get(job.key, ()):
+            if of_scene(run, job.config):
+                yield Measured.of(job.line, run)
+                break
+
+
+def _page(options: argparse.Namespace, parts: Sequence[Part]) -> list[Part]:
+    typed = shlex.join(["steerbench", *options.typed])
+    made = f"```sh\n{typed}\n```\n\nCommit {commit()}, {machine()['cpu']}."
+    page: list[Part] = [f"# {options.command.capitalize()}", made]
+    for part in parts:
+        page += [f"## {part.title}", part] if isinstance(part, Table) else [part]
+    return page
+
+
+def decibels(text: str) -> float:
+    """The number in "0.1dB", "0.1 dB" or "0.1"; SteerbenchError if invalid or negative."""
+    number = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)\s*(dB)?", text, re.IGNORECASE)
+    if not number:
+        raise unexpected("--within", "decibels, 0.1dB for example", repr(text))
+    return float(number[1])
+
+
+def _recommended(
+    lines: Sequence[Measured], jobs: Sequence[StudyJob], limit: float
+) -> Iterator[str]:
+    """For each method, the fastest setting that loses at most `limit` dB, as a command."""
+    commands = {job.line: job.command for job in jobs}
+    for method, of_method in by_method(lines).items():
+        first = of_method[0]
+        allowed = [line for line in of_method if line.lost <= limit]
+        if not allowed:  # the first is perfect
+            label = first.line.label
+            yield f"{method}: no setting, because {label!r} has an infinite PSNR"
+            continue
+        best = min(allowed, key=lambda line: (line.ms, line.lost))
+        yield (
+            f"{method}, within {limit:g} dB of {first.line.label}: {best.line.label}, "
+            f"{best.ms:.1f} ms, {best.lost:.3f} dB lost\n{shlex.join(commands[best.line])}"
+        )

@@ -1,0 +1,242 @@
+"""The lines of a study: variants of the methods that it is about, as these declare them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from bench.errors import SteerbenchError, unknown
+from bench.study import Axis, Study, Variant, study_of
+from reports.studies import StudyLine
+from sweeps.configured import build
+from sweeps.measurement import Job
+from sweeps.overrides import CONFIGS, beside, composed, engine_kinds, swept, target_of
+
+AS_IT_IS = Variant("as it is")  # the settings as typed
+NOTHING = "nothing"  # is skipped
+
+SIZES = ((200, 200), (400, 400), (800, 800), (1920, 1080), (3840, 2160))
+"""Widths and heights of frames that the time is measured at."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A method that is studied, `name`, as the `words` of a command describe it."""
+
+    name: str
+    words: list[str]
+
+    @property
+    def config(self) -> DictConfig:
+        """The composed configuration."""
+        return composed(self.words)
+
+    @property
+    def has_engine(self) -> bool:
+        """Whether the method has a 2D network, which an engine computes."""
+        return "engine" in self.config.method
+
+    @property
+    def study(self) -> Study:
+        """What the method declares: its class or, if only that knows, an object.
+
+        A method that still lacks a setting declares nothing.
+        """
+        method = self.config.method
+        target = target_of(method)
+        if isinstance(getattr(target, "study", None), property):
+            return Study() if OmegaConf.missing_keys(method) else build(self.config, "method").study
+        return study_of(target)
+
+    def engines(self) -> list[Variant]:
+        """All engines at all precisions; torch in fp32, the standard, first."""
+        return [
+            Variant(f"{name}, {precision}", (f"engine={name}", f"precision={precision}"))
+            for name, kind in engine_kinds(self.words).items()
+            for precision in kind.precisions
+        ]
+
+    def axes(self) -> dict[str, Axis]:
+        """What tables vary of the method, and what it declares itself."""
+        return {**table_axes(self.name), **self.study.axes}
+
+    def lines(self, group: str, variants: Sequence[Variant], **more: Any) -> Iterator[StudyLine]:
+        """The lines of a group."""
+        for each in variants:
+            yield StudyLine(self.name, group, each.name, each.settings, **more)
+
+
+def table_axes(method: str) -> dict[str, Axis]:
+    """The settings of `method` that tables of the paper vary, by the name of the axis."""
+    axes = {}
+    for path in sorted((CONFIGS / "experiment").glob("table*.yaml")):
+        experiment: Any = OmegaConf.to_container(OmegaConf.load(path))
+        if {"override /method": method} not in experiment["defaults"]:
+            continue
+        grid = experiment["hydra"]["sweeper"]["params"]
+        for setting, values in grid.items():
+            numbers = str(values).split(",")
+            if setting.startswith("method.") and all(map(str.isdecimal, numbers)):
+                table = experiment["table"]
+                values_of = tuple(sorted(map(int, numbers)))
+                axes[table["axis"]] = Axis(table["label"], setting, values_of)
+    return axes
+
+
+def accuracy(subject: Subject, only: Sequence[str], trained: bool) -> Iterator[StudyLine]:
+    """Every knob, beside two that all of them are compared with: everything off, if the method
+    declares what that is, and nothing changed. All use the same training, but those of `trained`
+    knobs."""
+    study = subject.study
+    standard, *others = subject.engines() if subject.has_engine else [AS_IT_IS]
+    exact = (*standard.settings, *study.exact)
+    first = [Variant("everything off", exact), AS_IT_IS] if exact else [AS_IT_IS]
+    knobs: dict[str, Sequence[Variant]] = {**study.knobs, **({"engine": others} if others else {})}
+    if trained:
+        for name, axis in subject.axes().items():
+            values = [Variant(axis.label.format(x), (f"{axis.setting}={x}",)) for x in axis.values]
+            knobs[f"{name}, trained"] = values
+        knobs |= study.trained
+    for knob in chosen(knobs, only, "knob") or [AS_IT_IS.name]:
+        yield from subject.lines(knob, [*first, *knobs.get(knob, ())])
+
+
+def parity(subject: Subject, only: Sequence[str]) -> Iterator[StudyLine]:
+    """Every engine and precision, beside torch in fp32."""
+    first, *_ = subject.engines()
+    for engine, kind in engine_kinds(subject.words).items():
+        words = [(f"engine={engine}", f"precision={precision}") for precision in kind.precisions]
+        own = [x for x in subject.engines() if x.settings in words and x != first]
+        yield from subject.lines(engine, [first, *own])
+
+
+def skips(subject: Subject, only: Sequence[str]) -> Iterator[StudyLine]:
+    """All skips, further savings on top, all skips but each one, nothing skipped."""
+    study = subject.study
+    off = {name: f"{setting}=false" for name, setting in study.skips.items()}
+    each = [Variant(f"all but {name}", (word,)) for name, word in off.items()]
+    ends = Variant("all"), Variant(NOTHING, tuple(off.values()))
+    yield from subject.lines(
+        "skips", [ends[0], *study.savings, *(each if len(off) > 1 else ()), ends[1]]
+    )
+
+
+def breakdown(subject: Subject, only: Sequence[str]) -> Iterator[StudyLine]:
+    """Each precision of the engine, or the method as it is without one; with and without skips."""
+    config = composed(subject.words, return_hydra_config=True)
+    variants = [Variant(subject.name)]
+    if subject.has_engine:
+        engine = f"engine={config.hydra.runtime.choices.engine}"
+        own = [each for each in subject.engines() if engine in each.settings]
+        variants = [Variant(f"{subject.name}, {each.name}", each.settings) for each in own]
+    off = tuple(f"{setting}=false" for setting in subject.study.skips.values())
+    if off:
+        variants += [Variant(f"{x.name}, {NOTHING} skipped", (*x.settings, *off)) for x in variants]
+    yield from subject.lines("parts", variants)
+
+
+def scaling(subject: Subject, only: Sequence[str]) -> Iterator[StudyLine]:
+    """Frame sizes, numbers of threads and the axes of the method, each measured alone."""
+    axes = subject.axes()
+    wanted = chosen(("pixels", "threads", *axes), only, "axis")
+    config = composed(subject.words, return_hydra_config=True)
+    engine = config.hydra.runtime.choices.engine
+    if "threads" in wanted and subject.has_engine and engine != "torch":
+        others = ", ".join(name for name in wanted if name != "threads")
+        raise SteerbenchError(
+            "threads: expected engine=torch, whose threads can be chosen afterwards; for another "
+            f"engine choose from {others} with --only"
+        )
+    # A 2D renderer costs the same however long it was trained; its own steps would win.
+    short = ("method.steps=null",) if config.method.get("steps") else ()
+    most = config.budget.threads or torch.get_num_threads()
+    for name in wanted:
+        points: list[tuple[float, str, tuple[str, ...]]] = []
+        if name == "pixels":
+            points = [(w * h, f"{w} x {h}", (f"frame_size=[{w},{h}]",)) for w, h in SIZES]
+        elif name == "threads":  # of the frames; all have the same training
+            trained = f"budget.threads={most}"
+            counts = range(1, most + 1)
+            points = [(n, f"{n} threads", (f"threads={n}", trained)) for n in counts]
+        else:
+            axis = axes[name]
+            words_of = {value: (f"{axis.setting}={value}",) for value in axis.values}
+            points = [(axis.size(x), axis.label.format(x), of) for x, of in words_of.items()]
+        for value, label, words in points:
+            yield StudyLine(subject.name, name, label, (*short, *words), value, in_turns=False)
+
+
+def chosen(names: Sequence[str] | Mapping[str, Any], parts: Sequence[str], kind: str) -> list[str]:
+    """Those of `names` that have any of `parts` in them; all without parts."""
+    for part in parts:
+        if not any(part in name for name in names):
+            raise unknown(kind, part, names)
+    return [name for name in names if not parts or any(part in name for part in parts)]
+
+
+LINES: Mapping[str, Callable[..., Iterator[StudyLine]]] = {
+    make.__name__: make for make in (accuracy, parity, skips, breakdown, scaling)
+}
+"""What makes the lines of each study, by its name."""
+
+
+def subjects(study: str, words: Sequence[str]) -> list[Subject]:
+    """The methods that the words choose (method=a,b), otherwise those of the experiment `study`.
+
+    With several, what the words set of a method is left out for one that lacks it. SteerbenchError
+    if one of them has nothing that the study could vary; of the usual ones, it is left out.
+    """
+    typed = [word for word in words if word.partition("=")[0] == "method"]
+    rest = [f"+experiment={study}", *(word for word in words if word not in typed)]
+    usual = OmegaConf.load(CONFIGS / "experiment" / f"{study}.yaml").study.methods
+    names = swept(words).get("method") or [word.partition("=")[2] for word in typed[-1:]] or usual
+    alone = len(names) == 1
+    found = [
+        Subject(name, [*rest, f"method={name}"] if alone else beside(name, rest)) for name in names
+    ]
+    lacks = {subject.name: _lack(study, subject) for subject in found}
+    fit = [subject for subject in found if not lacks[subject.name]]
+    if typed and len(fit) < len(found):
+        raise SteerbenchError(next(filter(None, lacks.values())))
+    return fit
+
+
+def _lack(study: str, subject: Subject) -> str:
+    """Why the study can vary nothing of a method; empty if it can."""
+    if study == "parity" and not subject.has_engine:
+        return (
+            f"steerbench parity compares the engines of a 2D network: {subject.name} has none; "
+            "expected a method with the setting method.engine, for example method=steernerf"
+        )
+    if study == "skips" and not subject.study.skips:
+        return (
+            f"steerbench skips: {subject.config.method._target_} declares nothing in `study.skips` "
+            "(bench/study.py); expected a method that does, for example method=steernerf"
+        )
+    return ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyJob(Job):
+    """A job of a study, and the line that it fills."""
+
+    line: StudyLine
+
+
+def jobs_of(study: str, found: Sequence[Subject], options: Mapping[str, Any]) -> list[StudyJob]:
+    """The jobs of all lines; those of a group in turns, if the study compares times."""
+    jobs = []
+    for subject in found:
+        for line in LINES[study](subject, **options):
+            words = [*subject.words, *line.settings]
+            config = composed(words)
+            whose = [] if study == "breakdown" else [subject.name]  # all methods in turns
+            turns = ", ".join((study, *whose, line.group))
+            name = f"{study}: {subject.name}, {line.group}: {line.label}"
+            command = ["steerbench", "run", *words, "hydra.mode=RUN"]
+            jobs.append(StudyJob(config, command, name, turns * line.in_turns, line=line))
+    return jobs
