@@ -28,7 +28,7 @@ from sweeps.processes import device_lock
 
 Row = dict[str, Any]
 
-METHOD = "method=steernerf_lean"  # the method that is studied by default
+METHOD = "method=steernerf"  # the method that is studied by default
 
 AS_IT_IS = Variant("as it is")  # the settings as typed
 

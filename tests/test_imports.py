@@ -35,7 +35,6 @@ STANDS_ON = {
     "students": FIELD,
     **{name: {*FIELD, "students"} for name in ("nerf", "nsvf", "kilonerf", "plenoctree", "diver")},
     "steernerf": {*FIELD, "engines"},
-    "steernerf_lean": {*FIELD, "engines", "steernerf"},
 }
 """The folders of `methods` from which each may import, beside itself; `methods/checks.py` stands
 above them all."""

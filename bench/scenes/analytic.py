@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import re
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,11 +17,9 @@ from PIL import Image
 from torch import Tensor
 
 from bench.cameras import look_at, move_camera
-from bench.errors import unexpected
 from bench.provenance import digest
 from bench.scenes import blender
 from bench.scenes.files import opengl_to_opencv, whole_number
-from bench.scenes.medley import medley
 from bench.scenes.models import MODELS
 from bench.scenes.raytrace import Model, Solids, render
 from bench.threads import in_parallel
@@ -30,7 +27,6 @@ from bench.types import Camera, Log, Scene, SteerbenchError, Unavailable
 
 ANGLE_X = 0.69  # horizontal field of view in radians
 DISTANCE = 4.3  # of most cameras from the centre of the scene, in the model's units
-MEDLEY = re.compile("medley-(0|[1-9][0-9]*)")  # names of the variants of `medley`
 
 
 @dataclass(frozen=True)
@@ -50,9 +46,8 @@ VIEWS = {"mill": Views(3.0, 26.0, middle=14.0, swing=6.0, distance=4.7)}
 
 
 def load(
-    name: str,  # one of `MODELS`, `medley`, or `medley-N` for its variant N
+    name: str,  # one of `MODELS`
     *,
-    variant: int | None = None,  # only for `medley`
     width: int = 400,
     height: int | None = None,  # None: square pictures
     train: int = 60,
@@ -71,10 +66,6 @@ def load(
     of scenes that need others. For `downscale`, `background` and `bounds` see `blender.load`.
     Raises SteerbenchError when an option is out of range or `root` cannot be written.
     """
-    if name == "medley":
-        name = f"medley-{whole_number(variant, 'variant', 0)}"
-    elif variant is not None:
-        raise unexpected("variant", f"none, {name} has no variants", variant)
     sizes = {"width": width, "height": width if height is None else height, "train": train}
     numbers = {**sizes, "test": test, "seed": seed}
     checked = {key: whole_number(x, key, int(key != "seed")) for key, x in numbers.items()}
@@ -101,11 +92,8 @@ def load(
 
 def find(name: str) -> Model:
     """The model called `name`; raises Unavailable if there is none."""
-    if match := MEDLEY.fullmatch(name):
-        return medley(int(match[1]))
     if name not in MODELS:
-        names = ", ".join((*MODELS, "medley-0, medley-1 and so on"))
-        raise Unavailable(f"scene: expected one of {names}, got {name!r}")
+        raise Unavailable(f"scene: expected one of {', '.join(MODELS)}, got {name!r}")
     return MODELS[name]()
 
 

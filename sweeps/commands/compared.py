@@ -32,12 +32,12 @@ def main(options: argparse.Namespace) -> int:
     if parity and "engine" not in config.method:
         raise SteerbenchError(
             "steerbench parity compares the engines of a 2D renderer: expected a method with the "
-            "setting method.engine, for example method=steernerf_lean or steernerf"
+            "setting method.engine, for example method=steernerf"
         )
     if not parity and not study.skips:
         raise SteerbenchError(
             f"steerbench skips: {config.method._target_} declares nothing in `study.skips` "
-            "(bench/study.py); expected a method that does, for example method=steernerf_lean"
+            "(bench/study.py); expected a method that does, for example method=steernerf"
         )
     if not parity:  # the user's words come last, so that they take precedence
         words = [*USUAL, *study.skips_with, *words[len(USUAL) :]]

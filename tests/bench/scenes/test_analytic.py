@@ -52,7 +52,7 @@ def test_who_finishes_second_accepts_the_scene_of_the_first(tmp_path, log, monke
     assert not (folder / "scene").exists()
 
 
-@pytest.mark.parametrize("name", [*MODELS, "medley-0"])
+@pytest.mark.parametrize("name", [*MODELS])
 def test_a_scene_knows_its_picture_at_any_camera_as_its_splits_have_it(tmp_path, log, name):
     scene = analytic.load(name, **SMALL, root=tmp_path, log=log)
     assert scene.exact is not None
@@ -143,8 +143,6 @@ def test_a_root_that_cannot_be_written_is_named(tmp_path, log):
         ({"height": 2.5}, "height: .* got 2.5"),
         ({"test": True}, "test: expected a whole number from 1"),
         ({"seed": -1}, "seed: expected a whole number from 0"),
-        ({"variant": 1}, "variant: expected none, void has no variants, got 1"),
-        ({"name": "medley"}, "variant: expected a whole number from 0 on, got nothing"),
     ],
 )
 def test_bad_options(tmp_path, log, options, message):
@@ -153,19 +151,7 @@ def test_bad_options(tmp_path, log, options, message):
 
 
 def test_unknown_names_are_refused(tmp_path, log):
-    known = "one of totem, wires, cloud, void, mill, medley-0, medley-1 and so on"
-    for name in ("tower", "medley-", "medley--1", "medley-07", "medley-1.5"):
-        with pytest.raises(Unavailable, match=f"{known}, got '{name}'"):
-            analytic.load(name, root=tmp_path, log=log)
+    known = "one of totem, wires, cloud, void, mill"
+    with pytest.raises(Unavailable, match=f"{known}, got 'tower'"):
+        analytic.load("tower", root=tmp_path, log=log)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_variants_of_medley_are_scenes_of_their_own_and_each_is_always_the_same(tmp_path, log):
-    scenes = [
-        analytic.load("medley", variant=variant, **SMALL, root=tmp_path / place, log=log)
-        for variant, place in ((7, "a"), (8, "a"), (7, "b"))
-    ]
-    assert [scene.name for scene in scenes] == ["medley-7", "medley-8", "medley-7"]
-    names = sorted(folder.name.rsplit("-", 1)[0] for folder in (tmp_path / "a").iterdir())
-    assert names == ["medley-7", "medley-8"]
-    assert scenes[0].digest == scenes[2].digest != scenes[1].digest

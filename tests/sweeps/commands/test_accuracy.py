@@ -77,7 +77,7 @@ def test_every_row_is_printed_as_json_and_left_with_a_report(steerbench, measure
 )
 def test_the_fastest_setting_within_the_budget_is_a_command(steerbench, measured, budget, setting):
     outcome = steerbench("accuracy", "--within", budget, "seed=3")
-    usual = "method=steernerf_lean scene=totem budget=demo trajectory=orbit"
+    usual = "method=steernerf scene=totem budget=demo trajectory=orbit"
     assert outcome.out.splitlines()[-2] == f"steerbench run {usual} seed=3 {setting}"
 
 
