@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bench.probes import StageClock
+from bench.clock import StageClock
 from bench.types import Camera, NullProbe
 from methods.kernels.types import Occupancy
 from methods.rendering.frame import everywhere, render_frame

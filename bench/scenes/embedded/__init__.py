@@ -21,10 +21,10 @@ from bench.cameras import look_at, move_camera
 from bench.errors import unexpected
 from bench.provenance import digest
 from bench.scenes import blender
+from bench.scenes.embedded.medley import medley
+from bench.scenes.embedded.models import MODELS
+from bench.scenes.embedded.raytrace import Model, Solids, render
 from bench.scenes.files import opengl_to_opencv, whole_number
-from bench.scenes.medley import medley
-from bench.scenes.models import MODELS
-from bench.scenes.raytrace import Model, Solids, render
 from bench.threads import in_parallel
 from bench.types import Camera, Log, Scene, SteerbenchError, Unavailable
 

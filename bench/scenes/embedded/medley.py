@@ -13,9 +13,9 @@ from collections.abc import Callable, Sequence
 from colorsys import hsv_to_rgb
 from typing import TypeVar
 
-from bench.scenes import textures
-from bench.scenes.raytrace import Part, Solids
-from bench.scenes.solids import (
+from bench.scenes.embedded import textures
+from bench.scenes.embedded.raytrace import Part, Solids
+from bench.scenes.embedded.solids import (
     Box,
     Capsule,
     Carved,
@@ -27,7 +27,7 @@ from bench.scenes.solids import (
     Triple,
     ball,
 )
-from bench.scenes.textures import Colour, Texture
+from bench.scenes.embedded.textures import Colour, Texture
 
 Item = TypeVar("Item")
 

@@ -8,11 +8,10 @@ from functools import partial
 import pytest
 import torch
 
-from bench.scenes import textures
-from bench.scenes.analytic import train_poses
-from bench.scenes.medley import BULKY, CORE, REACH, SHAPES, SMALLER, Draw, medley
-from bench.scenes.raytrace import render
-from bench.scenes.solids import Box, Capsule, Carved, Common, Cylinder, Ellipsoid
+from bench.scenes.embedded import textures, train_poses
+from bench.scenes.embedded.medley import BULKY, CORE, REACH, SHAPES, SMALLER, Draw, medley
+from bench.scenes.embedded.raytrace import render
+from bench.scenes.embedded.solids import Box, Capsule, Carved, Common, Cylinder, Ellipsoid
 from bench.types import Camera
 
 FIRST = range(12)
