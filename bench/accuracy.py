@@ -16,10 +16,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bench.clock import FrameRecord, StageClock, p99_to_p50, times_ms
 from bench.errors import unexpected
 from bench.metrics import psnr, psnr_of_mse
-from bench.probes import FrameRecord, StageClock, p99_to_p50, times_ms
-from bench.protocol import EvaluationProtocol, check_frame
+from bench.protocol import EvaluationProtocol
+from bench.scoring import check_frame
 from bench.trajectories import Trajectory
 from bench.types import Log, Method, Scene, composite
 

@@ -17,13 +17,14 @@ import numpy as np
 import pandas as pd
 import torch
 
-from bench.allocator import give_back
+from bench.clock import StageClock
 from bench.intervals import path_interval
+from bench.memory import MemoryMeter, give_back
 from bench.metrics import Lpips
 from bench.neighbours import Neighbours, Watch
-from bench.probes import MemoryMeter, StageClock
-from bench.protocol import ERROR_RANGE, PICTURES, EvaluationProtocol, Scoring, check_frame
+from bench.protocol import EvaluationProtocol
 from bench.results import COLD, STEADY, WHOLE, Measurement
+from bench.scoring import ERROR_RANGE, PICTURES, Scoring, check_frame
 from bench.trajectories import Trajectory, spread
 from bench.types import Budget, Log, Method, Scene
 

@@ -11,9 +11,10 @@ from itertools import compress
 from omegaconf import DictConfig
 
 from bench.accuracy import steady_frames
-from bench.probes import OTHER, Line, device_waits
+from bench.clock import OTHER
 from bench.study import Study
 from bench.types import NullProbe
+from bench.waits import Line, device_waits
 from reports.tables import Table, decimal, spread
 from sweeps import variants
 from sweeps.execute import Launcher

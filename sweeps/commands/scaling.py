@@ -15,9 +15,10 @@ from omegaconf import DictConfig
 
 from bench.accuracy import mean_figures, observed_order
 from bench.cameras import frame_camera
+from bench.clock import FrameRecord, StageClock, p99_to_p50
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, unexpected, unknown
-from bench.probes import FrameRecord, MemoryMeter, StageClock, p99_to_p50
+from bench.memory import MemoryMeter
 from bench.threads import torch_threads
 from bench.types import Camera, Log, Method, Scene
 from reports.tables import Table, decimal, megabytes

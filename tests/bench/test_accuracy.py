@@ -20,8 +20,8 @@ from bench.accuracy import (
     render_in_turns,
     steady_frames,
 )
+from bench.clock import FrameRecord
 from bench.errors import SteerbenchError
-from bench.probes import FrameRecord
 from bench.protocol import EvaluationProtocol
 from bench.trajectories import Step, Trajectory, from_split
 from bench.types import Frame, composite

@@ -15,11 +15,11 @@ import torch
 from bench.cameras import scale_camera
 from bench.case import Difference
 from bench.console import ConsoleLog
-from bench.probes import device_waits
 from bench.protocol import EvaluationProtocol
 from bench.run import Task, measure
 from bench.trajectories import from_split
 from bench.types import Budget, Method, NullProbe, Scene, Split
+from bench.waits import device_waits
 from methods.checks import found
 from methods.diver.method import Diver
 from methods.diver.training import DiverLessons

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from bench.probes import device_waits
+from bench.waits import device_waits
 from methods.rendering.compaction import indices_where
 from tests.pretended_gpu import PretendedGpu
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d, interpolate
 
-from bench.scenes.analytic import ANGLE_X, VIEWS, orbit_poses, picture, train_poses
-from bench.scenes.mill import mill
-from bench.scenes.raytrace import render
+from bench.scenes.embedded import ANGLE_X, VIEWS, orbit_poses, picture, train_poses
+from bench.scenes.embedded.mill import mill
+from bench.scenes.embedded.raytrace import render
 from bench.types import Camera
 
 WIDTH, HEIGHT = 1920, 1080

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from bench.scenes.textures import checker, lattice, noise, pips, polar_checker, spiral
+from bench.scenes.embedded.textures import checker, lattice, noise, pips, polar_checker, spiral
 
 DARK, LIGHT = (0.1, 0.1, 0.2), (0.7, 0.6, 0.5)
 

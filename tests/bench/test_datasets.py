@@ -1,4 +1,4 @@
-"""Data sets and weights of others: downloads that break off or lie, copies that differ.
+"""Data sets of others: downloads that break off or lie, copies that differ.
 
 The publisher is a server on the loopback address.
 """
@@ -13,17 +13,15 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
-import torch
 
-from bench import published
-from bench.published import BACKBONES, Published, fetch, get, load_features, locate, verify
+from bench import datasets
+from bench.datasets import Published, get, verify
+from bench.download import fetch
 from bench.types import SteerbenchError, Unavailable
 from sweeps.commands import scenes
-from tests.web import Web
 
 CONTENT = bytes(range(256)) * 600
 FILES = {"mic/train/r_0.png": b"a", "mic/test/r_0.png": b"b", "mic/test/r_0_depth_0000.png": b"c"}
-STATE = {"features.0.weight": torch.ones(2), "classifier.1.weight": torch.zeros(3)}
 
 
 def publish(monkeypatch: pytest.MonkeyPatch, files: Mapping[str, bytes], **where: str) -> Published:
@@ -31,7 +29,7 @@ def publish(monkeypatch: pytest.MonkeyPatch, files: Mapping[str, bytes], **where
     data = Published("release", "blender", "free", **where)
     hashes = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
     data.__dict__["hashes"] = hashes  # as if they had been read
-    for module in (published, scenes):
+    for module in (datasets, scenes):
         monkeypatch.setattr(module, "published", lambda: [data])
     return data
 
@@ -77,7 +75,7 @@ def test_without_a_connection_the_message_says_so_in_two_words(tmp_path, quiet_l
 
 
 def test_the_list_of_nerf_synthetic_is_the_whole_release():
-    official = next(data for data in published.published() if data.name == "nerf_synthetic")
+    official = next(data for data in datasets.published() if data.name == "nerf_synthetic")
     scenes = {"chair", "drums", "ficus", "hotdog", "lego", "materials", "mic", "ship"}
     assert official.scenes == scenes
     for scene in scenes:
@@ -158,92 +156,3 @@ def test_every_difference_is_named_and_no_link_out_is_followed(monkeypatch, tmp_
     assert verify(release, quiet_log).missing == ["chair/b.png", "mic/c.png"]
     with pytest.raises(SteerbenchError, match=r"expected a folder chair"):
         verify(tmp_path, quiet_log)
-
-
-@pytest.fixture
-def publisher(monkeypatch, tmp_path, web) -> Web:
-    """An empty cache, no environment, and a publisher of weights with no file."""
-    monkeypatch.setattr(published, "WEIGHTS_ADDRESS", web.address)
-    monkeypatch.setattr(published, "_unreachable", [])
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    monkeypatch.delenv("STEERBENCH_WEIGHTS", raising=False)
-    return web
-
-
-@pytest.fixture
-def weights(publisher, monkeypatch) -> tuple[str, bytes]:
-    """Name and bytes of a file whose name tells the beginning of its SHA-256."""
-    buffer = io.BytesIO()
-    torch.save(STATE, buffer)
-    name = f"alexnet-owt-{hashlib.sha256(buffer.getvalue()).hexdigest()[:8]}.pth"
-    monkeypatch.setitem(BACKBONES, "alex", (name, BACKBONES["alex"][1]))
-    return name, buffer.getvalue()
-
-
-def cache(tmp_path: Path) -> Path:
-    return tmp_path / "torch" / "hub" / "checkpoints"
-
-
-def test_weights_dir_precedes_environment_and_cache(publisher, monkeypatch, tmp_path, quiet_log):
-    folders = [tmp_path / "given", tmp_path / "environment", cache(tmp_path)]
-    for folder in folders:
-        folder.mkdir(parents=True)
-        torch.save(STATE, folder / "alexnet_features.pth")
-    monkeypatch.setenv("STEERBENCH_WEIGHTS", str(folders[1]))
-    for folder in folders:
-        assert locate("alex", folders[0], quiet_log) == folder / "alexnet_features.pth"
-        (folder / "alexnet_features.pth").unlink()
-
-
-def test_weights_with_their_published_name_are_read_unless_damaged(tmp_path, weights, quiet_log):
-    name, content = weights
-    (tmp_path / name).write_bytes(content)
-    path, features = load_features("alex", tmp_path, quiet_log)
-    assert path == tmp_path / name
-    assert torch.equal(features["features.0.weight"], STATE["features.0.weight"])
-    (tmp_path / name).write_bytes(content[:-1] + b"?")
-    with pytest.raises(Unavailable, match=f"{name}: expected a SHA-256 that begins with"):
-        locate("alex", tmp_path, quiet_log)
-    (tmp_path / "alexnet_features.pth").write_bytes(content[:100])
-    with pytest.raises(Unavailable, match=r"alexnet_features.pth: expected a torch state dict"):
-        load_features("alex", tmp_path, quiet_log)
-
-
-def test_a_file_that_would_run_code_is_refused_and_runs_none(tmp_path, quiet_log):
-    class Attack:
-        def __reduce__(self):
-            return Path.touch, (tmp_path / "attacked",)
-
-    torch.save({"features.0.weight": Attack()}, tmp_path / "alexnet_features.pth")
-    with pytest.raises(Unavailable):
-        load_features("alex", tmp_path, quiet_log)
-    assert not (tmp_path / "attacked").exists()
-
-
-def test_missing_weights_are_asked_for_once_and_the_message_says_what_to_do(publisher, quiet_log):
-    for net in ("vgg", "alex", "vgg"):
-        with pytest.raises(Unavailable) as caught:
-            locate(net, None, quiet_log)
-    assert publisher.asked == ["/vgg16-397923af.pth"]
-    for part in (f"{publisher.address}vgg16-397923af.pth", "404", "weights_dir=", "STEERBENCH_WE"):
-        assert part in str(caught.value)
-
-
-def test_downloaded_weights_are_kept_if_right(tmp_path, publisher, weights, quiet_log, monkeypatch):
-    name, content = weights
-    publisher.files[f"/{name}"] = content[:-1]
-    with pytest.raises(Unavailable, match="SHA-256"):
-        locate("alex", None, quiet_log)
-    assert not (cache(tmp_path) / name).exists()
-    monkeypatch.setattr(published, "_unreachable", [])
-    publisher.files[f"/{name}"] = content
-    assert locate("alex", None, quiet_log) == cache(tmp_path) / name
-    assert locate("alex", None, quiet_log).read_bytes() == content
-    assert len(publisher.asked) == 2
-
-
-def test_an_unknown_network_and_a_missing_folder_are_errors_not_gaps(tmp_path, quiet_log):
-    with pytest.raises(SteerbenchError, match="expected one of alex, vgg, squeeze, got 'resnet'"):
-        locate("resnet", None, quiet_log)
-    with pytest.raises(SteerbenchError, match=r"weights_dir: expected a folder, got .*nowhere"):
-        locate("alex", tmp_path / "nowhere", quiet_log)

@@ -1,14 +1,10 @@
-"""What others publish: data sets, and backbones of LPIPS. Downloads them with pooch, checks them.
+"""Data sets that others publish: downloads them, checks copies of them.
 
-`scenes/published.toml` describes the data sets; the SHA-256 of each file is in a pooch registry.
-Weights are searched in `weights_dir`, `$STEERBENCH_WEIGHTS` and torch's hub cache, in this order.
+`scenes/published.toml` describes them; the SHA-256 of each file is in a pooch registry.
 """
 
 from __future__ import annotations
 
-import os
-import pickle
-import re
 import tempfile
 import tomllib
 import zipfile
@@ -17,29 +13,15 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import torch
-from torch import Tensor
-
+from bench.download import fetch
 from bench.errors import unexpected
 from bench.scenes.files import data_folder
 from bench.sharing import locked
 from bench.threads import in_parallel
-from bench.types import Log, SteerbenchError, Unavailable
+from bench.types import Log, Unavailable
 
 LISTS = Path(__file__).parent / "scenes"
 GROUND_TRUTH = ("_depth_", "_normal_")  # pictures that no loader reads; an archive may lack them
-WEIGHTS_ADDRESS = "https://download.pytorch.org/models/"
-TIMEOUT_S = 10.0
-
-
-BACKBONES = {
-    "alex": ("alexnet-owt-7be5be79.pth", "alexnet_features.pth"),
-    "vgg": ("vgg16-397923af.pth", "vgg16_features.pth"),
-    "squeeze": ("squeezenet1_1-b8a52dc0.pth", "squeezenet1_1_features.pth"),
-}
-"""File names of a backbone: torchvision's own, and one with only its `features.*`."""
-
-_unreachable: list[str] = []  # why a download of weights failed
 
 
 @dataclass(frozen=True)
@@ -93,38 +75,6 @@ def get(data: Published, scene: str, folder: Path, log: Log) -> Path:
             finally:  # no longer needed, or damaged
                 archive.unlink()
     return folder / scene
-
-
-def fetch(address: str, target: Path, sha256: str | None, log: Log) -> Path:
-    """Download `address` to `target` unless it is there already and correct; returns `target`.
-
-    A download that breaks off leaves nothing. `sha256` None: the content is not checked. Raises
-    Unavailable without an answer, if the connection breaks off, or the content has another hash.
-    """
-    import pooch
-    import requests
-
-    def download(address: str, output_file: str, pooch: object) -> None:
-        with requests.get(address, stream=True, timeout=TIMEOUT_S) as answer:
-            answer.raise_for_status()
-            total = int(answer.headers.get("Content-Length", 0))
-            bar = log.progress(f"downloading {target.name}", total)
-            with Path(output_file).open("wb") as file, bar as progress:
-                for chunk in answer.iter_content(1 << 16):
-                    file.write(chunk)
-                    progress.advance(len(chunk))
-
-    pooch.get_logger().setLevel("WARNING")
-    try:
-        pooch.retrieve(address, sha256, target.name, target.parent, downloader=download)
-    except requests.RequestException as error:
-        # The message of a lost connection is that of four nested exceptions.
-        offline = type(error) in (requests.ConnectionError, requests.ConnectTimeout)
-        why = "no connection" if offline else error
-        raise Unavailable(f"the download of {address} failed ({why})") from error
-    except ValueError as error:  # from pooch, which has deleted the file
-        raise Unavailable(f"the download of {address} is damaged: {error}") from error
-    return target
 
 
 def _unpack(archive: Path, wanted: Mapping[str, str], folder: Path) -> None:
@@ -208,59 +158,3 @@ def _expected(root: Path) -> tuple[Path, Mapping[str, str]]:
             return root, data.hashes
     folders = sorted(scene for data in known for scene in data.scenes)
     raise unexpected(root, f"a folder {' or '.join(folders)}, or one above", "none of these names")
-
-
-def locate(net: str, weights_dir: Path | None, log: Log) -> Path:
-    """The weight file of backbone `net`, downloaded into torch's hub cache if need be.
-
-    A file with a SHA-256 in its name is checked against it. Raises SteerbenchError if `net` is
-    unknown or `weights_dir` no folder, and Unavailable if no sound file can be had.
-    """
-    if net not in BACKBONES:
-        raise SteerbenchError(f"LPIPS net: expected one of {', '.join(BACKBONES)}, got {net!r}")
-    if weights_dir is not None and not weights_dir.is_dir():
-        raise SteerbenchError(f"weights_dir: expected a folder, got {weights_dir}")
-    name, features = BACKBONES[net]
-    cache = Path(torch.hub.get_dir()) / "checkpoints"
-    folders = [Path(f) for f in (weights_dir, os.environ.get("STEERBENCH_WEIGHTS"), cache) if f]
-    for path in (folder / file for folder in folders for file in (features, name)):
-        if path.is_file():
-            return _verified(path)
-    # After one failure this process gives up: every backbone would wait for the same connection.
-    if not _unreachable:
-        try:
-            cache.mkdir(parents=True, exist_ok=True)
-            with locked(cache / f".{name}.lock", f"waits for another download of {name}", log):
-                path = fetch(WEIGHTS_ADDRESS + name, cache / name, None, log)
-                try:
-                    return _verified(path)
-                except Unavailable:
-                    path.unlink()
-                    raise
-        except (OSError, SteerbenchError) as error:
-            _unreachable.append(str(error))
-    advice = "name a folder that has it as weights_dir=DIR or in $STEERBENCH_WEIGHTS"
-    raise Unavailable(f"{name} is not on this machine, and {_unreachable[0]}; {advice}")
-
-
-def load_features(net: str, weights_dir: Path | None, log: Log) -> tuple[Path, dict[str, Tensor]]:
-    """The weight file of backbone `net` and the tensors in it; raises as `locate` does."""
-    path = locate(net, weights_dir, log)
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError):
-        state = None
-    if not isinstance(state, dict):
-        again = f"fetch the file again from {WEIGHTS_ADDRESS}{BACKBONES[net][0]}"
-        raise Unavailable(f"{path}: expected a torch state dict, could not read one; {again}")
-    return path, state
-
-
-def _verified(path: Path) -> Path:
-    """`path`; raises Unavailable if its name holds a SHA-256 that its content does not match."""
-    promised = re.search(r"-([0-9a-f]{8})\.pth$", path.name)
-    got = _sha256(path) if promised else None
-    if promised and not (got or "").startswith(promised[1]):
-        said = f"{path}: expected a SHA-256 that begins with {promised[1]}, got {got}"
-        raise Unavailable(f"{said}; the file is damaged: delete it and fetch it again")
-    return path

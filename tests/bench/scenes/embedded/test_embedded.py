@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from bench.scenes import analytic
-from bench.scenes.analytic import MOST, VIEWS, find, orbit_poses, train_poses
-from bench.scenes.models import MODELS
-from bench.scenes.raytrace import render
+from bench.scenes import embedded
+from bench.scenes.embedded import MOST, VIEWS, find, orbit_poses, train_poses
+from bench.scenes.embedded.models import MODELS
+from bench.scenes.embedded.raytrace import render
 from bench.types import Camera, SteerbenchError, Unavailable
 
 SMALL = {"width": 24, "height": 18, "train": 4, "test": 2}
@@ -21,10 +21,10 @@ SMALL = {"width": 24, "height": 18, "train": 4, "test": 2}
 
 def test_a_scene_is_written_once_in_the_layout_of_nerf_synthetic(tmp_path, log):
     options = {**SMALL, "bounds": "full", "root": tmp_path}
-    first = analytic.load("void", **options, log=log)
+    first = embedded.load("void", **options, log=log)
     written = log.done
     assert written == 2 * 6  # six rendered, six read
-    second = analytic.load("void", **options, log=log)
+    second = embedded.load("void", **options, log=log)
     assert log.done == written + 6
     assert second.digest == first.digest
     (folder,) = tmp_path.iterdir()
@@ -35,7 +35,7 @@ def test_a_scene_is_written_once_in_the_layout_of_nerf_synthetic(tmp_path, log):
     record = json.loads((folder / "transforms_train.json").read_text())
     assert record["scene"] == {"name": "void", "seed": 0, **SMALL}
     for change in ({"width": 25}, {"height": 19}, {"train": 5}, {"test": 3}, {"seed": 1}):
-        analytic.load("void", **options | change, log=log)
+        embedded.load("void", **options | change, log=log)
     assert len(list(tmp_path.iterdir())) == 6
 
 
@@ -47,14 +47,14 @@ def test_who_finishes_second_accepts_the_scene_of_the_first(tmp_path, log, monke
         return rename(scene, folder)
 
     monkeypatch.setattr(Path, "rename", overtaken)
-    analytic.load("void", **SMALL, root=tmp_path, log=log)
+    embedded.load("void", **SMALL, root=tmp_path, log=log)
     (folder,) = tmp_path.iterdir()
     assert not (folder / "scene").exists()
 
 
 @pytest.mark.parametrize("name", [*MODELS])
 def test_a_scene_knows_its_picture_at_any_camera_as_its_splits_have_it(tmp_path, log, name):
-    scene = analytic.load(name, **SMALL, root=tmp_path, log=log)
+    scene = embedded.load(name, **SMALL, root=tmp_path, log=log)
     assert scene.exact is not None
     assert (scene.surface is None) == (name == "cloud")
     test = scene.splits["test"]
@@ -84,7 +84,7 @@ def test_a_model_fills_but_does_not_leave_its_pictures(name, height, samples, le
 def test_the_orbit_is_smooth_and_closes():
     eyes = torch.stack([pose[:, 3] for pose in orbit_poses(360)])
     steps = (eyes - eyes.roll(1, 0)).norm(dim=1)  # the last step joins the ends
-    one_degree = 2 * analytic.DISTANCE * math.sin(math.radians(0.5))
+    one_degree = 2 * embedded.DISTANCE * math.sin(math.radians(0.5))
     # Azimuth moves cos(elevation) of a degree, elevation at most 8 * 2 / 57.3 of one.
     assert steps.min() >= one_degree * math.cos(math.radians(33)) * 0.999
     assert steps.max() <= one_degree * math.hypot(math.cos(math.radians(17)), 16 / 57.3) * 1.001
@@ -111,7 +111,7 @@ def test_training_poses_are_those_of_their_seed():
 
 def test_the_pictures_of_a_folder_have_the_views_of_their_scene(tmp_path, log):
     assert VIEWS.keys() <= MODELS.keys()
-    analytic.load("mill", **SMALL, root=tmp_path, log=log)
+    embedded.load("mill", **SMALL, root=tmp_path, log=log)
     (file,) = tmp_path.glob("mill-*/transforms_train.json")
     frames = json.loads(file.read_text())["frames"]
     matrices = torch.tensor([frame["transform_matrix"] for frame in frames])
@@ -124,16 +124,16 @@ def test_a_broken_write_leaves_nothing(tmp_path, monkeypatch, log, fault):
     def fail(*args: object, **kwargs: object) -> None:
         raise fault
 
-    monkeypatch.setattr(analytic, "picture", fail)
+    monkeypatch.setattr(embedded, "picture", fail)
     with pytest.raises((KeyboardInterrupt, SteerbenchError)):
-        analytic.load("void", **SMALL, root=tmp_path, log=log)
+        embedded.load("void", **SMALL, root=tmp_path, log=log)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_root_that_cannot_be_written_is_named(tmp_path, log):
     (tmp_path / "file").write_text("")
     with pytest.raises(SteerbenchError, match=r"file/void-\w+: the scene cannot be written"):
-        analytic.load("void", **SMALL, root=tmp_path / "file", log=log)
+        embedded.load("void", **SMALL, root=tmp_path / "file", log=log)
 
 
 @pytest.mark.parametrize(
@@ -147,11 +147,11 @@ def test_a_root_that_cannot_be_written_is_named(tmp_path, log):
 )
 def test_bad_options(tmp_path, log, options, message):
     with pytest.raises(SteerbenchError, match=message):
-        analytic.load(**{"name": "void", **options}, root=tmp_path, log=log)
+        embedded.load(**{"name": "void", **options}, root=tmp_path, log=log)
 
 
 def test_unknown_names_are_refused(tmp_path, log):
     known = "one of totem, wires, cloud, void, mill"
     with pytest.raises(Unavailable, match=f"{known}, got 'tower'"):
-        analytic.load("tower", root=tmp_path, log=log)
+        embedded.load("tower", root=tmp_path, log=log)
     assert list(tmp_path.iterdir()) == []

@@ -7,10 +7,10 @@ import math
 import pytest
 import torch
 
-from bench.scenes.building import block, rail, rod, slope
-from bench.scenes.raytrace import Part
-from bench.scenes.solids import Triple, box_corners
-from bench.scenes.textures import plain
+from bench.scenes.embedded.building import block, rail, rod, slope
+from bench.scenes.embedded.raytrace import Part
+from bench.scenes.embedded.solids import Triple, box_corners
+from bench.scenes.embedded.textures import plain
 
 GREY = plain((0.5, 0.5, 0.5))
 

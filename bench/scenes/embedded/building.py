@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from bench.scenes.masonry import placed
-from bench.scenes.raytrace import Part, rotation
-from bench.scenes.solids import Box, Cylinder, Pierced, Shape, Triple
-from bench.scenes.textures import Texture
+from bench.scenes.embedded.masonry import placed
+from bench.scenes.embedded.raytrace import Part, rotation
+from bench.scenes.embedded.solids import Box, Cylinder, Pierced, Shape, Triple
+from bench.scenes.embedded.textures import Texture
 
 UPRIGHT = (0.0, 0.0, 0.0)
 

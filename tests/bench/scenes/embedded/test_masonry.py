@@ -7,9 +7,9 @@ import math
 import pytest
 import torch
 
-from bench.scenes.building import block
-from bench.scenes.masonry import bricks, cells, panes, planks, rough, setts, tiles, tone
-from bench.scenes.textures import Texture
+from bench.scenes.embedded.building import block
+from bench.scenes.embedded.masonry import bricks, cells, panes, planks, rough, setts, tiles, tone
+from bench.scenes.embedded.textures import Texture
 
 DARK, LIGHT, THIRD = (0.1, 0.1, 0.2), (0.7, 0.6, 0.5), (0.3, 0.5, 0.2)
 TEXTURES: dict[str, Texture] = {

@@ -19,9 +19,9 @@ from torch import Tensor
 from bench.cameras import look_at, move_camera
 from bench.provenance import digest
 from bench.scenes import blender
+from bench.scenes.embedded.models import MODELS
+from bench.scenes.embedded.raytrace import Model, Solids, render
 from bench.scenes.files import opengl_to_opencv, whole_number
-from bench.scenes.models import MODELS
-from bench.scenes.raytrace import Model, Solids, render
 from bench.threads import in_parallel
 from bench.types import Camera, Log, Scene, SteerbenchError, Unavailable
 

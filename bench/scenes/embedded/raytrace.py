@@ -17,9 +17,17 @@ from torch import Tensor
 
 from bench.cameras import project
 from bench.errors import unexpected
-from bench.scenes.shadows import Tiles
-from bench.scenes.solids import Carved, Pierced, Shape, Triple, ball_interval, box_corners, unit
-from bench.scenes.textures import Colour, Texture
+from bench.scenes.embedded.shadows import Tiles
+from bench.scenes.embedded.solids import (
+    Carved,
+    Pierced,
+    Shape,
+    Triple,
+    ball_interval,
+    box_corners,
+    unit,
+)
+from bench.scenes.embedded.textures import Colour, Texture
 from bench.types import EMPTY_ALPHA, Camera, Frame
 
 BAND_RAYS = 1 << 18  # enough to hide the cost of calls, few enough to stay in the cache

@@ -9,8 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from bench.scenes.solids import Triple
-from bench.scenes.textures import Colour, Texture, lattice, mix, noise, texture
+from bench.scenes.embedded.solids import Triple
+from bench.scenes.embedded.textures import Colour, Texture, lattice, mix, noise, texture
 
 
 @texture

@@ -1,23 +1,16 @@
-"""Every nanosecond of a frame is charged once, every region is metered, every wait has its line."""
+"""Every nanosecond of a frame is charged once."""
 
 from __future__ import annotations
 
 import itertools
-import linecache
-import mmap
-import warnings
 from collections.abc import Iterable
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench import probes
-from bench.errors import Unavailable
-from bench.probes import FrameRecord, MemoryMeter, StageClock, device_waits, p99_to_p50
+from bench.clock import FrameRecord, StageClock, p99_to_p50
 
 
 def clock_reading(times: Iterable[int]) -> StageClock:
@@ -138,92 +131,3 @@ def test_the_device_finishes_its_work_before_every_reading(monkeypatch, stages, 
 def test_the_longest_frames_are_held_against_the_median():
     records = [FrameRecord({"field": ms * 1_000_000}, {}, {}) for ms in (10, 10, 40)]
     assert p99_to_p50(records) == pytest.approx(3.94)  # 10 + 0.98 x 30, of 10
-
-
-SIZE = 64 << 20
-SLACK = 8 << 20  # the kernel adds up resident pages in batches for every core
-
-
-def test_the_peak_of_a_region_is_what_it_touches_and_the_highest_of_several_is_kept():
-    meter, idle = MemoryMeter("cpu"), MemoryMeter("cpu")
-    with meter, mmap.mmap(-1, SIZE) as fresh:  # an allocator may have some bytes left to give
-        for page in range(0, SIZE, mmap.PAGESIZE):
-            fresh[page] = 1
-    first = meter.peak_bytes
-    with idle:  # it knows nothing of what was freed before
-        pass
-    with meter:
-        pass
-    assert first >= idle.peak_bytes + SIZE - SLACK
-    assert meter.peak_bytes == first
-
-
-def test_the_source_says_when_the_peak_includes_what_came_before(monkeypatch):
-    assert "while rendering" in MemoryMeter("cpu").source
-    # In some sandboxes the status of a process has fewer lines.
-    monkeypatch.setattr(Path, "read_text", lambda path: "VmRSS: 1 kB\n")
-    with (meter := MemoryMeter("cpu")):
-        pass
-    assert meter.peak_bytes > 1 << 20
-    monkeypatch.setattr(probes, "_reset_high_water_mark", lambda: False)
-    assert "since it began" in MemoryMeter("cpu").source
-
-
-def test_on_a_gpu_the_meter_reads_the_allocator(monkeypatch):
-    calls = []
-    monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", lambda device: calls.append("reset"))
-    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: 12345)
-    meter = MemoryMeter("cuda")
-    with meter:
-        assert calls == ["reset"]
-    assert meter.peak_bytes == 12345
-    assert "device" in meter.source
-
-
-def test_the_line_that_waits_or_calls_what_waits_in_torch_is_named(gpu):
-    x = torch.ones(3, device="cuda")
-    with device_waits() as waits:
-        for _ in range(2):
-            torch.unique(x)
-    ((line, count),) = waits.items()
-    assert (line.path, count) == (__file__, 2)
-    assert linecache.getline(*line).strip() == "torch.unique(x)"
-    scope: dict[str, Any] = {}
-    text = "def wait():\n import warnings\n warnings.warn('called a synchronizing CUDA operation')"
-    exec(compile(text, torch.functional.__file__, "exec"), scope)
-    with device_waits() as waits:
-        scope["wait"]()
-    ((line, count),) = waits.items()
-    assert (line.path, count) == (__file__, 1)
-
-
-def test_a_wait_in_a_backward_pass_is_that_of_its_line(gpu):
-    class Asking(torch.autograd.Function):
-        @staticmethod
-        def forward(ctx, x):
-            return x.clone()
-
-        @staticmethod
-        def backward(ctx, grad):
-            return grad * grad.max().item()
-
-    x = torch.ones(3, device="cuda", requires_grad=True)
-    y = Asking.apply(x).sum()
-    with device_waits() as waits:
-        y.backward()
-    ((line, count),) = waits.items()
-    assert (line.number, count) == (Asking.backward.__code__.co_firstlineno + 2, 1)
-
-
-def test_other_warnings_are_shown_as_ever_and_afterwards_none_is_counted(gpu):
-    with pytest.warns(UserWarning, match="of something else"), device_waits() as waits:
-        warnings.warn("of something else", stacklevel=1)
-    torch.ones(1, device="cuda").item()
-    assert not waits
-    assert torch.cuda.get_sync_debug_mode() == 0
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="for a machine without a GPU")
-def test_without_a_gpu_it_says_that_one_is_needed():
-    with pytest.raises(Unavailable, match="a GPU is needed"), device_waits():
-        pass

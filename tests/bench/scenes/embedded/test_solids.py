@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from bench.scenes.solids import (
+from bench.scenes.embedded.solids import (
     Box,
     Capsule,
     Carved,

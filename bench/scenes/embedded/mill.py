@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from bench.scenes.building import block, put, rail, raised, rod, slope
-from bench.scenes.masonry import bricks, panes, planks, rough, setts, tiles
-from bench.scenes.raytrace import Part, Solids
-from bench.scenes.solids import (
+from bench.scenes.embedded.building import block, put, rail, raised, rod, slope
+from bench.scenes.embedded.masonry import bricks, panes, planks, rough, setts, tiles
+from bench.scenes.embedded.raytrace import Part, Solids
+from bench.scenes.embedded.solids import (
     Box,
     Carved,
     Common,
@@ -23,7 +23,7 @@ from bench.scenes.solids import (
     Triple,
     ball,
 )
-from bench.scenes.textures import Texture
+from bench.scenes.embedded.textures import Texture
 
 SUNK = 0.53  # how far the ground lies below the centre of the pictures
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from bench.cameras import cast
-from bench.scenes import raytrace
-from bench.scenes.models import cloud, mill, totem, wires
-from bench.scenes.raytrace import (
+from bench.scenes.embedded import raytrace
+from bench.scenes.embedded.models import cloud, mill, totem, wires
+from bench.scenes.embedded.raytrace import (
     LIGHT,
     Ball,
     Cloud,
@@ -20,8 +20,8 @@ from bench.scenes.raytrace import (
     render,
     sample_offsets,
 )
-from bench.scenes.solids import Capsule, Ellipsoid
-from bench.scenes.textures import plain
+from bench.scenes.embedded.solids import Capsule, Ellipsoid
+from bench.scenes.embedded.textures import plain
 from bench.types import EMPTY_ALPHA, Camera, SteerbenchError
 from tests.bench.scenes.conftest import camera_at
 

@@ -24,9 +24,10 @@ from torch import Tensor
 
 from bench.errors import explained, unexpected
 from bench.metrics import as_bytes
+from bench.paths import write_path
 from bench.scenes.export import check_empty, data_camera, write_blender
 from bench.threads import in_parallel
-from bench.trajectories import Trajectory, write_path
+from bench.trajectories import Trajectory
 from bench.types import Log, Scene, Split, composite
 
 POINTS = 10_000  # random ones, from which Gaussians start

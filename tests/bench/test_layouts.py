@@ -14,16 +14,16 @@ import torch
 from torch import Tensor
 
 from bench.cameras import move_camera
+from bench.layouts import LAYOUTS, POINTS, export
 from bench.metrics import as_bytes
-from bench.scenes import analytic, blender, colmap
-from bench.scenes.layouts import LAYOUTS, POINTS, export
+from bench.scenes import blender, colmap, embedded
 from bench.trajectories import Trajectory, follow, orbit, smooth
 from bench.types import Camera, Scene, SteerbenchError, composite
 
 
 @pytest.fixture
 def scene(tmp_path, quiet_log) -> Scene:
-    return analytic.load("totem", width=24, train=3, test=3, root=tmp_path / "all", log=quiet_log)
+    return embedded.load("totem", width=24, train=3, test=3, root=tmp_path / "all", log=quiet_log)
 
 
 @pytest.fixture
@@ -104,6 +104,6 @@ def test_what_a_layout_cannot_hold_is_refused(scene, path, tmp_path, quiet_log):
 
 
 def test_the_choices_of_the_command_are_the_layouts():
-    file = Path(__file__).parents[3] / "sweeps" / "commands.toml"
+    file = Path(__file__).parents[2] / "sweeps" / "commands.toml"
     command = tomllib.loads(file.read_text())["scenes"]
     assert command["arguments"]["--layout"]["choices"] == list(LAYOUTS)

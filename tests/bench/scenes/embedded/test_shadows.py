@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bench.scenes.shadows import TILES, Tiles
+from bench.scenes.embedded.shadows import TILES, Tiles
 
 
 @pytest.mark.parametrize("count", [1, 5, 3000])

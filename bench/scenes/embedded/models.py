@@ -6,9 +6,9 @@ import math
 from collections.abc import Callable
 from itertools import pairwise
 
-from bench.scenes.mill import mill
-from bench.scenes.raytrace import Ball, Cloud, Model, Part, Solids
-from bench.scenes.solids import (
+from bench.scenes.embedded.mill import mill
+from bench.scenes.embedded.raytrace import Ball, Cloud, Model, Part, Solids
+from bench.scenes.embedded.solids import (
     Box,
     Capsule,
     Carved,
@@ -19,7 +19,7 @@ from bench.scenes.solids import (
     Triple,
     ball,
 )
-from bench.scenes.textures import (
+from bench.scenes.embedded.textures import (
     Colour,
     checker,
     chevrons,
