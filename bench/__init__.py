@@ -1,1 +1,1 @@
-"""The benchmark: scenes, metrics, probes, protocols and the store of results. Names no method."""
+"""The benchmark: scenes, metrics, clocks, protocols and the store of results. Names no method."""

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from bench.probes import times_ms
+from bench.clock import times_ms
 from bench.types import Log, Unavailable
 
 Cell = tuple[str, str]  # a backend or an engine, and a precision

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bench.probes import times_ms
+from bench.clock import times_ms
 from bench.types import Log
 
 

@@ -20,17 +20,19 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from bench.allocator import give_back
+from bench.clock import FrameRecord, StageClock
 from bench.errors import unexpected
+from bench.memory import MemoryMeter, give_back
 from bench.metrics import Lpips, psnr_of_mse
 from bench.neighbours import Neighbours, Watch
-from bench.probes import FrameRecord, Line, MemoryMeter, StageClock, device_waits
-from bench.protocol import ERROR_RANGE, PICTURES, EvaluationProtocol, Scoring, check_frame
+from bench.protocol import EvaluationProtocol
 from bench.results import COLD, STEADY, Measurement
 from bench.rows import UNITS, phase_rows, single
+from bench.scoring import ERROR_RANGE, PICTURES, Scoring, check_frame
 from bench.study import study_of
 from bench.trajectories import Trajectory, spread
 from bench.types import Budget, Log, Method, Scene
+from bench.waits import Line, device_waits
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ import torch
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
-from bench.published import load_features
 from bench.types import Log, SteerbenchError, Unavailable, check_shape
+from bench.weights import load_features
 
 LPIPS_SIDE = {"lpips_alex": 31, "lpips_vgg": 16, "lpips_squeeze": 17}
 SMALLEST_SIDE = {"psnr": 1, "ssim": 11, **LPIPS_SIDE, "flip": 1}
@@ -89,7 +89,7 @@ class Lpips:
     """LPIPS v0.1 (Zhang et al. 2018) with a named backbone; a lower value is more similar.
 
     The linear layers come with the `lpips` package, the backbone ("alex", "vgg" or "squeeze") from
-    `bench.published`, which searches `weights_dir` first. Runs in float32 on the device of the
+    `bench.weights`, which searches `weights_dir` first. Runs in float32 on the device of the
     pictures, which are mapped to [-1, 1] as published. Raises Unavailable if the weights cannot be
     found or downloaded, or do not fit the network.
     """

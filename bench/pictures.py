@@ -17,10 +17,11 @@ from torch import Tensor
 
 from bench.errors import unexpected
 from bench.metrics import Lpips, check_size
-from bench.protocol import PICTURES, EvaluationProtocol, Scoring
+from bench.protocol import EvaluationProtocol
 from bench.results import STEADY, Measurement
 from bench.rows import UNITS, phase_rows, score_rows, single
 from bench.scenes.images import contents, decode_bytes
+from bench.scoring import PICTURES, Scoring
 from bench.trajectories import resolution, spread
 from bench.types import BACKGROUNDS, Camera, Log, Split, SteerbenchError, composite
 

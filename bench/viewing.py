@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from bench.cameras import scale_camera
+from bench.clock import OTHER, StageClock
 from bench.metrics import quantise
-from bench.probes import OTHER, StageClock
-from bench.protocol import check_frame
+from bench.scoring import check_frame
 from bench.types import Camera, Method
 
 COARSE = 2  # while a camera moves, a slow method renders so many times fewer pixels a side

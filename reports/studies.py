@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from bench.clock import OTHER
 from bench.experiments import observed_order
-from bench.probes import OTHER
 from bench.study import part_of
 from reports.figures import frontier_plot
 from reports.images import Part, Picture

@@ -14,7 +14,7 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.allocator import keep_freed
+from bench.memory import keep_freed
 from bench.sharing import locked
 
 if TYPE_CHECKING:  # help and completion do not load torch

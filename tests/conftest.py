@@ -28,10 +28,10 @@ from bench.measure import Task, measure
 from bench.metrics import _lpips_package
 from bench.nerfbaselines import VERSION
 from bench.protocol import EvaluationProtocol
-from bench.published import BACKBONES
 from bench.results import Store
 from bench.trajectories import from_split
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene, Split, composite
+from bench.weights import BACKBONES
 from tests.pretended_gpu import PretendedGpu, pretended_gpu
 from tests.web import Web, served
 

@@ -21,7 +21,6 @@ RUN = [
 ]
 METHODS = (
     ["method=ngp"],
-    ["method=steernerf_lean", "method.model.step=4"],
     ["method=steernerf", "method.model.step=4"],
 )
 METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "work.samples", "work.products")

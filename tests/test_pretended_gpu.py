@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from bench.probes import device_waits
+from bench.waits import device_waits
 from methods.engines.torch_engine import TorchEngine
 from methods.kernels.encode import HashGrid, encode
 from tests.pretended_gpu import pretended_gpu

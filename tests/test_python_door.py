@@ -81,8 +81,8 @@ def test_the_import_changes_nothing_of_the_process():
     """The command line sets variables and the allocator for itself, not for who imports."""
     program = """
 import os, torch, numba  # both set variables of their own
-import bench.allocator
-bench.allocator.keep_freed = None  # a call would fail
+import bench.memory
+bench.memory.keep_freed = None  # a call would fail
 before = dict(os.environ)
 import steerbench
 assert dict(os.environ) == before, dict(os.environ).items() ^ before.items()

@@ -1,7 +1,7 @@
 """torch as an engine: the network as trained or in half precision, on a GPU with CUDA graphs.
 
-In plain torch the lean network is some two hundred small operations, which the CPU launches one by
-one. A graph, recorded once for each input size and then replayed, needs a single launch.
+In plain torch a network is dozens of operations, which the CPU launches one by one. A graph,
+recorded once for each input size and then replayed, needs a single launch.
 """
 
 from __future__ import annotations

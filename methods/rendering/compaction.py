@@ -17,13 +17,6 @@ def compacts(device: torch.device) -> bool:
     return device.type == "cpu"
 
 
-def kept_indices(mask: Tensor) -> Tensor:
-    """Indices where `mask` [N] is true, in order; all N where work is not compacted."""
-    if compacts(mask.device):
-        return mask.nonzero().squeeze(1)
-    return torch.arange(len(mask), device=mask.device)
-
-
 def to_host(numbers: Sequence[Tensor]) -> list[int]:
     """Copy all integers in `numbers`, of any shapes, to the host, which waits for a GPU once."""
     return torch.cat([number.flatten() for number in numbers]).tolist()

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from bench.clock import FrameRecord, StageClock
 from bench.metrics import psnr
 from bench.motion import preceding, viewing_target
-from bench.probes import FrameRecord, StageClock
 from bench.types import Camera, Frame, Log, NullProbe, Probe, Scene, composite
 from methods.engines import Built, Inputs
 from methods.engines.auto import Figures

@@ -19,9 +19,10 @@ from PIL import Image
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable, explained, install_command
 from bench.metrics import as_bytes, quantise
-from bench.protocol import check_frame
+from bench.paths import write_path
 from bench.results import Store
-from bench.trajectories import MIXED, write_path
+from bench.scoring import check_frame
+from bench.trajectories import MIXED
 from bench.types import Camera, Method, NullProbe
 from sweeps.configured import build, scene_of, trained
 from sweeps.overrides import beside, composed, setting

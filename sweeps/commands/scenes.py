@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from bench import layouts
 from bench.console import ConsoleLog
+from bench.datasets import Published, get, published, verify
 from bench.errors import unknown
-from bench.published import Published, get, published, verify
-from bench.scenes import layouts
 from sweeps.configured import build, scene_of
 from sweeps.overrides import composed
 

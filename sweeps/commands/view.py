@@ -26,8 +26,8 @@ from bench.cameras import pack_camera
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable, install_command
 from bench.metrics import as_bytes, psnr
+from bench.paths import write_path
 from bench.study import study_of
-from bench.trajectories import write_path
 from bench.types import Camera, composite
 from bench.viewing import Ask, Drawn, Painter, Turns, difference, divided, seen_from
 from sweeps.commands.render import words_of_run

@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from bench.metrics import SMALLEST_SIDE, Lpips, flicker, psnr, quantise, ssim
-from bench.protocol import EvaluationProtocol, Scoring
+from bench.protocol import EvaluationProtocol
+from bench.scoring import Scoring
 from bench.types import SteerbenchError, Unavailable
 
 

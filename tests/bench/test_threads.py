@@ -1,11 +1,6 @@
-"""Work in parallel: order, faults, torch's threads as they were, memory for any of them."""
+"""Work in parallel: order, faults, torch's threads as they were."""
 
 from __future__ import annotations
-
-import json
-import platform
-import subprocess
-import sys
 
 import pytest
 import torch
@@ -33,35 +28,3 @@ def test_the_first_fault_ends_it_and_torch_has_its_threads_back(log) -> None:
         assert (log.done, set(inside), torch.get_num_threads()) == (3, {1}, 2)
     finally:
         torch.set_num_threads(before)
-
-
-# Page faults of three steps on threads of their own, and of one after giving back.
-ROUNDS = """
-import json, resource, threading
-from bench.allocator import give_back, keep_freed
-
-keep_freed()
-faults = []
-
-def step():
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    pieces = [b"1" * (24 << 20) for _ in range(3)]
-    del pieces
-    faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
-
-for _ in range(3):
-    thread = threading.Thread(target=step)
-    thread.start()
-    thread.join()
-give_back()
-step()
-print(json.dumps(faults))
-"""
-
-
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
-def test_freed_memory_is_kept_for_any_thread_until_it_is_given_back() -> None:
-    done = subprocess.run([sys.executable, "-c", ROUNDS], capture_output=True, check=True)
-    first, *again, after = json.loads(done.stdout)
-    assert max(again) < first / 2
-    assert after > first / 2

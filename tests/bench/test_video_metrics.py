@@ -18,8 +18,9 @@ from torch import Tensor
 from bench.cameras import cast, pixel_grid
 from bench.measure import Task, measure
 from bench.metrics import as_bytes, flicker, psnr
-from bench.protocol import EvaluationProtocol, Scoring
-from bench.scenes import analytic
+from bench.protocol import EvaluationProtocol
+from bench.scenes import embedded
+from bench.scoring import Scoring
 from bench.trajectories import from_split
 from bench.types import Budget, Camera, SteerbenchError, Unavailable, composite
 from bench.video_metrics import View, flip, jod, tlpips, tpsnr, warping_error
@@ -151,7 +152,7 @@ def test_what_was_hidden_or_is_empty_or_out_of_the_picture_does_not_count():
 def test_the_surface_of_an_embedded_scene_is_exact(tmp_path, quiet_log):
     """`void` is a ball of radius 0.06 at (0.35, -0.2, 0.15) in its model's units."""
     sizes = {"width": 60, "train": 2, "test": 9, "bounds": [[-1.2] * 3, [1.2] * 3]}
-    ball = analytic.load("void", **sizes, root=tmp_path, log=quiet_log)
+    ball = embedded.load("void", **sizes, root=tmp_path, log=quiet_log)
     camera = ball.splits["test"].cameras[0]
     depth = ball.surface(camera).flatten()
     rays, seen = cast(camera), torch.isfinite(depth)
@@ -163,7 +164,7 @@ def test_the_surface_of_an_embedded_scene_is_exact(tmp_path, quiet_log):
 
 
 def test_exact_flow_follows_the_true_pictures_of_a_path(tmp_path, quiet_log):
-    scene = analytic.load("totem", width=160, train=2, test=8, root=tmp_path, log=quiet_log)
+    scene = embedded.load("totem", width=160, train=2, test=8, root=tmp_path, log=quiet_log)
     test = scene.splits["test"]
     (then, earlier), (now, view) = (
         (composite(test.images[k], WHITE), View(test.cameras[k], scene.surface(test.cameras[k])))

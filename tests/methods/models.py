@@ -24,9 +24,6 @@ from methods.steernerf.options import (
 )
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.unet import UNet
-from methods.steernerf_lean.lean_renderer import LeanRenderer
-from methods.steernerf_lean.options import LeanJointOptions, LeanRendering
-from methods.steernerf_lean.pipeline import LeanPipeline
 
 SMALL_GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=16)
 MODEL = Model(channels=4, frames=2, scale=4, step=8.0, stop=STOP, feature_background=0.5)
@@ -64,18 +61,6 @@ small_motion = partial(replace, MOTION)
 small_joint = partial(replace, JOINT)
 """Two patches of at most 32 x 32 a step."""
 
-lean_model = partial(replace, MODEL, frames=1)
-"""K = 4, L = 1, s = 4, long steps."""
-
-LEAN_RENDERING = {"skip": RENDERING.skip, "overlap": 0.0, "refined": 0.0, "refined_step": 1.0}
-lean_rendering = partial(replace, LeanRendering(**vars(RENDERING) | LEAN_RENDERING))
-"""As `lean_model()` is trained, but without refinement."""
-
-REFINED = {"refined": 0.2, "refined_step": 2.0, "refined_rays": 2048}
-LEAN_JOINT = {**REFINED, "optimiser": "adam", "error_weight": 1e-4, "clip": 1.0, "average": 0.999}
-lean_joint = partial(replace, LeanJointOptions(**vars(JOINT) | LEAN_JOINT))
-"""Two patches a step, refinement with steps of 2."""
-
 
 def shell() -> Occupancy:
     """Where the surface of the ball is, and a little more."""
@@ -102,23 +87,9 @@ def misty_field(precision: str = "bf16", backend: str = "auto", channels: int = 
     return field
 
 
-def lean_renderer(model: Model, *, width: int = 8) -> LeanRenderer:
-    """An untrained lean 2D renderer of one block for `model`."""
-    size = model.channels, model.frames, model.scale
-    return LeanRenderer(*size, width=width, blocks=1, init="scratch")
-
-
 def new_pipeline(model: Model = MODEL) -> Pipeline:
     """A misty field and an untrained U-Net on white; always the same weights."""
     torch.manual_seed(0)
     field = misty_field(channels=model.channels)
     unet = UNet(model.channels, model.frames, model.scale, width=4, aligned=False)
     return Pipeline(trained_field(field), torch.ones(3), unet, model)
-
-
-def lean_pipeline(model: Model | None = None) -> LeanPipeline:
-    """A misty field and an untrained lean 2D renderer on white; always the same weights."""
-    torch.manual_seed(0)
-    model = model or lean_model()
-    field = misty_field(channels=model.channels)
-    return LeanPipeline(trained_field(field), torch.ones(3), lean_renderer(model), model)

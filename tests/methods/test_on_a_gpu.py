@@ -16,10 +16,10 @@ from bench.cameras import scale_camera
 from bench.case import Difference
 from bench.console import ConsoleLog
 from bench.measure import Task, measure
-from bench.probes import device_waits
 from bench.protocol import EvaluationProtocol
 from bench.trajectories import from_split
 from bench.types import Budget, Method, NullProbe, Scene, Split
+from bench.waits import device_waits
 from methods.checks import found
 from methods.diver.method import Diver
 from methods.diver.training import DiverLessons
@@ -49,17 +49,10 @@ from methods.steernerf.options import RangeReduction
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.stage2 import JointTraining
 from methods.steernerf.unet import UNet
-from methods.steernerf_lean import training as lean_training
-from methods.steernerf_lean.lean_renderer import LeanRenderer
-from methods.steernerf_lean.method import SteerNerfLean
-from methods.steernerf_lean.pipeline import LeanPipeline
 from methods.students.fields import FieldLessons, StudentField
 from methods.training import loop
 from tests.methods.conftest import Work
 from tests.methods.models import (
-    lean_joint,
-    lean_model,
-    lean_rendering,
     small_joint,
     small_model,
     small_motion,
@@ -94,20 +87,6 @@ def steernerf(field: str, **others: Any) -> Method:
     return SteerNerf(**given | others)
 
 
-def steernerf_lean(**where: Any) -> Method:
-    reduction = RangeReduction("paper", 0.03, "expected")
-    return SteerNerfLean(
-        grid=GRID,
-        training=STAGE1,
-        model=lean_model(),
-        rendering=lean_rendering(range=reduction, refined=0.1, overlap=0.1),
-        renderer=partial(LeanRenderer, width=8, blocks=1, init="scratch"),
-        joint=lean_joint(refined=0.1, refined_rays=64, **FEW),
-        engine=TorchEngine(),
-        **where,
-    )
-
-
 def student(make: Callable[..., Method], device: str, backend: str, **options: Any) -> Method:
     teacher = Setup.resolved(GRID, STAGE1, "fp32", backend, device, seed=0)
     return make(teacher=teacher, **options)
@@ -119,7 +98,6 @@ METHODS: Mapping[str, Callable[..., Method]] = {
     "ngp": partial(InstantNgp, grid=GRID, training=STAGE1),
     "steernerf": partial(steernerf, "joint"),
     "steernerf, frozen": partial(steernerf, "frozen"),
-    "steernerf_lean": steernerf_lean,
     "gaussians": partial(
         GaussianSplatting, grid=GRID, training=STAGE1, count=40, fitting=Fitting()
     ),
@@ -184,7 +162,6 @@ def scene(ball_scene: Scene) -> Scene:
 def one_round(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of whole rays, as on a GPU, also where they are hidden in training, so that the sums have the
     same groups; and as few runs of a network before it is recorded."""
-    monkeypatch.setattr(lean_training, "compacts", lambda device: False)
     for kind in (HashField, StudentField, KiloField, NerfField, NsvfField):
         monkeypatch.setattr(kind, "round_samples", longest_ray(STEP))
     monkeypatch.setattr(torch_engine, "WARM_UP", 1)
@@ -202,7 +179,7 @@ def test_with_products_of_bfloat16_it_trains_and_renders_as_on_the_cpu(
 ) -> None:
     def drawn(device: str) -> list[torch.Tensor]:
         assert multiplies_bf16(device)
-        return frames(fitted("steernerf_lean", device, scene, tmp_path), scene)
+        return frames(fitted("steernerf", device, scene, tmp_path), scene)
 
     capabilities = {**torch.cpu.get_capabilities(), "avx512_bf16": True}
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities)
@@ -259,7 +236,7 @@ def test_what_was_trained_at_one_place_goes_on_at_the_other(
         assert torch.equal(value.cpu(), second.result()[name].cpu()), name
 
 
-MOST_WAITS = {"ngp": 2, "nsvf": 2, "steernerf": 2, "steernerf_lean": 6}
+MOST_WAITS = {"ngp": 2, "nsvf": 2, "steernerf": 2}
 
 
 @pytest.mark.parametrize("name", MOST_WAITS)
@@ -291,16 +268,10 @@ def test_a_step_of_stage_1_waits_less_than_three_times(gpu: PretendedGpu, scene:
     assert waits.total() < 3 * 2 * EVERY
 
 
-@pytest.mark.parametrize(("name", "most"), [("steernerf", 4), ("steernerf_lean", 5)])
 def test_a_step_of_stage_2_waits_a_few_times(
-    gpu: PretendedGpu,
-    name: str,
-    most: int,
-    scene: Scene,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    gpu: PretendedGpu, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """For the rays, their samples, the visible ones, the errors, and the cells of the lean one."""
+    """For the rays, their samples, the visible ones and the errors."""
     advance, counts = JointTraining.advance, []
 
     def counted(training: JointTraining) -> dict[str, float]:
@@ -316,13 +287,12 @@ def test_a_step_of_stage_2_waits_a_few_times(
 
     monkeypatch.setattr(loop, "LOOK_EVERY", 1)
     monkeypatch.setattr(JointTraining, "advance", counted)
-    for kind in (Pipeline, LeanPipeline):
-        remember = kind.remember
-        monkeypatch.setattr(kind, "remember", lambda *args, r=remember: apart(r, *args))
-    method = METHODS[name](device="cuda", backend="reference")
+    remember = Pipeline.remember
+    monkeypatch.setattr(Pipeline, "remember", lambda *args: apart(remember, *args))
+    method = METHODS["steernerf"](device="cuda", backend="reference")
     method.fit(scene, replace(BUDGET, renderer_steps=4), ConsoleLog(tmp_path, quiet=True))
     assert len(counts) == 4
-    assert sum(counts) <= most * len(counts)
+    assert sum(counts) <= 4 * len(counts)
 
 
 def smallest(name: str, **where: Any) -> Method:

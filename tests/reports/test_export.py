@@ -11,7 +11,7 @@ import pytest
 from reports import export
 from reports.paper_tables import Line, PaperTable
 from reports.runs import Repeated, Run
-from tests.reports.conftest import TABLES, changed
+from tests.reports.conftest import changed
 
 TABLE = PaperTable(
     name="table9",
@@ -73,16 +73,6 @@ def test_a_metric_that_the_paper_lacks_is_written_as_on_our_pages(lines):
     shown = changed(replace(run, rows=rows), {"flip": 0.1234, "peak_bytes": 2.5e9})
     found = cells(export.latex([table], {"table9": [Repeated(line.label, [shown])]}))
     assert found["$T = 2^{19}$"] == ["0.1234", "2,500.00"]
-
-
-def test_a_rule_stands_before_what_is_beyond_the_paper(lines):
-    table, run = TABLES["table5"], lines["table9"][0].runs[0]
-    measured = [Repeated(x.label, [run]) for block in table.blocks for x in block.lines]
-    both = export.latex([table], {"table5": measured})
-    first, second = both.split("\\midrule\n")[1:]
-    assert "lean" not in first
-    assert second.count("lean") == 2
-    assert "lean" not in export.latex([table], {"table5": measured[:2]})
 
 
 def test_csv_has_a_figure_a_row_as_it_was_measured(lines):

@@ -67,19 +67,6 @@ def test_milliseconds_follow_from_published_frames_per_second():
     assert fast.published["frame_ms"] == pytest.approx(1000 / 167.7)
 
 
-@pytest.mark.parametrize("name", [name for name, table in TABLES.items() if table.beyond])
-def test_the_block_beyond_the_paper_has_its_lines_but_no_published_figure_nor_claim(name):
-    first, second = TABLES[name].blocks
-    own = [line for line in first.lines if "method" not in line.job]
-    assert [line.job for line in second.lines] == [
-        {**line.job, "method": "steernerf_lean"} for line in own
-    ]
-    assert not second.claims
-    assert not any(line.published for line in second.lines)
-    labels = {line.label for line in (*first.lines, *second.lines)}
-    assert len(labels) == len(first.lines) + len(second.lines)
-
-
 @pytest.mark.parametrize("name", TABLES)
 def test_a_second_data_set_has_its_figures_in_a_block_if_the_paper_has_any(name):
     (alone,) = (x for x in paper_tables(CONFIGS / "experiment", [SECOND]) if x.name == name)
@@ -134,14 +121,6 @@ def test_what_stands_for_a_line_that_was_not_measured_has_its_figures_and_says_w
     assert f'- "SteerNeRF, fp32" stands for "SteerNeRF, half precision" ({why}).' in text
 
 
-def test_a_method_beyond_the_paper_has_its_own_name(run, tmp_path):
-    lines = [Repeated("SteerNeRF, fp32 (steernerf_lean)", [run])]
-    text = markdown(section(TABLES["table1"], lines), tmp_path)
-    paper, beyond = text.split("### Beyond the paper: steernerf_lean")
-    assert "| steernerf_lean, fp32 |" in beyond
-    assert "steernerf_lean" not in paper
-
-
 @pytest.mark.parametrize("name", TABLES)
 def test_the_lines_of_a_table_take_every_value_of_its_grid_and_no_other(name):
     experiment = OmegaConf.load(CONFIGS / "experiment" / f"{name}.yaml")
@@ -151,19 +130,14 @@ def test_the_lines_of_a_table_take_every_value_of_its_grid_and_no_other(name):
         assert {usual, *(job[setting] for job in jobs if setting in job)} == {usual, *others}
 
 
-def test_a_section_shows_both_blocks_and_distances_of_the_first(run, tmp_path):
+def test_a_section_shows_the_distances_of_its_lines(run, tmp_path):
     table = TABLES["table5"]
     lines = [Repeated(line.label, [run]) for block in table.blocks for line in block.lines]
     text = markdown(section(table, lines), tmp_path)
-    paper, beyond = text.split("### Beyond the paper: steernerf_lean")
-    assert "(steernerf_lean)" not in text  # the heading says it
-    assert "| with joint training | " in beyond
-    assert beyond.count("| measured |") == 1
-    assert "| measured |" not in paper  # its lines are no methods
-    assert "| here (paper) | PSNR, dB ↑ | SSIM ↑ | LPIPS vgg ↓ |" in paper
-    assert "| without joint training | 30.46 |" in paper
-    assert "| with joint training | +0.00 (+1.07) |" in paper
-    assert "here (paper)" not in beyond
+    assert "| measured |" not in text  # its lines are no methods
+    assert "| here (paper) | PSNR, dB ↑ | SSIM ↑ | LPIPS vgg ↓ |" in text
+    assert "| without joint training | 30.46 |" in text
+    assert "| with joint training | +0.00 (+1.07) |" in text
 
 
 def test_a_cell_has_the_distance_to_the_reference_here_and_in_the_paper(run):

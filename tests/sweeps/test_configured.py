@@ -94,12 +94,11 @@ def test_a_target_that_cannot_be_imported_is_named(name):
     [
         (["~method.grid"], ".grid is not set: give method.grid=..."),
         (["method.rendering.stop=much"], ".stop: expected float, got 'much'"),  # of a base class
-        (["method.model.scale=8"], "use renderer.init=scratch"),
         (["method.renderer.width=0"], "renderer.width: expected 1 to 4096, got 0"),
         (["method.joint.opacity_entropy=-1"], "joint.opacity_entropy: expected 0 or more, got -1"),
     ],
 )
 def test_what_field_and_renderer_cannot_do_is_refused_before_any_training(overrides, message):
-    config = composed(["method=steernerf_lean", *overrides])
+    config = composed(["method=steernerf", *overrides])
     with pytest.raises(SteerbenchError, match=rf"^method.*{re.escape(message)}"):
         build(config, "method")

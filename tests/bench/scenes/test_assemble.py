@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bench.scenes import assemble
-from bench.scenes.analytic import picture, pose_on_sphere, train_poses
 from bench.scenes.assemble import Box, cube, hold_out, hull_box
-from bench.scenes.raytrace import Part, Solids
-from bench.scenes.solids import Ellipsoid
-from bench.scenes.textures import plain
+from bench.scenes.embedded import picture, pose_on_sphere, train_poses
+from bench.scenes.embedded.raytrace import Part, Solids
+from bench.scenes.embedded.solids import Ellipsoid
+from bench.scenes.embedded.textures import plain
 from bench.types import Camera, Scene, Split, SteerbenchError
 
 

@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from bench.console import ConsoleLog
-from bench.probes import MemoryMeter
+from bench.memory import MemoryMeter
 from bench.scenes import blender, nsvf, transforms
 from bench.scenes.images import decode_bytes
 from bench.types import Scene, SteerbenchError

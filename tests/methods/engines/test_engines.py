@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
@@ -14,8 +12,7 @@ from methods.engines import Built, Engine, Inputs, Network
 from methods.engines.openvino_engine import OpenVino, _capabilities
 from methods.engines.torch_engine import Replay, Replayed, TorchEngine
 from methods.steernerf.unet import UNet
-from methods.steernerf_lean.kernels.depthwise import neighbours_of
-from tests.methods.observations import new_renderer, shaken
+from tests.methods.observations import shaken
 
 NO_BF16 = "BF16" not in _capabilities(OpenVino().load("openvino"))
 
@@ -32,33 +29,11 @@ TOLERANCE = {"fp32": 1e-5, "bf16": 0.03, "int8": 0.1}
 order. Below, a number is rounded by 2^-8 (bf16), or by half of 1/255 of the range that it
 was seen in (int8), before each of half a dozen layers; single layers are kept higher."""
 
-Make = Callable[[], tuple[Network, list[Inputs]]]
 CPU = torch.device("cpu")
 
 
-def cells(count: int, seed: int = 0) -> Inputs:
-    """Rows and neighbours of `count` cells in a square."""
-    renderer = new_renderer(width=64, blocks=6)
-    generator = torch.Generator().manual_seed(seed)
-    side = round(count**0.5)
-    neighbours = neighbours_of(torch.ones(1, side, side, dtype=torch.bool))
-    return torch.rand(side * side, renderer.layout.width, generator=generator) - 0.5, neighbours
-
-
-def blanks(count: int) -> Inputs:
-    """The same, of zeros."""
-    rows, neighbours = cells(0)
-    return rows.new_zeros(count, rows.shape[1]), neighbours.new_zeros(count, 9)
-
-
-def lean() -> tuple[Network, list[Inputs]]:
-    """The lean network, and inputs of three sizes."""
-    torch.manual_seed(1000)  # other numbers than those of the inputs
-    renderer = shaken(new_renderer(width=64, blocks=6)).requires_grad_(False)
-    return renderer.network, [cells(count, seed) for seed, count in enumerate((64, 100, 64, 144))]
-
-
 def unet() -> tuple[Network, list[Inputs]]:
+    """The U-Net, and inputs of one size."""
     torch.manual_seed(1000)
     renderer = shaken(UNet(6, 1, 4, width=64, aligned=False)).requires_grad_(False)
     generator = torch.Generator().manual_seed(0)
@@ -74,11 +49,10 @@ def assert_close(got: Inputs, want: Inputs, tolerance: float) -> None:
 
 
 @pytest.mark.parametrize(("kind", "precision"), ENGINES)
-@pytest.mark.parametrize("make", [lean, unet])
 def test_an_engine_computes_what_the_network_does(
-    kind: Callable[[str], Engine], precision: str, make: Make, build: Callable[..., Built]
+    kind: Callable[[str], Engine], precision: str, build: Callable[..., Built]
 ) -> None:
-    network, inputs = make()
+    network, inputs = unet()
     built = build(kind(precision), network, inputs)
     with torch.no_grad():
         for some in inputs:
@@ -104,20 +78,6 @@ def test_int8_weights_take_a_quarter(build: Callable[..., Built]) -> None:
     exact = 4 * sum(weight.numel() for weight in network.parameters())
     assert exact <= whole < 1.01 * exact  # and a few sizes and shapes
     assert 0.25 * exact <= quarter < 0.27 * exact  # biases and scales stay as they are
-
-
-def test_sizes_that_may_come_are_compiled_before_a_frame_is_timed(
-    build: Callable[..., Built], tmp_path: Path
-) -> None:
-    network, _ = lean()
-    quantum = network.quantum
-    built = build(OpenVino("fp32"), network, [blanks(2 * quantum)])
-    sizes = json.loads((tmp_path / "network.json").read_text())
-    assert sizes == [quantum, 2 * quantum, 3 * quantum]
-    assert [shapes[0][0] for shapes in built.run._requests] == sizes
-    nothing = cells(0)  # a view of nothing has no cells
-    for got, want in zip(built.run(*nothing), network(*nothing), strict=True):
-        assert got.shape == want.shape == (0, got.shape[1])
 
 
 def test_what_an_engine_lacks_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,24 +128,23 @@ class ReplayedHere(Replayed):
 
 
 def test_a_replay_gives_the_outputs_of_the_network_and_leaves_the_inputs_alone() -> None:
-    network, _ = lean()
-    replayed, chosen = ReplayedHere(network), ((64, 0), (100, 1), (64, 2), (100, 3), (0, 4))
-    every = [cells(*some) for some in chosen]
-    for given in every:
-        for got, want in zip(replayed(*given), network(*given), strict=True):
-            assert torch.equal(got, want)
-    assert replayed.recorded == 2  # sizes; of nothing, nothing is recorded
-    for given, some in zip(every, chosen, strict=True):
-        assert all(torch.equal(x, held) for x, held in zip(given, cells(*some), strict=True))
+    network, pictures = unet()
+    replayed = ReplayedHere(network)
+    for (whole,) in pictures:
+        for picture in (whole, whole[..., :28, :40].contiguous()):
+            before = picture.clone()
+            for got, want in zip(replayed(picture), network(picture), strict=True):
+                assert torch.equal(got, want)
+            assert torch.equal(picture, before)
+    assert replayed.recorded == 2  # sizes
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="for a machine with a GPU")
 @pytest.mark.parametrize("precision", TorchEngine.precisions)
-@pytest.mark.parametrize("make", [lean, unet])
 def test_a_gpu_replays_the_outputs_of_the_network(
-    precision: str, make: Make, build: Callable[..., Built]
+    precision: str, build: Callable[..., Built]
 ) -> None:
-    network, inputs = make()
+    network, inputs = unet()
     wanted = [network(*some) for some in inputs]
     seen = [tuple(x.cuda() for x in some) for some in inputs]
     built = build(TorchEngine(precision), network.to("cuda"), seen)

@@ -15,7 +15,7 @@ from torch.nn import functional
 from methods.engines import CALIBRATION, Built, Engine, Inputs, Network
 from methods.engines.openvino_engine import OpenVino
 from methods.engines.tensorrt_engine import TensorRt
-from tests.methods.engines.test_engines import CPU, Make, lean, unet
+from tests.methods.engines.test_engines import CPU, unet
 
 Kind = Callable[[str, str], Engine]
 Build = Callable[..., Built]
@@ -133,17 +133,15 @@ def test_no_number_of_a_frame_is_read(kind: Kind, build: Build) -> None:
         assert torch.equal(a, b)
 
 
-@pytest.mark.parametrize("make", [lean, unet])
-def test_networks_are_computed_within_half_a_step(make: Make, kind: Kind, build: Build) -> None:
-    module, inputs = make()
+def test_networks_are_computed_within_half_a_step(kind: Kind, build: Build) -> None:
+    module, inputs = unet()
     run = build(kind("int8", "none"), module, inputs[:1]).run
     for got, want in zip(run(*inputs[0]), module(*inputs[0]), strict=True):
         assert (got - want).square().mean().sqrt() < 4 / 127 / 2
 
 
-@pytest.mark.parametrize("make", [lean, unet])
-def test_no_more_frames_are_needed_than_without_int8(make: Make, kind: Kind) -> None:
-    module, _ = make()
+def test_no_more_frames_are_needed_than_without_int8(kind: Kind) -> None:
+    module, _ = unet()
     assert kind("int8", "none").samples(module) == kind("fp32", "frames").samples(module)
     assert kind("int8", "frames").samples(module) == CALIBRATION
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from bench.cameras import move_camera
-from bench.probes import StageClock
+from bench.clock import StageClock
 from bench.scenes import blender
 from bench.scenes.assemble import hold_out
 from bench.study import Variant

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from bench.console import ConsoleLog
-from bench.provenance import sources
 from bench.types import Budget, Log, NullProbe, Scene
 from methods.engines import Engine
 from methods.engines.openvino_engine import OpenVino
@@ -152,16 +151,6 @@ def test_a_training_depends_on_its_model_and_on_nothing_that_is_chosen_afterward
     assert other.stage2.joint.rendering(other.stage2.model) == everywhere
     model = replace(usual.stage2.model, feature_background=1.0)
     assert key_of(usual, model=model) != key_of(usual)
-
-
-def test_the_key_of_a_training_depends_on_nothing_of_the_lean_method() -> None:
-    """Neither on its files, nor on a setting that only it has."""
-    method = new_method()
-    names = sources(type(method.stage2), UNet)
-    assert "methods/steernerf/stage2.py" in names
-    assert not [name for name in names if name.startswith("methods/steernerf_lean")]
-    key = key_of(method)
-    assert not {"refined", "refined_step", "error_weight", "average"} & set(key["joint"])
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from methods.steernerf.unet import UNet
-from tests.methods.observations import ROUNDING, doubled, observe_paper, shaken
+from tests.methods.observations import ROUNDING, doubled, observe, shaken
 
 RELEASE = np.load(Path(__file__).parents[2] / "data" / "steernerf_release.npz")
 """What the released code computes on the formulas below."""
@@ -76,7 +76,7 @@ def test_any_features_frames_and_sizes_are_taken(
     """Sides of the picture that are no multiple of 4 as well: of 15 x 9, 6 x 10 and 9 x 6."""
     renderer = unet(channels, frames, scale)
     observations = [
-        observe_paper(height, width, channels=channels, frames=frames, scale=scale, seed=seed)
+        observe(height, width, channels=channels, frames=frames, scale=scale, seed=seed)
         for seed in range(2)
     ]
     for batch in (observations[:1], observations):
@@ -97,7 +97,7 @@ def test_its_products_are_those_that_torch_counts(height: int, width: int, chann
 
 def test_a_batch_of_two_is_one_after_the_other() -> None:
     renderer = shaken(unet(6, 1, 4)).double()
-    observations = [doubled(observe_paper(frames=1, seed=seed)) for seed in range(2)]
+    observations = [doubled(observe(frames=1, seed=seed)) for seed in range(2)]
     alone = torch.cat([renderer([observation]) for observation in observations])
     torch.testing.assert_close(renderer(observations), alone, rtol=0, atol=ROUNDING)
 
@@ -106,7 +106,7 @@ def test_a_batch_of_two_is_one_after_the_other() -> None:
 def test_the_base_puts_the_corners_on_corners_or_centres(aligned: bool) -> None:
     """Without an output of the network, the picture is the base."""
     height, width, scale = 4, 6, 4
-    observation = observe_paper(height, width, frames=0)
+    observation = observe(height, width, frames=0)
     row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     observation.frame.values[..., 0], observation.frame.values[..., 1] = row / 8, column / 8
     renderer = unet(6, 0, scale, aligned=aligned)

@@ -1,0 +1,136 @@
+"""The clock and the counters of a measurement."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bench.types import DEVICE
+
+OTHER = "other"  # the stage that gets the time of a frame outside any stage
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """The times and the work of one frame."""
+
+    stages_ns: dict[str, int]  # of each stage and `other`; "outer/inner" is no part of "outer"
+    done: dict[str, int]  # units of work by counter
+    dense: dict[str, int]  # the work of a method that skips nothing, of counters that report it
+    wall_ns: int | None = None  # by the clock here, until another process told the stages' times
+    peak_bytes: int | None = None  # of the memory of that process, if it told
+
+    @property
+    def total_ns(self) -> int:
+        """Time from the beginning to the end of the frame: the sum of all stages."""
+        return sum(self.stages_ns.values())
+
+
+def p99_to_p50(frames: Sequence[FrameRecord]) -> float:
+    """How much longer the slowest frames take: 99th percentile of frame time over the median."""
+    middle, last = np.percentile([frame.total_ns for frame in frames], (50, 99))
+    return float(last / middle)
+
+
+class StageClock:
+    """The probe of a measurement: charges every nanosecond of a frame to exactly one stage.
+
+    The clock is read when a stage begins or ends, after the device has finished its work. The time
+    since the last reading goes to the innermost open stage, so that the stages and `other` add up
+    to the frame by construction. Without `stages` the clock is read, and the GPU waited for, only
+    at the beginning and end of a frame, and all its time is `other`.
+    """
+
+    def __init__(
+        self, device: str, clock: Callable[[], int] = time.perf_counter_ns, *, stages: bool = True
+    ) -> None:
+        self.frames: list[FrameRecord] = []
+        # What is not a device of torch is one of another process.
+        self._device = torch.device(device if DEVICE.fullmatch(device) else "cpu")
+        self._clock, self._stages = clock, stages
+        self._open: list[str] | None = None  # names of the open stages; None outside a frame
+        self._last = 0
+        self._begin()
+
+    @contextmanager
+    def frame(self) -> Iterator[None]:
+        """Measure one frame; its record is kept unless the body raises."""
+        if self._open is not None:
+            raise RuntimeError("a frame may not begin inside a frame")
+        self._begin()
+        self._open = []
+        self._last = self._now()
+        try:
+            yield
+            self._charge()
+            done = {name: int(units) for name, units in self._done.items()}
+            record = FrameRecord(dict(self._ns), done, dict(self._dense))
+            self.frames.append(replace(record, **self._told))
+        finally:
+            self._open = None
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time a stage of the current frame; see `bench.types.Probe`."""
+        if self._open is None:
+            raise RuntimeError(f"stage {name!r} was entered outside a frame")
+        if name == OTHER:
+            raise ValueError(f"a stage may not be named {OTHER!r}: that is the remainder")
+        if not self._stages:
+            yield
+            return
+        self._charge()
+        self._open.append(name)
+        try:
+            yield
+        finally:
+            self._charge()
+            self._open.pop()
+
+    def count(self, name: str, done: int | Tensor, dense: int | None = None) -> None:
+        self._done[name] += done
+        if dense is not None:
+            self._dense[name] += dense
+
+    def report(self, ns: int, stages_ns: Mapping[str, int], peak_bytes: int | None = None) -> None:
+        """Take the times of another process's clock; see `bench.types.Probe`."""
+        self._charge()
+        stages = {name: of for name, of in stages_ns.items() if name != OTHER and self._stages}
+        stages[OTHER] = ns - sum(stages.values())
+        self._told.update(stages_ns=stages, wall_ns=sum(self._ns.values()), peak_bytes=peak_bytes)
+
+    def _begin(self) -> None:
+        self._ns: defaultdict[str, int] = defaultdict(int, {OTHER: 0})
+        self._done: defaultdict[str, int | Tensor] = defaultdict(int)
+        self._dense: defaultdict[str, int] = defaultdict(int)
+        self._told: dict[str, Any] = {}  # what another process has told of this frame
+
+    def _now(self) -> int:
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+        return self._clock()
+
+    def _charge(self) -> None:
+        now = self._now()
+        self._ns["/".join(self._open or ()) or OTHER] += now - self._last
+        self._last = now
+
+
+def times_ms(
+    calls: Sequence[Callable[[], object]], repeats: int, device: str = "cpu"
+) -> list[list[float]]:
+    """Milliseconds of `repeats` runs of each call, in turns: a drifting clock affects all alike."""
+    clocks = [StageClock(device) for _ in calls]
+    for _ in range(repeats):
+        for clock, call in zip(clocks, calls, strict=True):
+            with clock.frame():
+                call()
+    return [[frame.total_ns / 1e6 for frame in clock.frames] for clock in clocks]

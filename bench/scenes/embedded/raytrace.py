@@ -1,0 +1,393 @@
+"""Renders exact pictures of analytic models: every sub-pixel ray is solved in closed form.
+
+A model is made of opaque solids under one fixed light, or of overlapping homogeneous media. A
+picture is rendered in bands of rows. In each band, a part of a model is traced only in the columns
+that its bounding box can cover.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from bench.cameras import project
+from bench.errors import unexpected
+from bench.scenes.embedded.shadows import Tiles
+from bench.scenes.embedded.solids import (
+    Carved,
+    Pierced,
+    Shape,
+    Triple,
+    ball_interval,
+    box_corners,
+    unit,
+)
+from bench.scenes.embedded.textures import Colour, Texture
+from bench.types import EMPTY_ALPHA, Camera, Frame
+
+BAND_RAYS = 1 << 18  # enough to hide the cost of calls, few enough to stay in the cache
+
+Span = tuple[int, int, int]
+"""A part's number, the first column that it can cover in a band, and one past the last."""
+
+Rays = tuple[Tensor, Tensor, Tensor]
+"""Row, column and sample of each ray in a band, [N]."""
+
+LIGHT = (0.48, -0.6, 0.64)  # unit direction to the light
+LIFT = 1e-4  # distance of a shadow ray's start above the surface, in the model's units
+
+SKY, GROUND, SUN = 0.52, 0.24, 0.62
+"""Light from above, from below, and from the light's direction, as shares of a surface's colour."""
+
+
+@dataclass(frozen=True)
+class Band:
+    """The rays of some rows of a picture, from `origin` [3] along `rotation` @ (x, y, 1)."""
+
+    origin: Tensor
+    rotation: Tensor
+    x: Tensor  # [1, W, S] on the image plane
+    y: Tensor  # [rows, 1, S]
+
+    def directions(self, frame: Tensor, columns: slice) -> tuple[Tensor, Tensor, Tensor]:
+        """Directions of the rays in `columns`, as components along the axes of `frame` [3, 3]."""
+        matrix = (frame.T @ self.rotation).tolist()
+        x = self.x[:, columns]
+        across, down, ahead = ([row[i] for row in matrix] for i in range(3))
+        u, v, w = ((x * across[i] + ahead[i]) + self.y * down[i] for i in range(3))
+        return u, v, w
+
+
+class Model(Protocol):
+    """A model made of parts, through which a band of rays can be traced."""
+
+    def boxes(self) -> Tensor:
+        """Corners of a box around each part, [P, 8, 3]."""
+
+    def trace(self, band: Band, spans: Sequence[Span]) -> tuple[Tensor, Tensor, Tensor]:
+        """What the rays [rows, W, S] see of the parts in `spans`: rgb and depth, premultiplied by
+        alpha, which comes between them. A part is never seen outside its span."""
+
+
+def render(model: Model, camera: Camera, background: Tensor, samples: int) -> Frame:
+    """Render `model`, averaged over `samples` rays per pixel (a power of two).
+
+    `camera` is in the model's units; rays that hit nothing show `background` [3]. A pixel's alpha
+    and rgb are means over its rays, depth the mean z-depth weighted by opacity (+inf where alpha is
+    below EMPTY_ALPHA). A single sample is at the centre.
+    """
+    device, width, height = camera.c2w.device, camera.width, camera.height
+    offsets = sample_offsets(samples).to(device)
+    x = (torch.arange(width, device=device)[:, None] + offsets[:, 0] - camera.cx) / camera.fx
+    y = (torch.arange(height, device=device)[:, None] + offsets[:, 1] - camera.cy) / camera.fy
+    rgb = torch.zeros(height, width, 3, device=device)
+    alpha, depth = torch.zeros(2, height, width, device=device)
+    rows = max(BAND_RAYS // (width * samples), 1)
+    boxes = ProjectedBoxes(camera, model.boxes().to(device))
+    for top in range(0, height, rows):
+        bottom = min(top + rows, height)
+        spans = boxes.spans(top, bottom)
+        if not spans:
+            continue
+        first, last = min(span[1] for span in spans), max(span[2] for span in spans)
+        band = Band(camera.c2w[:, 3], camera.c2w[:, :3], x[None, first:last], y[top:bottom, None])
+        traced = model.trace(band, [(part, a - first, b - first) for part, a, b in spans])
+        for picture, seen in zip((rgb, alpha, depth), traced, strict=True):
+            picture[top:bottom, first:last] = seen.mean(2)
+    empty = alpha < EMPTY_ALPHA
+    depth = (depth / alpha.clamp(min=EMPTY_ALPHA)).masked_fill(empty, math.inf)
+    return Frame(rgb + (1 - alpha)[..., None] * background.to(device), depth, alpha)
+
+
+def sample_offsets(samples: int) -> Tensor:
+    """Hammersley points [samples, 2] in a pixel, one in each of `samples` rows and columns."""
+    if samples < 1 or samples & (samples - 1):
+        raise unexpected("samples", "a power of two", samples)
+    bits = samples.bit_length() - 1
+    index, mirrored = torch.arange(samples), torch.zeros(samples, dtype=torch.int64)
+    for bit in range(bits):
+        mirrored |= ((index >> bit) & 1) << (bits - 1 - bit)
+    return (torch.stack((index, mirrored), dim=1) + 0.5) / samples
+
+
+class ProjectedBoxes:
+    """The bounding boxes of a model's parts as a camera sees them."""
+
+    def __init__(self, camera: Camera, boxes: Tensor) -> None:
+        pixels, depth = project(camera, boxes.reshape(-1, 3))
+        self.width = camera.width
+        self.in_front = (depth.reshape(-1, 8) > 0).all(1)
+        self.behind = (depth.reshape(-1, 8) <= 0).all(1)
+        pairs = torch.combinations(torch.arange(8, device=boxes.device))
+        # The outline of a convex box lies in the hull of the segments between pairs of corners.
+        corners = pixels.reshape(-1, 8, 2)
+        self.start, self.end = corners[:, pairs[:, 0]], corners[:, pairs[:, 1]]  # [P, 28, 2]
+
+    def spans(self, top: int, bottom: int) -> list[Span]:
+        """The parts that may be seen in rows top <= row < bottom, each with its columns."""
+        (u0, v0), (u1, v1) = self.start.unbind(-1), self.end.unbind(-1)
+        flat = v0 == v1
+        rise = (v1 - v0).masked_fill(flat, 1)
+        # The range of each segment between the rows, with one pixel of margin for rounding.
+        low = ((top - 1 - v0) / rise).clamp(0, 1).masked_fill(flat, 0)
+        high = ((bottom + 1 - v0) / rise).clamp(0, 1).masked_fill(flat, 1)
+        meets = (torch.minimum(v0, v1) <= bottom + 1) & (torch.maximum(v0, v1) >= top - 1)
+        ends = torch.stack((u0 + low * (u1 - u0), u0 + high * (u1 - u0)))
+        first = ends.masked_fill(~meets, math.inf).amin((0, 2)).floor() - 1
+        last = ends.masked_fill(~meets, -math.inf).amax((0, 2)).ceil() + 1
+        # A part that reaches behind the camera may be visible anywhere.
+        first = first.masked_fill(~self.in_front, 0).clamp(min=0)
+        last = last.masked_fill(~self.in_front, self.width).clamp(max=self.width)
+        columns = torch.stack((first, last.masked_fill(self.behind, 0)), dim=1).tolist()
+        return [(part, int(a), int(b)) for part, (a, b) in enumerate(columns) if a < b]
+
+
+@dataclass(frozen=True)
+class Part:
+    """A solid placed in a model, with the texture of its own frame."""
+
+    shape: Shape
+    texture: Texture
+    centre: Triple = (0.0, 0.0, 0.0)  # origin of the frame, in the model's units
+    turn: Triple = (0.0, 0.0, 0.0)  # in degrees about x, then y, then z
+    gloss: float = 0.0  # strength of the highlight, 0 for a matt surface
+    sharpness: float = 60.0  # exponent of the highlight
+    frame: Tensor = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "frame", rotation(*self.turn))
+
+    @property
+    def turned(self) -> bool:
+        return any(self.turn)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What some rays see of one part; vectors are [N, 3]."""
+
+    number: int  # of the part
+    rays: Rays
+    directions: Tensor  # of the rays
+    points: Tensor
+    local: Tensor  # the points in the part's frame
+    normals: Tensor  # to the viewer's side
+
+
+class Solids:
+    """A model of opaque parts, lit by a point at infinity: shadows are hard and exact."""
+
+    def __init__(self, parts: Sequence[Part]) -> None:
+        self.parts = parts
+        light = torch.tensor(LIGHT)
+        across = unit(torch.linalg.cross(light, torch.tensor((0.0, 0.0, 1.0)))[None])[0]
+        self.light_axes = torch.stack((across, torch.linalg.cross(light, across), light), dim=1)
+        self.corners = self.boxes()
+        boxes = self.corners @ self.light_axes
+        self.low, self.high = boxes.amin(1), boxes.amax(1)
+
+    def boxes(self) -> Tensor:
+        placed = ((box_corners(p.shape.extent()) @ p.frame.T, p.centre) for p in self.parts)
+        return torch.stack([corners + torch.tensor(centre) for corners, centre in placed])
+
+    def trace(self, band: Band, spans: Sequence[Span]) -> tuple[Tensor, Tensor, Tensor]:
+        """Find the nearest surface over all parts, then shade only that."""
+        shape = (band.y.shape[0], *band.x.shape[1:])
+        depth = band.x.new_full(shape, math.inf)
+        owner = torch.full(shape, -1, dtype=torch.int16, device=depth.device)
+        # From front to back, so that a part whose box lies behind all that was met can be left out.
+        ahead = ((self.corners.to(depth) - band.origin) @ band.rotation[:, 2]).amin(1).tolist()
+        for number, first, last in sorted(spans, key=lambda span: ahead[span[0]]):
+            part, columns = self.parts[number], slice(first, last)
+            if ahead[number] > depth[:, columns].amax():
+                continue
+            frame = part.frame.to(depth)
+            x, y, z = ((band.origin - depth.new_tensor(part.centre)) @ frame).tolist()
+            t = part.shape.hit((x, y, z), band.directions(frame, columns))
+            nearest = depth[:, columns]
+            owner[:, columns].masked_fill_(t < nearest, number)
+            torch.minimum(nearest, t, out=nearest)
+        seen = owner >= 0
+        rgb = depth.new_zeros(*shape, 3)
+        surfaces = []
+        for number, first, last in spans:
+            row, column, sample = (owner[:, first:last] == number).nonzero(as_tuple=True)
+            if len(row):
+                rays = row, column + first, sample
+                surfaces.append(self.surface(number, rays, depth[rays], band))
+        for surface, lit in zip(surfaces, self.lit(surfaces), strict=True):
+            rgb[surface.rays] = self.shade(surface, lit)
+        return rgb, seen.to(depth.dtype), depth.masked_fill_(~seen, 0)
+
+    def surface(self, number: int, rays: Rays, depth: Tensor, band: Band) -> Surface:
+        """What the `rays` of a band meet of a part at `depth` [N]."""
+        part, (row, column, sample) = self.parts[number], rays
+        x, y = band.x[0, column, sample], band.y[row, 0, sample]
+        directions = torch.stack((x, y, torch.ones_like(x)), 1) @ band.rotation.T
+        points = band.origin + depth[:, None] * directions
+        local = points - points.new_tensor(part.centre)
+        if part.turned:
+            local = local @ part.frame.to(points)
+        normals = part.shape.normal(local)
+        if part.turned:
+            normals = normals @ part.frame.T.to(points)
+        # The normal points to the viewer's side of the surface.
+        away = (normals * directions).sum(1, keepdim=True) > 0
+        normals = torch.where(away, -normals, normals)
+        return Surface(number, rays, directions, points, local, normals)
+
+    def lit(self, surfaces: Sequence[Surface]) -> list[Tensor]:
+        """Which points [N] of each surface the light reaches."""
+        if not surfaces:
+            return []
+        # All surfaces together: a caster is intersected once, not once for each of them.
+        points, normals = (
+            torch.cat([getattr(surface, name) for surface in surfaces])
+            for name in ("points", "normals")
+        )
+        counts = [len(surface.points) for surface in surfaces]
+        numbers = torch.tensor([surface.number for surface in surfaces], dtype=torch.int16)
+        owners = numbers.repeat_interleave(torch.tensor(counts)).to(points.device)
+        lit = normals @ points.new_tensor(LIGHT) > 0
+        lit[lit.clone()] = ~self.shadowed(owners[lit], (points + LIFT * normals)[lit])
+        return list(lit.split(counts))
+
+    def shade(self, surface: Surface, lit: Tensor) -> Tensor:
+        """Lambert and Blinn-Phong colours [N, 3] of the points of a surface."""
+        part, normals = self.parts[surface.number], surface.normals
+        light = normals.new_tensor(LIGHT)
+        height = 0.5 + 0.5 * normals[:, 2:]
+        sun = (normals * light).sum(1, keepdim=True) * lit[:, None]
+        colour = part.texture(surface.local) * (GROUND + (SKY - GROUND) * height + SUN * sun)
+        if part.gloss:
+            half = unit(light - unit(surface.directions))
+            highlight = (normals * half).sum(1, keepdim=True).clamp(min=0) ** part.sharpness
+            colour = colour + part.gloss * highlight * lit[:, None]
+        return colour.clamp(max=1)
+
+    def shadowed(self, owners: Tensor, points: Tensor) -> Tensor:
+        """[N] bool: whether another part is between a point of part `owners` [N] and the light.
+
+        A convex part is skipped for itself: it casts no shadow on its own lit side.
+        """
+        dark = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+        if not len(points):
+            return dark
+        light, tiles = points.new_tensor(LIGHT), Tiles(points @ self.light_axes.to(points))
+        columns, owners = points[tiles.order].T.contiguous(), owners[tiles.order]
+        for number in tiles.casters(self.low, self.high):
+            caster = self.parts[number]
+            runs = tiles.runs(self.low[number], self.high[number])
+            if not runs:
+                continue
+            frame = caster.frame.to(points)
+            centre = points.new_tensor(caster.centre)[:, None]
+            below = torch.cat([columns[:, run] for run in runs], dim=1) - centre
+            x, y, z = (frame.T @ below if caster.turned else below).unbind(0)
+            u, v, w = (light @ frame).unbind(0)
+            found = caster.shape.hit((x, y, z), (u, v, w)) < math.inf
+            if not isinstance(caster.shape, Carved | Pierced):
+                found &= torch.cat([owners[run] for run in runs]) != number
+            counts = [run.stop - run.start for run in runs]
+            for run, part in zip(runs, found.split(counts), strict=True):
+                dark[run].logical_or_(part)
+        return torch.empty_like(dark).index_put_((tiles.order,), dark)
+
+
+def rotation(x: float, y: float, z: float) -> Tensor:
+    """[3, 3] rotation by degrees about x, then y, then z."""
+    turns = torch.eye(3, dtype=torch.float64)
+    for axis, degrees in enumerate((x, y, z)):
+        c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+        turn = torch.eye(3, dtype=torch.float64)
+        a, b = (axis + 1) % 3, (axis + 2) % 3
+        turn[a, a], turn[a, b], turn[b, a], turn[b, b] = c, -s, s, c
+        turns = turn @ turns
+    return turns.float()
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A sphere of constant density (sigma, 1 / unit length) that glows in one colour."""
+
+    centre: Triple
+    radius: float
+    density: float
+    colour: Colour
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Balls whose densities add where they overlap; their colours are averaged, density-weighted.
+
+    Between two crossings of surfaces the density k (per unit of t) and the colour c are constant.
+    With transmittance T at the start of such a piece [a, b]
+
+        opacity += T (1 - e^-x),    rgb += T (1 - e^-x) c,    x = k (b - a),
+        depth   += T ((1 - e^-x) a + (1 - e^-x - x e^-x) / k),
+
+    where the last line is the integral of t k e^(-k (t - a)).
+    """
+
+    balls: Sequence[Ball]
+
+    def boxes(self) -> Tensor:
+        balls = self.balls
+        return torch.stack([torch.tensor(b.centre) + box_corners((b.radius,) * 3) for b in balls])
+
+    def trace(self, band: Band, spans: Sequence[Span]) -> tuple[Tensor, Tensor, Tensor]:
+        """Integrate all balls in `spans` together, for the rays that hit any of them."""
+        shape = (band.y.shape[0], *band.x.shape[1:])
+        balls = [self.balls[number] for number, _, _ in spans]
+        directions = band.directions(torch.eye(3, device=band.x.device), slice(None))
+        enter, leave = band.x.new_zeros(2, len(balls), *shape)
+        for k, ((_, first, last), ball) in enumerate(zip(spans, balls, strict=True)):
+            columns = slice(first, last)
+            origin = (band.origin - torch.tensor(ball.centre).to(band.origin)).tolist()
+            a, b = ball_interval(origin, [d[:, columns] for d in directions], ball.radius)
+            missed = (a > b) | (b <= 0)
+            enter[k, :, columns] = a.clamp_(min=0).masked_fill_(missed, 0)
+            leave[k, :, columns] = b.masked_fill_(missed, 0)
+        met = (leave > 0).any(0)
+        speed = torch.stack([d[met] for d in directions]).norm(dim=0)  # length per unit of t
+        density = speed.new_tensor([ball.density for ball in balls])
+        colour = speed.new_tensor([ball.colour for ball in balls])
+        seen = integrate(enter[:, met], leave[:, met], speed, density, colour)
+        rgb, (alpha, depth) = speed.new_zeros(*shape, 3), speed.new_zeros(2, *shape)
+        rgb[met], alpha[met], depth[met] = seen
+        return rgb, alpha, depth
+
+
+def integrate(
+    enter: Tensor, leave: Tensor, speed: Tensor, density: Tensor, colour: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """rgb [N, 3], opacity [N] and depth times opacity [N] of rays through B overlapping media.
+
+    `enter` and `leave` [B, N] are the interval of each medium along each ray, equal where the ray
+    misses it; `speed` [N] the length of a ray's direction; `density` [B], `colour` [B, 3].
+    """
+    ends, order = torch.cat((enter, leave)).sort(dim=0)  # [2B, N]
+    step = torch.cat((density, -density))
+    emission = torch.cat((density[:, None] * colour, -density[:, None] * colour))
+    k, alpha, depth = speed.new_zeros(3, len(speed))
+    glow, rgb = speed.new_zeros(2, len(speed), 3)
+    transmittance = torch.ones_like(k)
+    for piece in range(len(ends) - 1):
+        k = k + step[order[piece]]
+        glow = glow + emission[order[piece]]
+        # Outside all media k is only rounding error, far below the density of the thinnest medium.
+        outside = ~(k > 1e-3 * density.min())
+        rate = (k * speed).masked_fill(outside, 1)
+        x = (rate * (ends[piece + 1] - ends[piece])).masked_fill(outside, 0)
+        passed, absorbed = torch.exp(-x), -torch.expm1(-x)
+        weight = transmittance * absorbed
+        rgb = rgb + (weight / k.masked_fill(outside, 1))[:, None] * glow
+        alpha = alpha + weight
+        depth = depth + weight * ends[piece] + transmittance * (absorbed - x * passed) / rate
+        transmittance = transmittance * passed
+    return rgb, alpha, depth

@@ -1,0 +1,129 @@
+"""Test cases of the engines on the U-Net: constant inputs, values far out of range, NaN."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable, Sequence
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bench.case import Case, Cell
+from bench.console import ConsoleLog
+from methods.engines import Engine, Inputs, Network
+from methods.engines.openvino_engine import OpenVino
+from methods.engines.tensorrt_engine import TensorRt
+from methods.engines.torch_engine import TorchEngine
+from methods.steernerf.unet import UNet
+
+ENGINES: tuple[type[Engine], ...] = (TorchEngine, OpenVino, TensorRt)
+CELLS: list[Cell] = [
+    (engine.name, precision) for engine in ENGINES for precision in engine.precisions
+]
+TOLERANCE = {"fp32": 1e-5, "bf16": 0.03, "fp16": 0.03, "int8": 0.1}
+SHARE = (
+    "of the root mean square: fp32 adds hundreds of products in another order; below, numbers are "
+    "rounded by 2^-8, or 1/510 of the range seen, before each of some twenty layers"
+)
+COUNTED = "numbers of which that is not true are counted: 0"
+
+CHANNELS, FRAMES, SCALE, WIDTH = 6, 2, 4, 16
+SIDE = 128  # pixels along a side of the view
+REACH = 52
+"""Pixels that an input reaches: 5 layers at full resolution, 6 at half, 8 at a quarter, where each
+pixel covers those of its 4 x 4."""
+
+
+def cases() -> list[Case]:
+    """Constant inputs, values far outside the calibration range, a pixel of NaN."""
+    shares = {cell: TOLERANCE[cell[1]] for cell in CELLS}
+    exact = dict.fromkeys(CELLS, 0.0)
+    int8 = {cell: 0.0 for cell in CELLS if cell[1] == "int8"}
+    same, finite = "the output is that of the network", "the output is finite"
+    saturates = "int8 saturates: twice as large, they give the same output, number by number"
+    spread = "pixels out of its reach are unchanged"
+    eight, nan = "inputs 8 times as large as in the calibration", "a pixel of NaN"
+
+    def case(name: str, holds: str, why: str, tolerances: Any, error: Any) -> Case:
+        # Engines take seconds to build.
+        return Case("engine", name, holds, why, tolerances, error, slow=True)
+
+    return [
+        case("all inputs 0", same, SHARE, shares, partial(_error, 0.0)),
+        case("all inputs 1/2", same, SHARE, shares, partial(_error, 0.5)),
+        case("inputs up to 1e3", finite, COUNTED, exact, _not_finite),
+        case(eight, saturates, COUNTED, int8, _not_saturated),
+        case(nan, spread, SHARE, shares, _spread_of_nan),
+    ]
+
+
+def _network() -> Network:
+    """The network of the quickest width, untrained; always the same weights."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        renderer = UNet(CHANNELS, FRAMES, SCALE, width=WIDTH, aligned=False)
+    return renderer.network.requires_grad_(False)
+
+
+def _random_inputs(seed: int) -> Tensor:
+    """What the network is shown of a random view, [1, C, H, W], -1/2 to 1/2."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(1, CHANNELS * (FRAMES + 1), SIDE, SIDE, generator=generator) - 0.5
+
+
+@cache
+def _built(engine: str, device: str, precision: Any) -> Callable[..., Inputs]:
+    """The network as an engine runs it, calibrated on random views. Raises `Unavailable` if the
+    engine, or its precision, does not exist on `device`."""
+    chosen = next(kind for kind in ENGINES if kind.name == engine)(precision)
+    chosen.check(torch.device(device))
+    views = [(_random_inputs(seed).to(device),) for seed in range(4)]
+    with tempfile.TemporaryDirectory() as folder:
+        log = ConsoleLog(Path(folder), quiet=True)
+        network = _network().to(device)
+        return chosen.build(network, lambda: views, lambda: Path(folder), log).run
+
+
+@torch.no_grad()
+def _output(cell: Sequence[str], inputs: Tensor) -> Tensor:
+    """The output for `inputs` of an engine, on a device, in a precision, as float64."""
+    (output,) = _built(*cell)(inputs.to(cell[1]))
+    return output.cpu().double().clone()
+
+
+def _apart(got: Tensor, want: Tensor) -> float:
+    """Root mean square of the difference relative to that of `want`."""
+    share = ((got - want).square().mean() / want.square().mean()).sqrt().item()
+    return math.inf if math.isnan(share) else share
+
+
+def _error(value: float, *cell: str) -> float:
+    inputs = torch.full_like(_random_inputs(0), value)
+    with torch.no_grad():
+        (want,) = _network()(inputs)
+    return _apart(_output(cell, inputs), want.double())
+
+
+def _not_finite(*cell: str) -> float:
+    output = _output(cell, 2e3 * _random_inputs(0))
+    return float(output.numel() - int(output.isfinite().sum()))
+
+
+def _not_saturated(*cell: str) -> float:
+    """How many numbers of the output change when inputs out of range double."""
+    inputs = _random_inputs(0).sign() * 4
+    once, twice = (_output(cell, factor * inputs) for factor in (1, 2))
+    return float((once != twice).sum())
+
+
+def _spread_of_nan(*cell: str) -> float:
+    inputs = _random_inputs(0)
+    want = _output(cell, inputs)
+    inputs[..., 0, 0] = torch.nan
+    far = torch.ones(SIDE, SIDE, dtype=torch.bool)
+    far[: REACH + 1, : REACH + 1] = False
+    return _apart(_output(cell, inputs)[..., far], want[..., far])

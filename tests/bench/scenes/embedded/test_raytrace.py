@@ -1,0 +1,232 @@
+"""Exact pictures: closed forms of spheres and media, culling that changes nothing, shadows."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from bench.cameras import cast
+from bench.scenes.embedded import raytrace
+from bench.scenes.embedded.models import cloud, mill, totem, wires
+from bench.scenes.embedded.raytrace import (
+    LIGHT,
+    Ball,
+    Cloud,
+    Part,
+    ProjectedBoxes,
+    Solids,
+    render,
+    sample_offsets,
+)
+from bench.scenes.embedded.solids import Capsule, Ellipsoid
+from bench.scenes.embedded.textures import plain
+from bench.types import EMPTY_ALPHA, Camera, SteerbenchError
+from tests.bench.scenes.conftest import camera_at
+
+RED = plain((1.0, 0.0, 0.0))
+
+
+def sphere(radius: float, centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Part:
+    return Part(Ellipsoid((radius, radius, radius)), RED, centre)
+
+
+def test_16_samples_stand_for_the_16_quarter_pixel_cells() -> None:
+    offsets = sample_offsets(16)
+    cells = (offsets * 4).floor().tolist()
+    assert sorted(cells) == [[a, b] for a in range(4) for b in range(4)]
+    assert len(set(offsets[:, 0].tolist())) == len(set(offsets[:, 1].tolist())) == 16
+    assert offsets.mean(0).tolist() == [0.5, 0.5]
+    assert sample_offsets(1).tolist() == [[0.5, 0.5]]
+    for samples in (0, -4, 3, 12):
+        with pytest.raises(SteerbenchError, match="samples: expected a power of two"):
+            sample_offsets(samples)
+
+
+def test_depth_of_a_sphere_is_the_closed_form(device) -> None:
+    camera = camera_at((3.0, 1.0, 2.0), device=device)
+    frame = render(Solids([sphere(0.7)]), camera, torch.ones(3), samples=1)
+    rays = cast(camera)
+    # |o + t d|^2 = r^2, the textbook's way, in double precision.
+    o, d = rays.origins.double(), rays.directions.double()
+    a, b, c = (d * d).sum(1), (o * d).sum(1), (o * o).sum(1) - 0.49
+    root = b * b - a * c
+    expected = torch.where(root > 0, (-b - root.clamp(min=0).sqrt()) / a, math.inf)
+    certain = root.abs() > 1e-4
+    torch.testing.assert_close(
+        frame.depth.flatten().double()[certain], expected[certain], rtol=0, atol=2e-4
+    )
+    assert torch.equal(frame.alpha.flatten()[certain] > 0, (root > 0)[certain])
+
+
+def test_silhouettes_of_a_sphere_and_a_thin_wire_have_their_closed_form_areas() -> None:
+    camera = camera_at((0.0, -4.0, 0.0))
+    alpha = render(Solids([sphere(0.8)]), camera, torch.ones(3), samples=16).alpha
+    radius = camera.fx * math.tan(math.asin(0.8 / 4))
+    # Only quarter-pixel cells that the outline crosses can be counted wrongly, half either way.
+    diagonal = math.sqrt(2) / 4
+    assert abs(alpha.sum().item() - math.pi * radius**2) <= 2 * math.pi * radius * diagonal
+    camera = camera_at((0.0, -4.0, 0.0), size=400)
+    alpha = render(Solids([Part(Capsule(0.006, 1.0), RED)]), camera, torch.ones(3), 16).alpha
+    width = 2 * camera.fx * math.tan(math.asin(0.006 / 4))
+    rows = alpha[150:250].sum(1)
+    # Sixteen columns of samples a pixel: each border is off by 1/16 at most.
+    assert (rows - width).abs().max() <= 2 / 16
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        Solids([sphere(0.1, (9.0, 9.0, 0.0))]),  # beside the picture, and behind the camera
+        Cloud([Ball((0.0, -6.0, 0.0), 0.5, 9.0, (1.0, 1.0, 1.0))]),
+    ],
+)
+def test_nothing_seen_is_the_background_at_infinity(model) -> None:
+    background = torch.tensor((0.2, 0.4, 0.6))
+    frame = render(model, camera_at((0.0, -4.0, 0.0), 8), background, 4)
+    assert (frame.rgb == background).all()
+    assert frame.depth.isinf().all()
+    assert (frame.alpha == 0).all()
+
+
+def test_depth_is_finite_exactly_where_there_is_opacity() -> None:
+    frame = render(totem(), camera_at((1.0, -3.5, 1.5), size=64), torch.ones(3), 16)
+    assert torch.equal(frame.depth.isfinite(), frame.alpha >= EMPTY_ALPHA)
+    assert ((frame.rgb >= 0) & (frame.rgb <= 1 + 1e-6)).all()
+
+
+@pytest.mark.parametrize("model", [totem, wires, mill])
+@pytest.mark.parametrize("eye", [(1.0, -3.5, 1.5), (0.3, 0.2, 0.3), (0.0, 0.1, 4.0)])
+def test_culling_by_boxes_changes_nothing(monkeypatch, model, eye) -> None:
+    camera = camera_at(eye, size=24)
+    monkeypatch.setattr(raytrace, "BAND_RAYS", 24 * 4 * 5)  # bands of five rows, the last of four
+    culled = render(model(), camera, torch.ones(3), 4)
+
+    def everywhere(boxes: ProjectedBoxes, top: int, bottom: int) -> list[tuple[int, int, int]]:
+        return [(part, 0, boxes.width) for part in range(len(boxes.in_front))]
+
+    monkeypatch.setattr(ProjectedBoxes, "spans", everywhere)
+    whole = render(model(), camera, torch.ones(3), 4)
+    # Only rounding may differ, and it can turn a sample that grazes an edge.
+    differing = ((culled.rgb - whole.rgb).abs().amax(-1) > 1e-4).sum()
+    assert differing <= 1
+    assert (culled.alpha > 0).any()
+
+
+@pytest.mark.parametrize("model", [totem, wires, mill])
+def test_the_nearest_of_all_parts_is_seen(model) -> None:
+    solids, camera = model(), camera_at((1.0, -3.5, 1.5), size=40)
+    depth = render(solids, camera, torch.ones(3), samples=1).depth.flatten()
+    rays = cast(camera)
+    nearest = torch.full_like(depth, math.inf)
+    for part in solids.parts:
+        origins = (rays.origins - torch.tensor(part.centre)) @ part.frame
+        directions = rays.directions @ part.frame
+        nearest = nearest.minimum(part.shape.hit(origins.unbind(1), directions.unbind(1)))
+    # Only rounding may differ, and it can turn a ray that grazes an edge.
+    differing = (nearest - depth).abs() > 1e-4  # not where both are infinite
+    assert differing.sum() <= 2
+    assert (nearest.isfinite() != depth.isfinite()).sum() <= 2
+    assert nearest.isfinite().any()
+
+
+def test_shadow_of_a_sphere_is_the_closed_form() -> None:
+    caster, ground = sphere(0.3, (0.2, -0.1, 0.8)), sphere(0.01, (0.0, 0.0, -0.5))
+    model = Solids([ground, caster])
+    generator = torch.Generator().manual_seed(0)
+    flat = 3 * torch.rand(4000, 2, generator=generator) - 1.5
+    points = torch.cat((flat, torch.zeros(4000, 1)), 1)
+    offset = torch.tensor(caster.centre) - points
+    light = torch.tensor(LIGHT)
+    assert math.hypot(*LIGHT) == pytest.approx(1, abs=1e-6)
+    ahead = offset @ light
+    gap = (offset - ahead[:, None] * light).norm(dim=1) - 0.3
+    certain = gap.abs() > 1e-4
+    expected = ((gap < 0) & (ahead > 0))[certain]
+    owners = torch.zeros(4000, dtype=torch.int16)
+    assert torch.equal(model.shadowed(owners, points)[certain], expected)
+    assert not model.shadowed(owners + 1, points).any()  # of the caster itself
+    assert 50 < (gap < 0).sum() < 3950
+
+
+@pytest.mark.parametrize("model", [totem, wires, mill])
+def test_culling_of_shadow_casters_changes_nothing(model) -> None:
+    solids = model()
+    points = 2.4 * torch.rand(6000, 3, generator=torch.Generator().manual_seed(3)) - 1.2
+    owners = torch.full((6000,), -1, dtype=torch.int16)  # of no part
+    dark = torch.zeros(6000, dtype=torch.bool)
+    for part in solids.parts:
+        origins = (points - torch.tensor(part.centre)) @ part.frame
+        light = torch.tensor(LIGHT) @ part.frame
+        dark |= part.shape.hit(origins.unbind(1), light.unbind(0)).isfinite()
+    # Rounding can turn a ray that grazes an edge.
+    assert (solids.shadowed(owners, points) != dark).sum() <= 1
+    assert 100 < dark.sum() < 5900
+
+
+def test_highlights_move_with_the_viewer() -> None:
+    glossy = Solids([Part(Ellipsoid((0.7, 0.7, 0.7)), RED, gloss=0.9)])
+    top = Solids([sphere(0.7)])
+    places = []
+    for eye in ((0.0, -4.0, 0.0), (1.5, -3.7, 0.0)):
+        camera = camera_at(eye)
+        shiny, matt = (render(model, camera, torch.zeros(3), 4) for model in (glossy, top))
+        row, column = divmod((shiny.rgb - matt.rgb)[..., 1].argmax().item(), camera.width)
+        depth = matt.depth[row, column]
+        ray = cast(camera, torch.tensor([[column + 0.5, row + 0.5]]))
+        places.append(ray.origins[0] + depth * ray.directions[0])
+    assert (places[0] - places[1]).norm() > 0.05
+
+
+BLACK = torch.zeros(3)
+
+
+@pytest.mark.parametrize("density", [0.01, 1.0, 30.0])
+def test_one_ball_through_its_middle(device, density) -> None:
+    model = Cloud([Ball((0.0, 0.0, 0.0), 0.5, density, (0.8, 0.4, 0.2))])
+    frame = render(model, camera_at((0.0, -4.0, 0.0), 1, device), BLACK, samples=1)
+    alpha = 1 - math.exp(-density)
+    # Mean of an exponential of rate k cut off at 1: 1 / k - 1 / (e^k - 1), from t = 3.5 on.
+    depth = 3.5 + 1 / density - 1 / math.expm1(density)
+    assert frame.alpha.item() == pytest.approx(alpha, rel=1e-5)
+    assert frame.depth.item() == pytest.approx(depth, rel=2e-5)
+    assert frame.rgb.flatten().tolist() == pytest.approx(
+        [0.8 * alpha, 0.4 * alpha, 0.2 * alpha], rel=1e-5
+    )
+
+
+def quadrature(model: Cloud, camera: Camera, steps: int) -> tuple[torch.Tensor, ...]:
+    """rgb, alpha, and depth times alpha of the pixel centres, by the midpoint rule on [0, 6]."""
+    rays = cast(camera)
+    width = 6 / steps
+    t = (torch.arange(steps, dtype=torch.float64) + 0.5) * width
+    points = rays.origins.double()[:, None] + t[:, None] * rays.directions.double()[:, None]
+    sigma = torch.zeros(points.shape[:2], dtype=torch.float64)
+    glow = torch.zeros_like(points)
+    for ball in model.balls:
+        inside = (points - torch.tensor(ball.centre)).norm(dim=-1) < ball.radius
+        sigma += ball.density * inside
+        glow += ball.density * inside[..., None] * torch.tensor(ball.colour)
+    thickness = sigma * width * rays.directions.double().norm(dim=1, keepdim=True)
+    passed = torch.exp(-thickness.cumsum(1))  # after each step
+    weight = passed * torch.expm1(thickness)
+    colour = glow / sigma.clamp(min=1e-12)[..., None]
+    return (weight[..., None] * colour).sum(1), 1 - passed[:, -1], (weight * t).sum(1)
+
+
+@pytest.mark.parametrize("eye", [(0.5, -3.0, 1.0), (0.1, 0.0, -0.4)], ids=["outside", "inside"])
+def test_overlapping_balls_against_quadrature(eye) -> None:
+    camera = camera_at(eye, 12)
+    frame = render(cloud(), camera, BLACK, samples=1)
+    rgb, alpha, depth = quadrature(cloud(), camera, steps=6000)
+    # A step that a surface cuts is wrong by its optical thickness at most, k h |d|: surfaces come
+    # in pairs, densities sum to 70.
+    error = 2 * 70 * (6 / 6000) * 1.2 / 2
+    assert (frame.alpha.flatten() - alpha).abs().max() <= error
+    assert (frame.rgb.reshape(-1, 3) - rgb).abs().max() <= error
+    seen = alpha > 0.05
+    got = (frame.depth * frame.alpha).flatten()[seen]
+    assert (got - depth[seen]).abs().max() <= 4 * error
+    # And on average far closer, for errors at the surfaces have both signs.
+    assert (frame.alpha.flatten() - alpha).abs().mean() <= error / 20

@@ -1,0 +1,170 @@
+"""Shapes: the hit is the first place where the distance changes sign, the normal its gradient."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from bench.scenes.embedded.solids import (
+    Box,
+    Capsule,
+    Carved,
+    Common,
+    Cylinder,
+    Ellipsoid,
+    Gable,
+    Pierced,
+    Shape,
+    Shifted,
+)
+
+SHAPES: dict[str, Shape] = {
+    "ellipsoid": Ellipsoid((0.9, 0.4, 0.6)),
+    "box": Box((0.5, 0.8, 0.3)),
+    "gable": Gable((0.5, 0.7, 0.6)),
+    "cylinder": Cylinder(0.5, 0.7),
+    "capsule": Capsule(0.3, 0.5),
+    "common": Common(Box((0.6, 0.6, 0.6)), Ellipsoid((0.8, 0.8, 0.8))),
+    "common of a shifted": Common(
+        Cylinder(0.6, 0.6), Shifted(Ellipsoid((0.7,) * 3), (0.3, 0, 0.2))
+    ),
+    "carved": Carved(
+        Box((0.6, 0.6, 0.4)),
+        [
+            Shifted(Ellipsoid((0.3, 0.3, 0.3)), (0.6, 0.0, 0.0)),
+            Shifted(Ellipsoid((0.4, 0.3, 0.3)), (0.4, 0.3, 0.3)),
+            Shifted(Cylinder(0.2, 1.0), (-0.3, 0.0, 0.0)),
+        ],
+    ),
+}
+REACH, STEPS = 6.0, 1500
+
+
+@pytest.fixture(params=SHAPES)
+def shape(request: pytest.FixtureRequest) -> Shape:
+    """Every kind of shape in turn."""
+    return SHAPES[request.param]
+
+
+def rays(count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Origins inside and around the shapes, directions of any length, [count, 3] float64."""
+    generator = torch.Generator().manual_seed(7)
+    origins = 4 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 2
+    directions = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    directions[: count // 2] -= origins[: count // 2]  # half of them towards the middle
+    return origins, directions
+
+
+def hits(shape: Shape, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+    return shape.hit(tuple(origins.unbind(1)), tuple(directions.unbind(1)))
+
+
+def met(shape: Shape, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where rays hit the shape, and the directions of these rays, [N, 3]."""
+    origins, directions = rays(count)
+    found = hits(shape, origins, directions)
+    hit = found.isfinite()
+    return origins[hit] + found[hit, None] * directions[hit], directions[hit]
+
+
+def test_the_hit_is_the_first_change_of_sign(shape) -> None:
+    origins, directions = rays(300)
+    found = hits(shape, origins, directions)
+    assert 20 < found.isfinite().sum() < 290
+    t = torch.linspace(0, REACH, STEPS, dtype=torch.float64)
+    points = origins[:, None] + t[:, None] * directions[:, None]
+    distance = shape.distance(points.reshape(-1, 3)).reshape(300, STEPS)
+    inside = distance < 0
+    # Rays that graze the surface may cross it twice between two steps: no verdict on those.
+    before = t < found[:, None] - 1e-9
+    same = (inside == inside[:, :1]) | (distance.abs() < 1e-4) | ~before
+    assert same.all()
+
+
+def test_the_sign_changes_at_the_hit(shape) -> None:
+    points, directions = met(shape, 300)
+    assert shape.distance(points).abs().max() < 1e-9
+    step = 1e-5 * directions / directions.norm(dim=1, keepdim=True)
+    across = (shape.normal(points) * step).sum(1).abs() > 1e-7  # not along the surface
+    before, after = shape.distance(points - step), shape.distance(points + step)
+    edges = (before * after > 0) & across
+    # Closer to an edge than the step the ray may leave again: a share of about step / size.
+    assert edges.sum() <= 1
+
+
+def test_normals_are_the_gradient_of_the_distance(shape) -> None:
+    points, _ = met(shape, 300)
+    steps = 1e-6 * torch.eye(3, dtype=torch.float64)
+    rise = [shape.distance(points + step) - shape.distance(points - step) for step in steps]
+    gradient = torch.stack(rise, dim=1) / 2e-6
+    smooth = (gradient.norm(dim=1) - 1).abs() < 1e-3  # else an edge lies within the step
+    assert smooth.float().mean() > 0.98
+    torch.testing.assert_close(shape.normal(points)[smooth], gradient[smooth], rtol=0, atol=1e-3)
+
+
+def test_the_extent_holds_every_hit(shape) -> None:
+    points, _ = met(shape, 2000)
+    assert (points.abs() <= torch.tensor(shape.extent(), dtype=torch.float64) + 1e-9).all()
+
+
+def test_a_pierced_box_is_a_box_minus_its_holes() -> None:
+    pierced = Pierced((0.9, 0.25, 0.6), (3, 2), (0.22, 0.2))
+    middles = [(x, 0.0, z) for x in (-0.6, 0.0, 0.6) for z in (-0.3, 0.3)]
+    body = Carved(Box((0.9, 0.25, 0.6)), [Shifted(Box((0.22, 9, 0.2)), x) for x in middles])
+    assert pierced.extent() == body.extent()
+    origins, directions = rays(4000)
+    inside = body.distance(origins) < 0
+    torch.testing.assert_close(pierced.distance(origins), body.distance(origins))
+    found, expected = (hits(shape, origins, directions)[~inside] for shape in (pierced, body))
+    torch.testing.assert_close(found, expected)
+    hit = found.isfinite()
+    assert 0.1 < hit.double().mean() < 0.5
+    # Some rays hit the sides of holes, from in front, from behind and from inside.
+    points = (origins[~inside] + found[:, None] * directions[~inside])[hit]
+    assert (points[:, 1].abs() < 0.249).double().mean() > 0.2
+    assert torch.equal(pierced.normal(points), body.normal(points))
+
+
+def test_from_inside_the_solid_a_pierced_box_ends_where_the_box_does() -> None:
+    pierced = Pierced((0.9, 0.25, 0.6), (3, 2), (0.22, 0.2))
+    along = tuple(torch.tensor([x]) for x in (0.0, 1.0, 0.0))
+    assert pierced.hit((0.3, 0.0, 0.3), along).item() == pytest.approx(0.25)
+
+
+def test_the_end_of_a_gable_has_the_area_of_a_triangle() -> None:
+    x, y = torch.meshgrid(*(torch.linspace(-1, 1, 801),) * 2, indexing="ij")
+    directions = (torch.full_like(x, 1e-9), torch.zeros_like(x), torch.ones_like(x))
+    # From below the foot is a rectangle, and a ray goes up to the slope: h (1 - |y| / w).
+    enter, leave = Gable((0.4, 0.5, 0.3)).interval((x, y, -torch.ones_like(x)), directions)
+    deep = (leave - enter).clamp(min=0).masked_fill(enter > leave, 0)
+    assert deep.mean().item() * 4 == pytest.approx(0.8 * 0.5 * 0.6, rel=0.01)
+
+
+def test_a_thin_wire_far_away_keeps_its_thickness_in_float32() -> None:
+    radius, far = 0.006, 5.0
+    offset = torch.linspace(-1.5 * radius, 1.5 * radius, 3001)
+    directions = (offset / far, torch.ones_like(offset), torch.zeros_like(offset))
+    found = Capsule(radius, 0.5).hit((0.0, -far, 0.0), directions)
+    # Tangents from 5 away touch at an angle of asin(r / far).
+    edge = far * math.tan(math.asin(radius / far))
+    certain = (offset.abs() - edge).abs() > 1e-3 * radius
+    assert torch.equal(found.isfinite()[certain], (offset.abs() < edge)[certain])
+    middle = found[1500].item()
+    assert middle == pytest.approx(far - radius, abs=4 * far * torch.finfo(torch.float32).eps)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_rays_along_an_axis_meet_box_and_cylinder(axis) -> None:
+    directions = [torch.zeros(1), torch.zeros(1), torch.zeros(1)]
+    directions[axis] = torch.ones(1)
+    origin = [0.1, 0.1, 0.1]
+    origin[axis] = -2.0
+    wall = math.sqrt(0.25 - 0.01)
+    aside = list(origin)
+    aside[(axis + 1) % 3] = 1.0
+    for shape, reach in ((Box((0.5, 0.6, 0.7)), (0.5, 0.6)), (Cylinder(0.5, 0.7), (wall, wall))):
+        met = shape.hit(tuple(origin), tuple(directions)).item()
+        assert met == pytest.approx(2 - (*reach, 0.7)[axis])
+        assert shape.hit(tuple(aside), tuple(directions)).isinf().all()

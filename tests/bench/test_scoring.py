@@ -1,0 +1,62 @@
+"""Frames are scored one at a time, and against the frame before them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from bench.metrics import flicker, quantise
+from bench.protocol import EvaluationProtocol
+from bench.scoring import Scoring
+from bench.types import composite
+
+WHITE = torch.ones(3)
+QUICK = EvaluationProtocol(name="quick", lpips=())
+
+
+def scored(images, cut: int | None = None, **options) -> list[dict]:
+    """Of frames of one grey level each, darker from one to the next; None: without a truth."""
+    scoring, found = Scoring(QUICK, {}, WHITE, ()), []
+    for index, image in enumerate(images):
+        height, width = (32, 40) if image is None else image.shape[:2]
+        rgb = torch.full((height, width, 3), (0.9, 0.7, 0.5, 0.3, 0.2, 0.1)[index])
+        found.append(scoring.score(index, rgb, image, cut=index == cut, **options))
+    return found
+
+
+def test_flicker_is_that_of_the_rounded_prediction_and_the_frame_before(tiny_scene):
+    images = tiny_scene.splits["test"].images
+    found = scored(images)
+    assert ["flicker" in figures for figures in found] == [False, *[True] * 5]
+    first, second = (composite(image, WHITE) for image in images[:2])
+    light, dark = (quantise(torch.full((32, 40, 3), level)) for level in (0.9, 0.7))
+    assert found[1]["flicker"] == pytest.approx(flicker(dark, second, light, first), rel=1e-9)
+    alone = scored(images, scored=False)
+    assert [set(figures) for figures in alone] == [set(), *[{"flicker"}] * 5]
+
+
+def test_a_cut_a_frame_without_truth_or_of_another_size_leaves_no_pair(tiny_scene):
+    images = list(tiny_scene.splits["test"].images)
+    found = scored([*images[:4], None, images[5]], cut=2)
+    assert [i for i, figures in enumerate(found) if "flicker" in figures] == [1, 3]
+    assert found[4] == {}
+    assert "psnr" in found[5]
+    found = scored([images[0], images[1][:, :20], images[2]])
+    assert not any("flicker" in figures for figures in found)
+
+
+def test_the_last_of_so_many_frames_is_scored_with_lpips_and_too_few_frames_say_so():
+    protocol = EvaluationProtocol(name="some", lpips=("alex",), lpips_every=2)
+    scoring = Scoring(protocol, {"alex": lambda *_: 0.5}, WHITE, shown=())
+    picture = torch.zeros(16, 16, 3)
+    found, said = [], []
+    for index in range(8):  # each second one has no truth
+        scored = index % 2 == 0
+        scores = scoring.score(index, picture, picture.byte(), scored=scored, cut=False)
+        found += [scores["lpips_alex"]] if scored else []
+        said.append(scoring.missing([]).get("lpips_alex"))
+    assert found == [pytest.approx(value, nan_ok=True) for value in (math.nan, 0.5, math.nan, 0.5)]
+    few = "protocol.lpips_every is 2, and the path has 1 frames to score"
+    assert said == [few, few, *[None] * 6]
