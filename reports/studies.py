@@ -62,7 +62,7 @@ class Measured:
         values = run.values
         ms = values["frame_ms"]
         fastest, slowest = (values.get(f"frame_ms.{end}", ms) for end in ("fastest", "slowest"))
-        return cls(line, run, ms, fastest, slowest)
+        return cls(line, run, ms, min(fastest, ms), max(slowest, ms))  # means are rounded
 
     def figure(self, metric: str) -> float:
         """A figure of the run; nan if it has none."""
@@ -144,7 +144,9 @@ def accuracy(found: Sequence[Measured]) -> list[Part]:
         rated = on_frontier(lines)
         plot = partial(frontier_plot, list(map(_point, rated)))
         shows = f"{method}: error of a frame against its time, one point a setting"
-        parts += [_accuracy_table(method, rated), Picture(f"frontier-{method}", shows, plot)]
+        parts.append(_accuracy_table(method, rated))
+        if any(math.isfinite(line.figure("psnr")) for line in rated):
+            parts.append(Picture(f"frontier-{method}", shows, plot))
     return parts
 
 

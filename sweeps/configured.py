@@ -53,6 +53,8 @@ def checked_settings(config: DictConfig) -> Settings:
     """The settings in `config`, checked. Also sets torch's number of threads as they say."""
     names = [field.name for field in fields(Settings)]
     values = {name: config[name] for name in names if name in config}
+    if values.get("frame_size") is not None:
+        values["frame_size"] = list(values["frame_size"])
     check_settings(Settings, values)
     settings = Settings(**values)
     if settings.seed < 0:

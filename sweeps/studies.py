@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache, cached_property
 from typing import Any
 
 import torch
@@ -14,7 +15,16 @@ from bench.study import Axis, Study, Variant, study_of
 from reports.studies import StudyLine
 from sweeps.configured import build
 from sweeps.measurement import Job
-from sweeps.overrides import CONFIGS, beside, composed, engine_kinds, swept, target_of
+from sweeps.overrides import (
+    CONFIGS,
+    beside,
+    changed,
+    composed,
+    engine_kinds,
+    folder_words,
+    swept,
+    target_of,
+)
 
 AS_IT_IS = Variant("as it is")  # the settings as typed
 NOTHING = "nothing"  # is skipped
@@ -23,24 +33,24 @@ SIZES = ((200, 200), (400, 400), (800, 800), (1920, 1080), (3840, 2160))
 """Widths and heights of frames that the time is measured at."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Subject:
     """A method that is studied, `name`, as the `words` of a command describe it."""
 
     name: str
     words: list[str]
 
-    @property
+    @cached_property
     def config(self) -> DictConfig:
-        """The composed configuration."""
-        return composed(self.words)
+        """The composed configuration, with Hydra's own."""
+        return composed(self.words, return_hydra_config=True)
 
     @property
     def has_engine(self) -> bool:
         """Whether the method has a 2D network, which an engine computes."""
         return "engine" in self.config.method
 
-    @property
+    @cached_property
     def study(self) -> Study:
         """What the method declares: its class or, if only that knows, an object.
 
@@ -52,6 +62,11 @@ class Subject:
             return Study() if OmegaConf.missing_keys(method) else build(self.config, "method").study
         return study_of(target)
 
+    @property
+    def engine(self) -> str:
+        """The engine that is chosen."""
+        return str(self.config.hydra.runtime.choices.engine)
+
     def engines(self) -> list[Variant]:
         """All engines at all precisions; torch in fp32, the standard, first."""
         return [
@@ -59,6 +74,16 @@ class Subject:
             for name, kind in engine_kinds(self.words).items()
             for precision in kind.precisions
         ]
+
+    def varied(self, settings: Sequence[str]) -> DictConfig:
+        """The configuration with further settings; values are set without composing it again."""
+        plain = [word for word in settings if not word.startswith(("+", "engine="))]
+        return changed(self._with(*(word for word in settings if word not in plain)), plain)
+
+    @cached_property
+    def _with(self) -> Callable[..., DictConfig]:
+        """The configuration with further choices; each is composed once."""
+        return cache(lambda *words: composed([*self.words, *words]))
 
     def axes(self) -> dict[str, Axis]:
         """What tables vary of the method, and what it declares itself."""
@@ -127,11 +152,9 @@ def skips(subject: Subject, only: Sequence[str]) -> Iterator[StudyLine]:
 
 def breakdown(subject: Subject, only: Sequence[str]) -> Iterator[StudyLine]:
     """Each precision of the engine, or the method as it is without one; with and without skips."""
-    config = composed(subject.words, return_hydra_config=True)
     variants = [Variant(subject.name)]
     if subject.has_engine:
-        engine = f"engine={config.hydra.runtime.choices.engine}"
-        own = [each for each in subject.engines() if engine in each.settings]
+        own = [x for x in subject.engines() if f"engine={subject.engine}" in x.settings]
         variants = [Variant(f"{subject.name}, {each.name}", each.settings) for each in own]
     off = tuple(f"{setting}=false" for setting in subject.study.skips.values())
     if off:
@@ -143,9 +166,8 @@ def scaling(subject: Subject, only: Sequence[str]) -> Iterator[StudyLine]:
     """Frame sizes, numbers of threads and the axes of the method, each measured alone."""
     axes = subject.axes()
     wanted = chosen(("pixels", "threads", *axes), only, "axis")
-    config = composed(subject.words, return_hydra_config=True)
-    engine = config.hydra.runtime.choices.engine
-    if "threads" in wanted and subject.has_engine and engine != "torch":
+    config = subject.config
+    if "threads" in wanted and subject.has_engine and subject.engine != "torch":
         others = ", ".join(name for name in wanted if name != "threads")
         raise SteerbenchError(
             "threads: expected engine=torch, whose threads can be chosen afterwards; for another "
@@ -191,7 +213,9 @@ def subjects(study: str, words: Sequence[str]) -> list[Subject]:
     if one of them has nothing that the study could vary; of the usual ones, it is left out.
     """
     typed = [word for word in words if word.partition("=")[0] == "method"]
-    rest = [f"+experiment={study}", *(word for word in words if word not in typed)]
+    folders = folder_words(words)
+    others = (word for word in words if word not in (*typed, *folders))
+    rest = [*folders, f"+experiment={study}", *others]
     usual = OmegaConf.load(CONFIGS / "experiment" / f"{study}.yaml").study.methods
     names = swept(words).get("method") or [word.partition("=")[2] for word in typed[-1:]] or usual
     alone = len(names) == 1
@@ -233,10 +257,10 @@ def jobs_of(study: str, found: Sequence[Subject], options: Mapping[str, Any]) ->
     for subject in found:
         for line in LINES[study](subject, **options):
             words = [*subject.words, *line.settings]
-            config = composed(words)
+            config = subject.varied(line.settings)
             whose = [] if study == "breakdown" else [subject.name]  # all methods in turns
             turns = ", ".join((study, *whose, line.group))
             name = f"{study}: {subject.name}, {line.group}: {line.label}"
-            command = ["steerbench", "run", *words, "hydra.mode=RUN"]
+            command = ["steerbench", "run", *words]
             jobs.append(StudyJob(config, command, name, turns * line.in_turns, line=line))
     return jobs

@@ -5,19 +5,23 @@ from __future__ import annotations
 import math
 import weakref
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 import bench.measure
+from bench.clock import FrameRecord
+from bench.console import ConsoleLog
 from bench.intervals import path_interval
-from bench.measure import MethodFailed, Task, measure
+from bench.measure import MethodFailed, Task, _Take, measure
 from bench.metrics import psnr, quantise
 from bench.protocol import EvaluationProtocol
 from bench.results import COLUMNS
 from bench.trajectories import from_split
-from bench.types import Budget, SteerbenchError, composite
+from bench.types import Budget, Frame, SteerbenchError, composite
 
 QUICK = EvaluationProtocol(name="quick", lpips=(), warmup=2)
 BUDGET = Budget("tiny", steps=1, samples=1)
@@ -309,3 +313,111 @@ def test_of_several_methods_the_one_that_failed_is_named(where, run, offset_meth
     assert caught.value.__cause__ is error
     with pytest.raises(RuntimeError, match="no"):
         run(other)
+
+
+# In rounds, compared with the first
+
+
+IN_ROUNDS = replace(QUICK, warmup=0, rounds=3, compared=True)
+
+
+class Brighter:
+    """Renders half the ground truth, brighter by some 8-bit levels; notes its turn in `turns`."""
+
+    name, train_s = "brighter", 0.0
+
+    def __init__(self, scene, levels: float, turns: list, memory: int = 0) -> None:
+        self.levels, self.turns, self.memory = levels, turns, memory
+        self.split, self.background = scene.splits["test"], scene.background
+
+    def fit(self, scene, budget, log) -> None:
+        self.turns.append((self.levels, "fit"))
+
+    def reset(self) -> None:
+        self.turns.append((self.levels, "reset"))
+
+    def render(self, camera, probe) -> Frame:
+        number = next(n for n, known in enumerate(self.split.cameras) if known is camera)
+        self.turns.append((self.levels, number))
+        dark = composite(self.split.images[number], self.background) / 2
+        picture = dark + self.levels / 255
+        return Frame(picture, torch.ones_like(picture[..., 0]), torch.ones_like(picture[..., 0]))
+
+    def sizes(self) -> dict[str, int]:
+        return {}
+
+    def settings(self) -> dict[str, str]:
+        return {"device": "cpu", "backend": "none", "engine": "none", "precision": "fp32"}
+
+
+@pytest.fixture
+def in_turns(run, tiny_scene):
+    """What was measured of methods of these brightnesses, in rounds, and who had which turn."""
+
+    def rendered(*levels: float, memory: int = 0, **changes):
+        turns: list = []
+        methods = [Brighter(tiny_scene, n, turns, memory) for n in levels]
+        found = run(*methods, **{"protocol": IN_ROUNDS, **changes})
+        return (found if len(levels) > 1 else [found]), turns
+
+    return rendered
+
+
+def test_methods_take_turns_in_every_round_and_are_held_against_the_first(in_turns, tiny_scene):
+    (first, second), turns = in_turns(0, 8)
+    count = len(tiny_scene.splits["test"])
+    round_ = [(levels, turn) for turn in ("reset", *range(count)) for levels in (0, 8)]
+    warm = [(levels, turn) for turn in ("fit", "reset") for levels in (0, 8)]
+    assert turns == [*warm, *3 * round_]
+    assert value(first.rows, "psnr_to_first") == math.inf
+    assert value(first.rows, "worst_to_first") == 0
+    # Halves of odd levels round to even ones: by up to one level more or less than 8.
+    apart, worst = (value(second.rows, f"{x}_to_first") for x in ("psnr", "worst"))
+    assert -20 * math.log10(9 / 255) <= apart <= -20 * math.log10(7 / 255)
+    assert 7 / 255 - 1e-6 <= worst <= 9 / 255 + 1e-6
+    assert value(second.rows, "psnr") > value(first.rows, "psnr")  # half the truth is too dark
+    for each in (first, second):
+        ms, *ends = (value(each.rows, f"frame_ms{x}") for x in ("", ".fastest", ".slowest"))
+        assert 0 < ends[0] <= ms <= ends[1]
+
+
+def test_a_single_round_names_no_other_and_no_first(in_turns):
+    (alone,), _ = in_turns(0, protocol=QUICK)
+    named = set(alone.rows["metric"])
+    assert not {"frame_ms.fastest", "psnr_to_first", "worst_to_first"} & named
+
+
+def test_times_are_those_of_the_median_round_without_the_first_and_what_is_not_steady():
+    take = object.__new__(_Take)
+    take.rows = [{"phase": phase} for phase in ("cold", "steady", "steady")]
+    warm, first = [frame(9.0)], [frame(1000.0), frame(500.0), frame(500.0)]
+    slow = [frame(1000.0), frame(40.0), frame(60.0)]
+    usual = [frame(1000.0), frame(14.0), frame(14.0)]
+    fast = [frame(1000.0), frame(8.0), frame(8.0)]
+    take.clock = SimpleNamespace(frames=[*warm, *first, *slow, *usual, *fast])
+    assert take.timed(1) == (usual, [50.0, 14.0, 8.0])
+    take.clock = SimpleNamespace(frames=[*warm, *first, *slow, *usual])
+    assert take.timed(1)[0] == usual  # the lower of two
+    take.clock = SimpleNamespace(frames=[*warm, *first])
+    assert take.timed(1) == (first, [500.0])  # the only round
+
+
+def frame(ms: float) -> FrameRecord:
+    return FrameRecord({"field": int(ms * 1e6)}, {}, {})
+
+
+def test_only_steady_frames_with_a_ground_truth_are_held_against_the_first(in_turns, tiny_scene):
+    whole = from_split(tiny_scene)
+    blind = replace(whole, steps=(whole.steps[0], replace(whole.steps[1], truth=None)))
+    alone = replace(whole, steps=whole.steps[:1])
+    found = [in_turns(0, 8, trajectory=path)[0][1].rows for path in (blind, alone)]
+    assert value(found[0], "psnr_to_first") == value(found[1], "psnr_to_first")
+
+
+def test_what_cannot_be_compared_is_refused_before_anything_is_trained(in_turns, tiny_scene):
+    turns: list = []
+    method = Brighter(tiny_scene, 0, turns, memory=99)
+    task = Task(tiny_scene, from_split(tiny_scene), IN_ROUNDS, BUDGET, seed=0)
+    with pytest.raises(SteerbenchError, match="99 frames before it"):
+        measure([method], task, ConsoleLog(Path(), quiet=True))
+    assert turns == []
