@@ -22,9 +22,6 @@ from methods.kernels.types import Extent, Occupancy, Samples, check_rays, expect
 
 MAX_SAMPLES = 1024  # most samples of a ray through the unit cube at the usual step, sqrt(3) / 1024
 
-PARALLEL = 2.0**-127
-"""A smaller component of a direction counts as 0, because its reciprocal overflows float32."""
-
 
 @dataclass(frozen=True)
 class Segments:

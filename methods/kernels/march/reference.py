@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from methods.kernels.march import PARALLEL, Segments, longest_ray
-from methods.kernels.types import Extent, Occupancy, Samples, offsets_of
+from methods.kernels.march import Segments, longest_ray
+from methods.kernels.types import PARALLEL, Extent, Occupancy, Samples, offsets_of
 
 BLOCK = 1 << 12  # rays that are tested at a time: [BLOCK, 1024, 3] positions are 50 MB
 

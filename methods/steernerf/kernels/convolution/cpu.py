@@ -14,14 +14,14 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 from llvmlite import ir
-from numba import njit, prange, types
+from numba import prange, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 from torch import Tensor
 from torch.nn import functional
 
-from methods.kernels.cpu import LANES, check_float32, f32, flat, multiply
+from methods.kernels.cpu import LANES, check_float32, f32, flat, jit, multiply
 from methods.steernerf.kernels.convolution import reference
 from methods.steernerf.kernels.spans import Spans, ends
 
@@ -319,7 +319,7 @@ def _finish(typing, source, at, bias, b_at, plus, p_at, adds, relu, target, to):
     return types.void(source, n, bias, n, plus, n, yes, yes, target, n), generate
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@jit(parallel=True, error_model="numpy")
 def _convolve(
     one, other, c_one, c_other, batch, height, width, stride, ends, weight, bias, padded, outputs,
     relu, adds, shuffled, plus, out,
@@ -374,7 +374,7 @@ def _convolve(
                                     out[to + c] = f32(0) if relu and value < f32(0) else value
 
 
-@njit(cache=True, error_model="numpy")
+@jit(error_model="numpy")
 def _tile(
     source, start, channels, height, width, top, left, ends, patch, space, tiles, to, step
 ):  # fmt: skip
@@ -406,7 +406,7 @@ def _tile(
         c += LANES
 
 
-@njit(cache=True, error_model="numpy")
+@jit(error_model="numpy")
 def _pixels(results, at, step, space, square):
     """A^T m A of 36 vectors that are `step` apart: `square` [4, 4, LANES]."""
     for j in range(6):
@@ -415,7 +415,7 @@ def _pixels(results, at, step, space, square):
         _from_tile(space, 6 * i * LANES, LANES, square, 4 * i * LANES, LANES)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@jit(parallel=True, error_model="numpy")
 def _weigh(given, grad, channels, outputs, batch, height, width, ends, sums):
     """Sums over tiles of (A Y A^T) . (B^T d B): `sums` [SHARES, 36 * channels * outputs]. Arrays
     are flat, with channels last."""
@@ -444,7 +444,7 @@ def _weigh(given, grad, channels, outputs, batch, height, width, ends, sums):
                         total[n * square + k] += product[k]
 
 
-@njit(cache=True, error_model="numpy")
+@jit(error_model="numpy")
 def _square(
     source, start, channels, height, width, top, left, patch, space, tiles, to, step
 ):  # fmt: skip
@@ -466,7 +466,7 @@ def _square(
             _to_sums(space, 4 * i * LANES, LANES, tiles, to + c + 6 * i * step, step)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@jit(parallel=True, error_model="numpy")
 def _halve(given, out, ends):
     """`given` [rows, W, C] with the rows of all pictures, an even number in each; `ends` are of the
     rows of one."""
@@ -479,7 +479,7 @@ def _halve(given, out, ends):
                 out[y, x, c] = _larger(above, below)
 
 
-@njit(cache=True)
+@jit()
 def _larger(x, y):
     """The larger number; NaN if one is."""
     return y if y > x or y != y else x

@@ -7,10 +7,10 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
-from methods.kernels.cpu import arrays, check_float32, f32
+from methods.kernels.cpu import arrays, check_float32, f32, jit
 from methods.steernerf.kernels.spans import Spans, ends
 
 Axis = tuple[Tensor, Tensor, Tensor]
@@ -91,7 +91,7 @@ def _axis(side: int, scale: int, aligned: bool) -> Axis:
     return first.int(), (first + 1).clamp(max=side - 1).int(), (place - first).float()
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _shown(present, values, index, ends, frames, out):
     step = out.shape[0] // present.shape[0]
     for row in prange(out.shape[0]):
@@ -107,7 +107,7 @@ def _shown(present, values, index, ends, frames, out):
                     _put(values[point], frame + 1, frames, line[column])
 
 
-@njit(cache=True)
+@jit()
 def _put(features, frame, frames, pixel):
     """Write the features of one of the frames to a pixel: RGB of all come first."""
     for k in range(3):
@@ -117,7 +117,7 @@ def _put(features, frame, frames, pixel):
         pixel[3 * frames + rest * frame + k] = features[3 + k]
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _collected(grad, index, present, values, frames):
     """Adjoint of `_shown`. A thread a frame, because frames share no points."""
     step = grad.shape[0] // present.shape[0]
@@ -135,7 +135,7 @@ def _collected(grad, index, present, values, frames):
                         _add(grad[row, column], frame, frames, values[point])
 
 
-@njit(cache=True)
+@jit()
 def _add(pixel, frame, frames, features):
     """Adjoint of `_put`."""
     for k in range(3):
@@ -145,7 +145,7 @@ def _add(pixel, frame, frames, features):
         features[3 + k] += pixel[3 * frames + rest * frame + k]
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _corrected(
     rgb, correction, ends, above, below, lower, left, right, nearer, out, top, start, clip
 ):  # fmt: skip
@@ -170,12 +170,12 @@ def _corrected(
                     line[x, c] = f32(0) if v < 0 else f32(1) if v > 1 else v  # NaN stays
 
 
-@njit(cache=True)
+@jit()
 def _mixed(first, second, share):
     return first * (f32(1) - share) + second * share
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _reduced(grad, above, below, lower, left, right, nearer, rows, sums):
     """Adjoint of enlarging: first along the rows of the picture, then along its columns."""
     for y in prange(grad.shape[0]):
