@@ -16,7 +16,7 @@ from numba import prange
 from torch import Tensor
 
 from methods.kernels.cpu import arrays, check_float32, f32, i32, jit, slope, u64
-from methods.kernels.march import Segments, longest_ray
+from methods.kernels.march import LEAST_STEP, Segments, longest_ray
 from methods.kernels.types import Extent, Occupancy, Samples, offsets_of
 
 CHUNK = 128  # rays that are marched together; their numbers stay in the first-level cache
@@ -28,6 +28,7 @@ columns without a ray is not read."""
 f64 = np.float64
 INF = f32(np.inf)
 ZEROS, ONES = (f32(0),) * 3, (f32(1),) * 3
+LEAST = f32(LEAST_STEP)
 FAR_AWAY = f32(2**30)  # a step that no ray reaches; the numbers of steps are int32
 
 # Rows of a chunk: what is known of each ray, in float32 ...
@@ -136,7 +137,7 @@ def _begin(floats, integers, rays, low, high, step):
         enter, leave = _cross(floats, i, ZEROS, ONES)
         near, far = max(enter, f32(0)), min(leave, floats[_at(FAR, i)])
         x, y, z = _three(floats, ORIGIN, i)
-        finite = (abs(x) + abs(y) + abs(z) < INF) & (f32(0) < length) & (length < INF)
+        finite = (abs(x) + abs(y) + abs(z) < INF) & (step_t >= LEAST) & (step_t < INF)
         alive = finite & (near < far) & (far < INF) & (integers[_at(K, i)] >= 0)
         enter, leave = _cross(floats, i, low, high)
         integers[_at(FREE, i)] = i32(alive & (enter <= leave))
