@@ -57,7 +57,7 @@ class TorchEngine(Engine):
 
         size = sum(weight.numel() for weight in network.parameters()) * dtype.itemsize
         made = run if _on_cpu(network) else _recorded(run, network, samples, log)
-        return Built(made, size, dtype, plain=made is run and dtype == torch.float32)
+        return Built(made, size, dtype)
 
 
 def _on_cpu(network: Network) -> bool:
