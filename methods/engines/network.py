@@ -23,7 +23,6 @@ class Built:
     run: Callable[..., Inputs]
     size: int  # bytes of its weights in a file
     dtype: torch.dtype = torch.float32  # of input pictures that it need not convert
-    plain: bool = False  # whether `run` is the network itself, and so can leave pixels out
 
 
 class Network(nn.Module, ABC):

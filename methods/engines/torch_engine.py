@@ -53,8 +53,7 @@ class TorchEngine(Engine):
 
         size = sum(weight.numel() for weight in network.parameters()) * dtype.itemsize
         on_cpu = next(network.parameters()).device.type == "cpu"
-        made = run if on_cpu else Replayed(run)
-        return Built(made, size, dtype, plain=on_cpu and dtype == torch.float32)
+        return Built(run if on_cpu else Replayed(run), size, dtype)
 
 
 def _arithmetic(device: torch.device, dtype: torch.dtype) -> AbstractContextManager[object]:

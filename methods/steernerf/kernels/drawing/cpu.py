@@ -11,7 +11,6 @@ from numba import prange
 from torch import Tensor
 
 from methods.kernels.cpu import arrays, check_float32, f32, jit
-from methods.steernerf.kernels.spans import Spans, ends
 
 Axis = tuple[Tensor, Tensor, Tensor]
 """Of each place along a side of the picture: the two pixels it lies between, and how near it is to
@@ -24,7 +23,6 @@ def shown(
     index: Tensor,
     frames: int,
     memory: Tensor,
-    spans: Spans | None,
 ) -> Tensor:
     """As the reference, of numbers of 16 or 32 bits, which are moved and not computed; in `memory`
     if that has room."""
@@ -33,8 +31,7 @@ def shown(
     out = memory[: shape.numel()].view(shape) if fits else present.new_empty(shape)
     moved = (x.view(torch.int16) if x.dtype.itemsize == 2 else x for x in (present, values, out))
     present, values, filled = moved
-    of_rows = ends(spans, *shape[:2])
-    _shown(*arrays(present, values, index, of_rows), frames + 1, filled.numpy())
+    _shown(*arrays(present, values, index), frames + 1, filled.numpy())
     return out
 
 
@@ -55,7 +52,6 @@ def corrected(
     corner: tuple[int, int],
     scale: int,
     aligned: bool,
-    spans: Spans | None,
     *,
     clip: bool,
 ) -> Tensor:
@@ -64,8 +60,7 @@ def corrected(
     check_float32(rgb)
     down, across = (_axis(side, scale, aligned) for side in rgb.shape[:2])
     out = torch.empty(len(down[0]), len(across[0]), 3)
-    of_rows = ends(spans, *correction.shape[:2])
-    given = arrays(rgb, correction, of_rows, *down, *across, out)
+    given = arrays(rgb, correction, *down, *across, out)
     _corrected(*given, *corner, clip)
     return out
 
@@ -92,16 +87,16 @@ def _axis(side: int, scale: int, aligned: bool) -> Axis:
 
 
 @jit(parallel=True)
-def _shown(present, values, index, ends, frames, out):
+def _shown(present, values, index, frames, out):
     step = out.shape[0] // present.shape[0]
     for row in prange(out.shape[0]):
-        line, (first, end) = out[row], ends[row]
-        line[first:end] = 0
+        line = out[row]
+        line[:] = 0
         if row % step == 0:
-            for column in range((first + step - 1) // step, (end + step - 1) // step):
+            for column in range(present.shape[1]):
                 _put(present[row // step, column], 0, frames, line[column * step])
         for frame in range(index.shape[0]):
-            for column in range(first, end):
+            for column in range(out.shape[1]):
                 point = index[frame, row, column]
                 if point >= 0:
                     _put(values[point], frame + 1, frames, line[column])
@@ -147,7 +142,7 @@ def _add(pixel, frame, frames, features):
 
 @jit(parallel=True)
 def _corrected(
-    rgb, correction, ends, above, below, lower, left, right, nearer, out, top, start, clip
+    rgb, correction, above, below, lower, left, right, nearer, out, top, start, clip
 ):  # fmt: skip
     for y in prange(out.shape[0]):
         first, second, share = rgb[above[y]], rgb[below[y]], lower[y]
@@ -159,8 +154,8 @@ def _corrected(
             for c in range(3):
                 line[x, c] = _mixed(between[left[x], c], between[right[x], c], nearer[x])
         if top <= y < top + correction.shape[0]:
-            added, (first_added, end) = correction[y - top], ends[y - top]
-            for x in range(first_added, end):
+            added = correction[y - top]
+            for x in range(len(added)):
                 for c in range(3):
                     line[start + x, c] += added[x, c]
         if clip:
