@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from bench.intervals import half_interval, path_interval
-from reports.comparison import metric_format
+from reports.comparison import shown_as
 from reports.runs import Repeated, Run
 from reports.tables import ABSENT, Table, decimal
 
@@ -221,7 +221,7 @@ def told(metric: str, by: float) -> str:
     if math.isnan(by):
         return ABSENT
     if not _by_ratio(metric):
-        return ("-" if by < 0 else "+") + metric_format(metric)[1](abs(by))
+        return ("-" if by < 0 else "+") + shown_as(metric).write(abs(by))
     factor = math.exp(by)
     if factor < 0.1:
         return f"×{factor:.2g}"
@@ -262,7 +262,7 @@ def claim_table(comparisons: Sequence[Comparison]) -> Table:
     lines = []
     for each in comparisons:
         metric = each.claim.metric
-        label = metric_format(metric)[0].rstrip(" ↑↓")
+        label = shown_as(metric).name
         sign = "≈" if each.claim.alike else "<"
         where = ", ".join(filter(None, (each.table, each.data_set, label)))
         name = f"{where}: {each.smaller} {sign} {each.larger}"

@@ -8,7 +8,7 @@ from functools import partial
 
 import pandas as pd
 
-from reports.comparison import conditions_of, marked, metric_format
+from reports.comparison import conditions_of, marked, shown_as
 from reports.paper_tables import Measured, PaperTable, Shown
 from reports.tables import decimal
 
@@ -49,7 +49,7 @@ def _latex(table: PaperTable, measured: Measured) -> str:
     blocks = table.shown(measured)
     runs = [run for block in blocks for _, line in block.lines.values() for run in line.runs]
     caption = f"{_escaped(table.title)}. " + (f"{_escaped(conditions_of(runs))}." if runs else "")
-    heads = ["", *(_escaped(metric_format(metric)[0]) for metric in table.metrics)]
+    heads = ["", *(_escaped(shown_as(metric).heading) for metric in table.metrics)]
     parts = ([heads], *map(_rows, blocks))
     rows = ("\n".join(" & ".join(row) + r" \\" for row in part) for part in parts)
     return "\n".join(
@@ -108,7 +108,7 @@ def _written(metric: str, value: float) -> str:
     """A figure with the paper's number of decimals, sizes in MB."""
     family = re.split(r"[._]", metric)[0]
     if family not in DECIMALS:
-        return metric_format(metric)[1](value)
+        return shown_as(metric).write(value)
     return decimal(value / 1e6 if family == "size" else value, DECIMALS[family])
 
 

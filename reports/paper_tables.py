@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from reports.claims import Claim, Comparison, apart, compare, gap, told
-from reports.comparison import COMMON, marked, metric_format, written
+from reports.comparison import COMMON, marked, shown_as, written
 from reports.runs import Repeated, Run, missing_figures
 from reports.tables import ABSENT, Table
 
@@ -227,7 +227,7 @@ def figure_table(block: Shown) -> Table:
     columns = [
         [text or ABSENT for text in marked(lines, metric, ("**%s**", "*%s*"))] for metric in metrics
     ]
-    heads = ("measured", *(metric_format(metric)[0] for metric in metrics))
+    heads = ("measured", *(shown_as(metric).heading for metric in metrics))
     cells = tuple(zip(map(_name, lines), *columns, strict=True))
     sources = tuple(line.keys for line in lines)
     return Table(block.title or block.table.title, heads, cells, sources=sources)
@@ -252,7 +252,7 @@ def distance_table(block: Shown) -> Table:
         if {*(cells := [cell(*line, metric) for line in lines.values()])} != {ABSENT}
     }
     every = [reference, *(runs for _, runs in lines.values())]
-    heads = ("here (paper)", *(metric_format(metric)[0] for metric in columns))
+    heads = ("here (paper)", *(shown_as(metric).heading for metric in columns))
     cells = tuple(zip(map(_name, every), *columns.values(), strict=True))
     return Table("Distances", heads, cells, sources=tuple(line.keys for line in every))
 
@@ -272,5 +272,5 @@ def _scenes(metrics: Sequence[str], lines: Sequence[Repeated]) -> Table:
     cells = tuple(
         (each.label, *(written(each, metric) or ABSENT for metric in metrics)) for each in shown
     )
-    heads = ("measured", *(metric_format(metric)[0] for metric in metrics))
+    heads = ("measured", *(shown_as(metric).heading for metric in metrics))
     return Table("Each scene", heads, cells, sources=tuple(each.keys for each in shown))

@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 
 from bench.errors import SteerbenchError, unexpected, unknown
 from reports.claims import Claim
-from reports.comparison import metric_format
+from reports.comparison import shown_as
 from reports.paper_tables import METHOD, Block, Line, PaperTable
 from sweeps.configured import check_settings
 from sweeps.data_sets import FIRST
@@ -89,7 +89,7 @@ def _table(name: str, experiment: Any, data_sets: Sequence[str]) -> PaperTable:
     own["instead"] = {str(key): str(of) for key, of in own.get("instead", {}).items()}
     check_settings(PaperTable, own, f"{where}.", ("name", "blocks"))
     for metric in own["metrics"]:
-        metric_format(metric)  # refuses a name that is no metric
+        shown_as(metric)  # refuses a name that is no metric
     axes = {key: values for key, values in _grid(experiment).items() if key != SEED}
     lines = _lines(declared, axes, f"{where}.lines")
     own["claims"] = [_claim(of, lines, f"{where}.claims.") for of in own.get("claims", ())]
@@ -130,7 +130,7 @@ def _claim(declared: Mapping[str, Any], lines: Mapping[str, Line], where: str) -
     """A claim about lines that an experiment declares as `rising` or as `alike`."""
     own = {name: of for name, of in declared.items() if name not in ("rising", "alike")}
     check_settings(Claim, own, where, ("lines", "alike"))
-    metric_format(own["metric"])
+    shown_as(own["metric"])
     keys = [str(key) for key in declared.get("rising") or declared.get("alike") or ()]
     said = (key for _, key, _, _ in Formatter().parse(own.get("says", "")))
     _refuse_unknown([*keys, *filter(None, said)], lines)
