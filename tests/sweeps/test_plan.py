@@ -313,10 +313,12 @@ def test_any_folder_can_be_named_in_a_command(text):
     assert config.scene._get_node("path")._value() == text
 
 
-def test_every_scene_is_a_job_of_its_own_and_a_command_that_makes_it(tmp_path):
+@pytest.mark.parametrize("quote", ["", "'", '"'])
+def test_every_scene_is_a_job_of_its_own_and_a_command_that_makes_it(tmp_path, quote):
     for name in ("mic", "chair"):
         blender(tmp_path / "my data" / name)
-    typed = ["scene.downscale=4", f"data={tmp_path / 'my data'}", "budget=tiny", "seed=0,1"]
+    folder = f"{quote}{tmp_path / 'my data'}{quote}"
+    typed = ["scene.downscale=4", f"data={folder}", "budget=tiny", "seed=0,1"]
     words, data = data_set(typed)
     assert words == [typed[0], *typed[2:]]
     jobs = plan(TABLES["table5"], words, data)
