@@ -170,8 +170,10 @@ def comparisons(table: PaperTable, measured: Measured) -> list[Comparison]:
                 for key, (line, _) in block.lines.items()
                 if claim.metric in line.published
             }
-            where = {"table": table.called, "data_set": block.title}
-            found += [replace(each, **where) for each in compare(claim, known, figures)]
+            found += [
+                replace(each, table=table.called, data_set=block.title)
+                for each in compare(claim, known, figures)
+            ]
     return found
 
 
@@ -247,9 +249,9 @@ def distance_table(block: Shown) -> Table:
         return here if paper == ABSENT else f"{here} ({paper})"
 
     columns = {
-        metric: [written(reference, metric) or ABSENT, *cells]
+        metric: [written(reference, metric) or ABSENT, *distances]
         for metric in block.table.metrics
-        if {*(cells := [cell(*line, metric) for line in lines.values()])} != {ABSENT}
+        if {*(distances := [cell(*line, metric) for line in lines.values()])} != {ABSENT}
     }
     every = [reference, *(runs for _, runs in lines.values())]
     heads = ("here (paper)", *(shown_as(metric).heading for metric in columns))
