@@ -5,6 +5,7 @@
 #   PIP_ARGS="..."         further arguments for pip, e.g. an index of CPU-only wheels of torch
 #   DEMO_ARGS="..."        overrides for the demo, e.g. DEMO_ARGS="seed=1 scene=wires"
 #   PAPER_ARGS="..."       overrides for the paper's tables, e.g. PAPER_ARGS="budget=full data=DIR"
+#   FIGURES_ARGS="..."     of docs/figures.py, e.g. FIGURES_ARGS="--data DIR" or FIGURES_ARGS=--check
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
@@ -15,6 +16,7 @@ BIN := $(VENV)/bin
 PYTHON ?=
 PIP_ARGS ?=
 DEMO_ARGS ?=
+FIGURES_ARGS ?=
 PAPER_ARGS ?= budget=paper protocol=paper-1 scene=totem,mill
 
 # A complete interpreter is one that is new enough and can make environments with pip in them.
@@ -41,7 +43,7 @@ test-all: lint ## lint, then all tests: what continuous integration runs
 	$(PYTEST)
 
 figures: install ## measure all that the documents show, and put it there; in hours
-	@$(BIN)/steerbench figures
+	@$(BIN)/python docs/figures.py $(FIGURES_ARGS)
 
 fuzz: install ## loaders and settings on whatever comes, for some minutes
 	$(BIN)/python -m pytest --hypothesis-profile=fuzz tests/bench/scenes/test_fuzz.py tests/sweeps/test_fuzz.py

@@ -1,6 +1,6 @@
 """Data sets that others publish: downloads them, checks copies of them.
 
-`scenes/published.toml` describes them; the SHA-256 of each file is in a pooch registry.
+`scenes/published.toml` describes them, `scenes/*.registry.txt` have the SHA-256 of each file.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from bench.download import fetch
+from bench.download import fetch, file_sha256
 from bench.errors import unexpected
 from bench.scenes.files import data_folder
 from bench.sharing import locked
@@ -37,11 +37,8 @@ class Published:
     @cached_property
     def hashes(self) -> Mapping[str, str]:
         """SHA-256 of each file, by its path, which starts with the scene's name."""
-        import pooch  # imported here and below: it takes 0.1 s, and few commands need it
-
-        registry = pooch.create(LISTS, "")
-        registry.load_registry(LISTS / f"{self.name}.registry.txt")
-        return registry.registry
+        text = (LISTS / f"{self.name}.registry.txt").read_text(encoding="utf-8")
+        return dict(line.split() for line in text.splitlines())
 
     @property
     def scenes(self) -> set[str]:
@@ -99,17 +96,9 @@ def _unpack(archive: Path, wanted: Mapping[str, str], folder: Path) -> None:
 def _wrong(folder: Path, wanted: Mapping[str, str]) -> list[str]:
     """The `wanted` files that are present but differ, or missing although a loader needs them."""
     needed = {n for n in wanted if (folder / n).exists() or not any(m in n for m in GROUND_TRUTH)}
-    return [name for name in wanted if name in needed and _sha256(folder / name) != wanted[name]]
-
-
-def _sha256(path: Path) -> str | None:
-    """SHA-256 of a file's content; None if it cannot be read."""
-    import pooch
-
-    try:
-        return pooch.file_hash(str(path))
-    except OSError:
-        return None
+    return [
+        name for name in wanted if name in needed and file_sha256(folder / name) != wanted[name]
+    ]
 
 
 @dataclass(frozen=True)
@@ -138,7 +127,7 @@ def verify(path: str | Path, log: Log) -> VerifyReport:
     inside = (file for file in files if file.resolve().is_relative_to(root))
     present = {file.relative_to(base).as_posix() for file in inside}
     known = sorted(present & expected.keys())
-    digests = in_parallel(_sha256, [base / name for name in known], "verify", log)
+    digests = in_parallel(file_sha256, [base / name for name in known], "verify", log)
     right = {name for name, digest in zip(known, digests, strict=True) if digest == expected[name]}
     return VerifyReport(
         ok=[name for name in known if name in right],

@@ -122,9 +122,6 @@ class Lpips:
         return float(distance.item())
 
 
-_torchvision_operators: torch.library.Library | None = None
-
-
 def _lpips_package() -> ModuleType:
     """Import `lpips`, which needs torchvision only for its network definitions."""
     declare_torchvision()
@@ -138,16 +135,14 @@ def declare_torchvision() -> None:
 
     Two operators are then undeclared. Declaring them is enough for what needs no others.
     """
-    global _torchvision_operators
     try:
         import torchvision  # noqa: F401
     except RuntimeError as error:
         if "operator torchvision::" not in str(error):
             raise
-        _torchvision_operators = torch.library.Library("torchvision", "DEF")
         for name in ("nms", "qnms"):
             arguments = "Tensor dets, Tensor scores, float iou_threshold"
-            _torchvision_operators.define(f"{name}({arguments}) -> Tensor")
+            torch.library.define(f"torchvision::{name}", f"({arguments}) -> Tensor")
 
 
 def check_pair(image: Tensor, reference: Tensor) -> None:

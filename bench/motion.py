@@ -38,6 +38,13 @@ def rotation_between(first: Camera, second: Camera) -> Tensor:
     return rotation_matrix_to_axis_angle(relative[None])[0]
 
 
+def shift_of(target: Tensor, first: Camera, second: Camera) -> float:
+    """By how much the `target` [3] moves in the axes of a camera that goes from `first` to
+    `second`, as an angle in radians: 0 on an orbit, where the camera turns with it."""
+    before, after = (x.c2w[:, :3].double().T @ -_offset(x, target) for x in (first, second))
+    return math.atan2((after - before).norm().item(), before.norm().item())
+
+
 def between(first: Camera, second: Camera, turn: Tensor, share: float) -> Camera:
     """The camera at `share` of the way: rotation at constant speed, everything else linear.
 

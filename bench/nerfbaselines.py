@@ -81,7 +81,7 @@ def write_results(
         lists = {
             theirs: [frame.figures[ours] for frame in frames]
             for theirs, ours in METRICS.items()
-            if all(np.isfinite(frame.figures.get(ours, np.nan)) for frame in frames)
+            if not any(np.isnan(frame.figures.get(ours, np.nan)) for frame in frames)
         }
         results = {
             **rendered,
@@ -106,6 +106,7 @@ def read_results(file: Path) -> tuple[Measurement, dict[str, Any]]:
     """
     file = file.resolve()
     record = read_json(file.parent, file.name)
+    record.pop("metrics", None)  # means, of which one perfect frame makes the PSNR infinite
     try:
         json.dumps(record, allow_nan=False)
     except ValueError as error:

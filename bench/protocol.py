@@ -37,8 +37,6 @@ CHOICES = {
 
 COLUMNS = ("flip", *video_metrics.NEEDS)  # further metrics that a protocol can name
 
-_named: set[str] = set()  # reasons why figures are missing that this process has logged
-
 
 @dataclass(frozen=True)
 class EvaluationProtocol:
@@ -133,7 +131,7 @@ class EvaluationProtocol:
     def load_lpips(
         self, weights_dir: Path | None, log: Log
     ) -> tuple[dict[str, metrics.Lpips], dict[str, str]]:
-        """LPIPS by backbone; by metric, why it is missing, which is also logged once a process.
+        """LPIPS by backbone; by metric, why it is missing, which is also logged.
 
         Raises Unavailable if a further column needs a package that is not installed.
         """
@@ -146,10 +144,8 @@ class EvaluationProtocol:
             try:
                 loaded[net] = metrics.Lpips(net, weights_dir, log)
             except Unavailable as error:
-                reason = missing[f"lpips_{net}"] = str(error)
-                if reason not in _named:
-                    _named.add(reason)
-                    log.info(f"lpips_{net}: n/a. {reason}")
+                missing[f"lpips_{net}"] = str(error)
+                log.info(f"lpips_{net}: n/a. {error}")
         return loaded, missing
 
     def rounded(self, rgb: Tensor) -> Tensor:

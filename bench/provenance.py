@@ -23,7 +23,6 @@ from bench.errors import SteerbenchError
 
 ROOT = Path(__file__).resolve().parent.parent
 OURS = ("bench", "methods")
-WEIGHTS = "*.safetensors"
 CHECKS = ("cases.py", "experiments.py")  # the checks of their folder, which affect no results
 
 CPU_MARKS = ("cpu family", "model", "CPU implementer", "CPU part")
@@ -80,13 +79,16 @@ def digest(*things: Any) -> str:
     total = hashlib.sha256()
     for name, path in sorted(sources(*things).items()):
         content = sha256(path)
-        if _first.setdefault(path, content) != content:
+        if _loaded(path) != content:
             raise SteerbenchError(f"{name} was changed while this process runs: start it again")
         total.update(f"{name} {content}\n".encode())
     return total.hexdigest()
 
 
-_first: dict[Path, str] = {}  # the first hash that this process took of each file
+@cache
+def _loaded(path: Path) -> str:
+    """SHA-256 of a file of code as this process has loaded it: as it was when first asked for."""
+    return sha256(path)
 
 
 def sha256(path: Path) -> str:
@@ -117,29 +119,11 @@ def sources(*things: Any) -> dict[str, Path]:
     """The files that decide what `things` (classes or functions) compute.
 
     In this project: the module that defines each thing, and all that it imports, directly or not;
-    packages with all files beside their `__init__`, because backends are loaded by name, and with
-    their weights. For a thing from another project: its whole top-level package, and what that
-    imports from here or from outside any installed distribution. Returns paths by name, which
-    starts at the top-level package.
+    packages with all files beside their `__init__`, because backends are loaded by name. For a
+    thing from another project: its whole top-level package, and what that imports from here or from
+    outside any installed distribution. Returns paths by name, which starts at the top-level
+    package.
     """
-    known = _known.get((ROOT, things))
-    if known is None or _times(known[0]) != known[1]:
-        files = _collected(*things)
-        known = _known[ROOT, things] = files, _times(files)
-    return known[0]
-
-
-_known: dict[tuple[Path, tuple[Any, ...]], tuple[dict[str, Path], list[int]]] = {}
-"""Cache of `sources`, with modification times of the files and their folders: a sweep asks for the
-same things again and again."""
-
-
-def _times(files: dict[str, Path]) -> list[int]:
-    places = {*files.values(), *(path.parent for path in files.values())}
-    return [path.stat().st_mtime_ns if path.exists() else 0 for path in sorted(places)]
-
-
-def _collected(*things: Any) -> dict[str, Path]:
     collected: dict[str, Path] = {}
     seen: set[str] = set()
     pending = {
@@ -183,17 +167,11 @@ def _ours(name: str) -> list[Path]:
     path = ROOT.joinpath(*name.split("."))
     while path != ROOT:
         if (path / "__init__.py").exists():
-            files = [file for file in path.glob("*.py") if file.name not in CHECKS]
-            return files + _weights(path)
+            return [file for file in path.glob("*.py") if file.name not in CHECKS]
         if path.with_suffix(".py").exists():
-            return [path.with_suffix(".py"), *_weights(path.parent)]
+            return [path.with_suffix(".py")]
         path = path.parent
     return []
-
-
-def _weights(folder: Path) -> list[Path]:
-    """Weight files below `folder`; none for a top-level package itself."""
-    return list(folder.rglob(WEIGHTS)) if folder.parent != ROOT else []
 
 
 def _imports(path: Path) -> tuple[str, ...]:

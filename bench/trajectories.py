@@ -22,7 +22,14 @@ from torch import Tensor
 
 from bench.cameras import frame_camera
 from bench.errors import unexpected
-from bench.motion import between, lens_between, preceding, rotation_between, viewing_target
+from bench.motion import (
+    between,
+    lens_between,
+    preceding,
+    rotation_between,
+    shift_of,
+    viewing_target,
+)
 from bench.paths import read_path
 from bench.provenance import sha256
 from bench.scenes.files import whole_number
@@ -102,7 +109,11 @@ def orbit(scene: Scene, split: str = "test", limit: int = 0) -> Trajectory:
 
 
 def smooth(scene: Scene, split: str = "test", degrees: float = 1.0, limit: int = 0) -> Trajectory:
-    """A path through the first `limit` cameras; the frames between them have no ground truth."""
+    """A path through the first `limit` cameras; the frames between them have no ground truth.
+
+    From frame to frame the camera turns by at most `degrees`, and what it looks at moves by no more
+    as the camera sees it: `motion.shift_of`.
+    """
     steps, part = _smooth_steps(scene, split, degrees, limit)
     return Trajectory(f"{split}-smooth{degrees:g}deg{part}", split, tuple(steps))
 
@@ -186,11 +197,12 @@ def _smooth_steps(scene: Scene, split: str, degrees: float, limit: int) -> tuple
     """The steps of the smooth path through the first `limit` cameras, and its name's ending."""
     _check(0 < degrees < math.inf, "degrees", "more than 0", degrees)
     cameras, kept, part = _kept(scene, split, limit)
-    steps = [Step(cameras[0], 0)]
+    target, steps = viewing_target(scene), [Step(cameras[0], 0)]
     for first, second in pairwise(kept):
         turn = rotation_between(cameras[first], cameras[second])
+        angle = max(turn.norm().item(), shift_of(target, cameras[first], cameras[second]))
         # 1e-3: cameras that are `degrees` apart need no frame between them, despite rounding.
-        count = max(math.ceil(math.degrees(turn.norm().item()) / degrees - 1e-3), 1)
+        count = max(math.ceil(math.degrees(angle) / degrees - 1e-3), 1)
         shares = (k / count for k in range(1, count))
         steps += [Step(between(cameras[first], cameras[second], turn, s), None) for s in shares]
         steps.append(Step(cameras[second], second))

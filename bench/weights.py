@@ -5,7 +5,6 @@ They are searched in `weights_dir`, `$STEERBENCH_WEIGHTS` and torch's hub cache,
 
 from __future__ import annotations
 
-import hashlib
 import os
 import pickle
 import re
@@ -14,7 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from bench.download import fetch
+from bench.download import fetch, file_sha256
 from bench.sharing import locked
 from bench.types import Log, SteerbenchError, Unavailable
 
@@ -26,8 +25,6 @@ BACKBONES = {
     "squeeze": ("squeezenet1_1-b8a52dc0.pth", "squeezenet1_1_features.pth"),
 }
 """File names of a backbone: torchvision's own, and one with only its `features.*`."""
-
-_unreachable: list[str] = []  # why a download of weights failed
 
 
 def locate(net: str, weights_dir: Path | None, log: Log) -> Path:
@@ -46,21 +43,18 @@ def locate(net: str, weights_dir: Path | None, log: Log) -> Path:
     for path in (folder / file for folder in folders for file in (features, name)):
         if path.is_file():
             return _verified(path)
-    # After one failure this process gives up: every backbone would wait for the same connection.
-    if not _unreachable:
-        try:
-            cache.mkdir(parents=True, exist_ok=True)
-            with locked(cache / f".{name}.lock", f"waits for another download of {name}", log):
-                path = fetch(ADDRESS + name, cache / name, None, log)
-                try:
-                    return _verified(path)
-                except Unavailable:
-                    path.unlink()
-                    raise
-        except (OSError, SteerbenchError) as error:
-            _unreachable.append(str(error))
-    advice = "name a folder that has it as weights_dir=DIR or in $STEERBENCH_WEIGHTS"
-    raise Unavailable(f"{name} is not on this machine, and {_unreachable[0]}; {advice}")
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+        with locked(cache / f".{name}.lock", f"waits for another download of {name}", log):
+            path = fetch(ADDRESS + name, cache / name, None, log)
+            try:
+                return _verified(path)
+            except Unavailable:
+                path.unlink()
+                raise
+    except (OSError, SteerbenchError) as error:
+        advice = "name a folder that has it as weights_dir=DIR or in $STEERBENCH_WEIGHTS"
+        raise Unavailable(f"{name} is not on this machine, and {error}; {advice}") from error
 
 
 def load_features(net: str, weights_dir: Path | None, log: Log) -> tuple[Path, dict[str, Tensor]]:
@@ -79,16 +73,8 @@ def load_features(net: str, weights_dir: Path | None, log: Log) -> tuple[Path, d
 def _verified(path: Path) -> Path:
     """`path`; raises Unavailable if its name holds a SHA-256 that its content does not match."""
     promised = re.search(r"-([0-9a-f]{8})\.pth$", path.name)
-    if promised and not (got := _sha256(path)).startswith(promised[1]):
+    got = file_sha256(path) if promised else None
+    if promised and not (got or "").startswith(promised[1]):
         said = f"{path}: expected a SHA-256 that begins with {promised[1]}, got {got}"
         raise Unavailable(f"{said}; the file is damaged: delete it and fetch it again")
     return path
-
-
-def _sha256(path: Path) -> str:
-    """SHA-256 of a file, or why it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        return str(error)

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from bench.intervals import half_interval, path_interval
-from reports.comparison import metric_format
+from reports.comparison import shown_as
 from reports.runs import Repeated, Run
 from reports.tables import ABSENT, Table, decimal
 
@@ -31,7 +31,7 @@ would depend on machine and scene. `TIMES` can be compared on one machine only."
 
 @dataclass(frozen=True)
 class Claim:
-    """`metric` grows from each of the `lines` (labels) to the next or, if `alike`, hardly grows.
+    """`metric` grows from each of the `lines` (keys) to the next or, if `alike`, hardly grows.
 
     Differences that are apart by no more than `margin` count as equal: in the unit of the metric,
     or as a factor where figures are compared by their ratio. A finding of the paper `says` in words
@@ -65,14 +65,16 @@ NOT_MEASURED = Gap(math.nan, math.nan, "", False)
 
 @dataclass(frozen=True)
 class Comparison:
-    """A claim about two lines: their gap in the `paper`, nan if it gives none, and `here`."""
+    """A claim about two lines, by their labels: their gap in the `paper`, nan if it gives none, and
+    `here`. It is made in a `table`, with the figures of a `data_set` if that is a further one."""
 
     claim: Claim
     smaller: str
     larger: str
     paper: float
     here: Gap
-    table: str = ""  # where the claim is made; of a further block, also its title after a comma
+    table: str = ""
+    data_set: str = ""
 
     @property
     def verdict(self) -> str:
@@ -105,7 +107,8 @@ class Comparison:
 def compare(
     claim: Claim, lines: Mapping[str, Repeated], published: Mapping[str, float]
 ) -> Iterator[Comparison]:
-    """A claim between all of its neighbours among `lines`; `published` is the paper's metric.
+    """A claim between all of its neighbours among `lines`; `published` is the paper's metric. Both
+    are by key.
 
     Where the paper has the opposite order, on another data set, a claim of growth is turned round.
     Where it gives the metric, but not of both lines, it claims nothing about them.
@@ -117,8 +120,9 @@ def compare(
         if paper < 0 and not claim.alike:
             smaller, larger, paper = larger, smaller, -paper
         if smaller in lines and larger in lines:
-            here = gap(claim.metric, lines[smaller], lines[larger])
-            yield Comparison(claim, smaller, larger, paper, here)
+            one, other = lines[smaller], lines[larger]
+            here = gap(claim.metric, one, other)
+            yield Comparison(claim, one.label, other.label, paper, here)
 
 
 def apart(metric: str, one: float, other: float) -> float:
@@ -217,7 +221,7 @@ def told(metric: str, by: float) -> str:
     if math.isnan(by):
         return ABSENT
     if not _by_ratio(metric):
-        return ("-" if by < 0 else "+") + metric_format(metric)[1](abs(by))
+        return ("-" if by < 0 else "+") + shown_as(metric).write(abs(by))
     factor = math.exp(by)
     if factor < 0.1:
         return f"×{factor:.2g}"
@@ -241,9 +245,8 @@ def finding_table(comparisons: Sequence[Comparison]) -> Table:
 
 def _quantity(each: Comparison) -> str:
     """What a finding is about, on which further data set, in which unit."""
-    data_set = "".join(each.table.partition(",")[1:])
     unit = " (dB)" if each.claim.metric == "psnr" else ""
-    return f"{each.claim.says}{data_set}{unit}"
+    return ", ".join(filter(None, (each.claim.says, each.data_set))) + unit
 
 
 def _figures(each: Comparison) -> tuple[str, str, str]:
@@ -259,9 +262,10 @@ def claim_table(comparisons: Sequence[Comparison]) -> Table:
     lines = []
     for each in comparisons:
         metric = each.claim.metric
-        label = metric_format(metric)[0].rstrip(" ↑↓")
+        label = shown_as(metric).name
         sign = "≈" if each.claim.alike else "<"
-        name = f"{each.table}, {label}: {each.smaller} {sign} {each.larger}"
+        where = ", ".join(filter(None, (each.table, each.data_set, label)))
+        name = f"{where}: {each.smaller} {sign} {each.larger}"
         margin = f"×{each.claim.margin:g}" if _by_ratio(metric) else f"{each.claim.margin:g}"
         figures = (*_figures(each), each.here.over, margin)
         lines.append((name, *figures, each.verdict))

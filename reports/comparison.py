@@ -9,17 +9,17 @@ from functools import partial
 from bench.errors import SteerbenchError
 from bench.rows import UNITS
 from reports.runs import Repeated, Run
-from reports.tables import NOT_AVAILABLE, QUALITY, Table, decimal, megabytes
+from reports.tables import NOT_AVAILABLE, QUALITY, Metric, Table, decimal, megabytes
 
 Write = Callable[[float], str]
 
-COST: dict[str, tuple[str, Write]] = {
-    "frame_ms": ("ms / frame ↓", partial(decimal, decimals=1)),
-    "fps": ("FPS ↑", partial(decimal, decimals=2)),
-    "size_bytes.total": ("model, MB ↓", megabytes),
-    "train_s": ("training, s ↓", partial(decimal, decimals=0)),
+COST = {
+    "frame_ms": Metric("ms / frame", "↓", partial(decimal, decimals=1)),
+    "fps": Metric("FPS", "↑", partial(decimal, decimals=2)),
+    "size_bytes.total": Metric("model, MB", "↓", megabytes),
+    "train_s": Metric("training, s", "↓", partial(decimal, decimals=0)),
 }
-"""Label and format of the columns other than quality metrics."""
+"""The columns other than quality metrics."""
 
 COMMON = ("scene", "resolution", "trajectory", "budget", "protocol", "device")
 """Facts that a heading lists."""
@@ -46,21 +46,15 @@ def comparison(runs: Sequence[Run], failures: Mapping[str, str]) -> Table:
     blank = ("",) * len(metrics)
     lines += [(f"{label}: failed: {reason}", *blank) for label, reason in failures.items()]
     title = f"Comparison: {conditions_of(runs)}" if runs else "Comparison"
-    heads = ("run", *(metric_format(metric)[0] for metric in metrics))
+    heads = ("run", *(shown_as(metric).heading for metric in metrics))
     sources = (*(part.keys for part in parts), *(() for _ in failures))
     return Table(title, heads, tuple(lines), bold=bold, sources=sources)
 
 
-def metric_format(metric: str) -> tuple[str, Write]:
-    """The label of a metric, with unit and an arrow to better values, and its number format.
-
-    Raises SteerbenchError if there is no such metric.
-    """
-    if metric in QUALITY:
-        label, decimals = QUALITY[metric]
-        return label, partial(decimal, decimals=decimals)
-    if metric in COST:
-        return COST[metric]
+def shown_as(metric: str) -> Metric:
+    """How a metric is shown; raises SteerbenchError if there is no such metric."""
+    if known := QUALITY.get(metric) or COST.get(metric):
+        return known
     family, _, rest = metric.partition(".")
     unit = UNITS.get(family)
     if unit is None:
@@ -68,8 +62,9 @@ def metric_format(metric: str) -> tuple[str, Write]:
             f"{metric}: no such metric; expected one as `steerbench results` shows them"
         )
     if unit == "B":
-        return f"{rest or 'peak memory'}, MB ↓", megabytes
-    return f"{rest or family}, {unit} ↓", partial(decimal, decimals=0 if family == "work" else 2)
+        return Metric(f"{rest or 'peak memory'}, MB", "↓", megabytes)
+    decimals = 0 if family == "work" else 2
+    return Metric(f"{rest or family}, {unit}", "↓", partial(decimal, decimals=decimals))
 
 
 def written(line: Repeated, metric: str, write: Write | None = None) -> str | None:
@@ -78,7 +73,7 @@ def written(line: Repeated, metric: str, write: Write | None = None) -> str | No
     Numbers are written by `write`, or in the usual format.
     """
     mean, half = line.mean(metric), line.half(metric)
-    write = write or metric_format(metric)[1]
+    write = write or shown_as(metric).write
     if mean is None:
         return None
     return f"{write(mean)} ± {write(half)}" if half > 0 else write(mean)
@@ -104,10 +99,10 @@ def ranks(lines: Sequence[Repeated], metric: str, write: Write | None = None) ->
     line that is alone under its conditions has no rank, nor has the last of several, so that the
     second of two has none. No line has one in a metric without a better side.
     """
-    label, usual = metric_format(metric)
-    if not label.endswith(("↑", "↓")):
+    shown = shown_as(metric)
+    if not shown.better:
         return {}
-    write = write or usual
+    write = write or shown.write
     known: dict[tuple[object, ...], dict[int, float]] = {}
     for row, line in enumerate(lines):
         mean = line.mean(metric)
@@ -115,7 +110,7 @@ def ranks(lines: Sequence[Repeated], metric: str, write: Write | None = None) ->
             known.setdefault(line.conditions, {})[row] = mean
     places: dict[int, int] = {}
     for figures in known.values():
-        ordered = sorted(figures.values(), reverse=label.endswith("↑"))
+        ordered = sorted(figures.values(), reverse=shown.better == "↑")
         texts = list(dict.fromkeys(map(write, ordered)))
         ranked = {row: texts.index(write(value)) + 1 for row, value in figures.items()}
         places |= {row: place for row, place in ranked.items() if place < len(figures)}

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import pandas as pd
 
-from reports.comparison import conditions_of, marked, metric_format
-from reports.paper_tables import Lines, PaperTable
-from reports.runs import Repeated
+from reports.comparison import conditions_of, marked, shown_as
+from reports.paper_tables import Measured, PaperTable, Shown
 from reports.tables import decimal
 
 DECIMALS = {"ssim": 3, "lpips": 3, "frame": 2, "size": 1}
@@ -31,73 +30,77 @@ ESCAPES = str.maketrans(
     }
 )
 
-SETTING = re.compile(r"[A-Z] = \d+(\^\d+)?")
-"""A label such as "T = 2^19", which is set in math mode."""
+POWER = re.compile(r"\\textasciicircum\{\}(\d+)")  # as `ESCAPES` leaves it
 
 MARKS = (r"\textbf{%s}", r"\underline{%s}")
 """LaTeX for the best and the second-best figure of a column."""
 
 
-def latex(tables: Sequence[PaperTable], measured: Lines) -> str:
+def latex(tables: Sequence[PaperTable], measured: Measured) -> str:
     """All tables as LaTeX, for the package booktabs, with as many decimals as in the paper.
 
     Among figures under the same conditions, the best of a column is bold and, of at least three,
     the second best is underlined; figures that look the same share a rank.
     """
-    return "\n".join(_latex(table, measured.get(table.name, ())) for table in tables)
+    return "\n".join(_latex(table, measured) for table in tables)
 
 
-def _latex(table: PaperTable, lines: Sequence[Repeated]) -> str:
-    known = {line.label: line for line in lines}
-    rows, *beyond = (_rows(block, known) for block in table.shown(known))
-    runs = [run for line in lines for run in line.runs]
-    caption = f"{_escaped(table.title)}. " + (f"{_escaped(conditions_of(runs))}. " if runs else "")
-    text = pd.DataFrame(
-        sum(beyond, rows),
-        columns=["", *(_escaped(metric_format(metric)[0]) for metric in table.metrics)],
-    ).to_latex(
-        index=False,
-        column_format="l" + "r" * len(table.metrics),
-        caption=caption.strip(),
-        label=f"tab:{table.name}",
+def _latex(table: PaperTable, measured: Measured) -> str:
+    blocks = table.shown(measured)
+    runs = [run for block in blocks for _, line in block.lines.values() for run in line.runs]
+    caption = f"{_escaped(table.title)}. " + (f"{_escaped(conditions_of(runs))}." if runs else "")
+    heads = ["", *(_escaped(shown_as(metric).heading) for metric in table.metrics)]
+    parts = ([heads], *map(_rows, blocks))
+    rows = ("\n".join(" & ".join(row) + r" \\" for row in part) for part in parts)
+    return "\n".join(
+        (
+            r"\begin{table}",
+            rf"\caption{{{caption.strip()}}}",
+            rf"\label{{tab:{table.name}}}",
+            rf"\begin{{tabular}}{{l{'r' * len(table.metrics)}}}",
+            r"\toprule",
+            "\n\\midrule\n".join(rows),
+            r"\bottomrule",
+            r"\end{tabular}",
+            "\\end{table}\n",
+        )
     )
-    for further in beyond:  # a rule before the lines beyond the paper
-        first = " & ".join(further[0])
-        text = text.replace(first, f"\\midrule\n{first}", 1)
-    return text
 
 
-def _rows(block: PaperTable, known: Mapping[str, Repeated]) -> list[list[str]]:
-    lines = block.measured(known)
-    columns = [marked(lines, metric, MARKS, partial(_written, metric)) for metric in block.metrics]
+def _rows(block: Shown) -> list[list[str]]:
+    """The cells of a block; labels of a further one also have its data set."""
+    metrics, lines = block.table.metrics, [line for _, line in block.lines.values()]
+    columns = [marked(lines, metric, MARKS, partial(_written, metric)) for metric in metrics]
+    where = f" ({block.title})" if block.title else ""
     return [
-        [_escaped(line.label), *((text or "--").replace("±", r"$\pm$") for text in row)]
+        [_escaped(line.label + where), *((text or "--").replace("±", r"$\pm$") for text in row)]
         for line, *row in zip(lines, *columns, strict=True)
     ]
 
 
-def csv(tables: Sequence[PaperTable], measured: Lines) -> str:
+def csv(tables: Sequence[PaperTable], measured: Measured) -> str:
     """All tables as CSV, one figure per row, in the units of `steerbench results`.
 
     A row has the measured mean, the number of runs, half the 95 % interval, and the paper's figure.
+    Lines have their keys and labels; of a table's further blocks, also the data set.
     """
-    rows = []
-    for table in tables:
-        known = {line.label: line for line in measured.get(table.name, ())}
-        for block in table.shown(known):
-            for line, found in zip(block.lines, block.measured(known), strict=True):
-                rows += [
-                    {
-                        "table": table.name,
-                        "line": line.label,
-                        "metric": metric,
-                        "measured": found.mean(metric),
-                        "half_interval": found.half(metric),
-                        "runs": len(found.runs),
-                        "published": line.published.get(metric),
-                    }
-                    for metric in table.metrics
-                ]
+    rows = [
+        {
+            "table": table.name,
+            "data_set": block.title,
+            "line": key,
+            "label": line.label,
+            "metric": metric,
+            "measured": found.mean(metric),
+            "half_interval": found.half(metric),
+            "runs": len(found.runs),
+            "published": line.published.get(metric),
+        }
+        for table in tables
+        for block in table.shown(measured)
+        for key, (line, found) in block.lines.items()
+        for metric in table.metrics
+    ]
     return pd.DataFrame(rows).to_csv(index=False)
 
 
@@ -105,11 +108,10 @@ def _written(metric: str, value: float) -> str:
     """A figure with the paper's number of decimals, sizes in MB."""
     family = re.split(r"[._]", metric)[0]
     if family not in DECIMALS:
-        return metric_format(metric)[1](value)
+        return shown_as(metric).write(value)
     return decimal(value / 1e6 if family == "size" else value, DECIMALS[family])
 
 
 def _escaped(text: str) -> str:
-    if SETTING.fullmatch(text):
-        return "$" + re.sub(r"\^(\d+)", r"^{\1}", text) + "$"
-    return text.translate(ESCAPES)
+    """For LaTeX; powers of numbers are set in math mode."""
+    return POWER.sub(r"$^{\1}$", text.translate(ESCAPES))

@@ -1,6 +1,6 @@
 """Writes the page about the paper's tables: measured and published figures, trends, pictures.
 
-Its texts, and the lines that its plots and images show, are in `paper/page.yaml`.
+Its texts, and which lines its plots and images show, are in `paper/page.yaml`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,17 @@ from reports import figures
 from reports.claims import NOT_MEASURED, Comparison, claim_table, finding_table
 from reports.images import Part, Picture, frame_section, kept_frames
 from reports.outliers import Outlier, outlier_table
-from reports.paper_tables import METHOD, SHARES, Lines, PaperTable, comparisons, conditions, section
+from reports.paper_tables import (
+    CURVES,
+    SHARES,
+    Measured,
+    PaperTable,
+    Place,
+    comparisons,
+    conditions,
+    point,
+    section,
+)
 from reports.publish import publish
 from reports.runs import Repeated, Run
 
@@ -26,39 +36,44 @@ PAGE: Any = OmegaConf.to_container(OmegaConf.load(Path(__file__).parent / "paper
 
 def write_paper_page(
     tables: Sequence[PaperTable],
-    lines: Lines,
+    measured: Measured,
     found: Sequence[Outlier],
     folder: Path,
     missing: Mapping[str, str] = {},
 ) -> Path:
     """Write `folder/report.md` with its pictures, and the same as `report.html`; return the former.
 
-    The page shows `tables` in this order, with the `lines` that were measured, and the outliers
-    `found` among their runs; `missing` says why scenes are left out, by name. Raises
-    SteerbenchError if `folder` cannot be written to.
+    The page shows `tables` in this order, with what was `measured`, and the outliers `found` among
+    their runs; `missing` says why scenes are left out, by name. Raises SteerbenchError if `folder`
+    cannot be written to.
     """
-    measured = (run for of in lines.values() for line in of for run in line.measured)
-    runs = list({run.key: run for run in measured}.values())
+    runs = list({run.key: run for line in measured.values() for run in line.measured}.values())
     left_out = "\n".join(f"- missing: {name}: {why}" for name, why in missing.items())
     listed = outlier_table(found, runs)
     flagged: list[Part] = [f"## {listed.title}", listed] if listed.lines else []
     sources = "\n".join(f"{run.key}  {run.record['command']}" for run in runs)
-    compared = [x for table in tables for x in comparisons(table, lines.get(table.name, ()))]
+    compared = [each for table in tables for each in comparisons(table, measured)]
     if all(each.here is NOT_MEASURED for each in compared):
         compared = []
     every: list[Part] = [f"## {PAGE['comparisons']}", claim_table(compared)] if compared else []
+    of_paper = any(table.number is not None for table in tables)
+    title = PAGE["title"] if of_paper else ", ".join(table.title for table in tables)
+    published = any(line.published for table in tables for line in table.lines.values())
+    reading = [PAGE["distances"].strip()] if published else []
     facts = conditions(runs).items() if runs else ()
     said = {name: value for name, value in facts if " / " not in value}  # once for all tables
     parts: list[Part] = [
-        f"# {PAGE['title']}",
+        f"# {title}",
         *_conclusions(compared),
         *([f"## Scenes that are left out\n\n{left_out}"] if left_out else []),
         *flagged,
-        f"## The tables\n\n{PAGE['reading'].strip()}",
+        "## The tables",
+        *reading,
+        PAGE["reading"].strip(),
         *([f"Measured: {', '.join(map(' '.join, said.items()))}."] if said else []),
-        *(part for table in tables for part in section(table, lines.get(table.name, ()), said)),
-        *(part for plot in PAGE["plots"] for part in _plot(plot, tables, lines)),
-        *(part for images in PAGE["images"] for part in _images(images, lines)),
+        *(part for table in tables for part in section(table, measured, said)),
+        *(part for plot in PAGE["plots"] for part in _plot(plot, tables, measured)),
+        *(part for images in PAGE["images"] for part in _images(images, tables, measured)),
         *every,
         f"## Runs\n\nTheir keys in the store, and the commands:\n\n```\n{sources}\n```",
     ]
@@ -73,22 +88,24 @@ def _conclusions(found: Sequence[Comparison]) -> Iterator[Part]:
         yield PAGE["verdicts"].format(sampled=sampled, count=len(found)).strip()
 
 
-def _plot(plot: Mapping[str, Any], tables: Sequence[PaperTable], lines: Lines) -> Iterator[Part]:
+def _plot(
+    plot: Mapping[str, Any], tables: Sequence[PaperTable], measured: Measured
+) -> Iterator[Part]:
     """A plot with heading and caption, if any of its lines was measured."""
-    some: Sequence[Any] = _chosen(plot.get("lines", {}), lines)
+    some: Sequence[Any] = _chosen(plot.get("lines", {}), tables, measured)
     if "metric" in plot:
-        every = ((table.name, line) for table in tables for line in table.lines)
-        added = {x.label: (name, x.label) for name, x in every if x.job == {METHOD: x.label}}
-        some = [*some, *_chosen(added, lines)]
+        every = ((table, key, line) for table in tables for key, line in table.lines.items())
+        added = {line.label: (table.name, key) for table, key, line in every if line.added}
+        some = [*some, *_chosen(added, tables, measured)]
         drawn = figures.quality_plot(some, plot["metric"])
     elif "lines" in plot:
         some = _first_runs(some, one_scene=plot.get("one_scene", False))
         draw = partial(getattr(figures, plot["draw"]), some)
         drawn = Picture(plot["file"], plot["title"], draw)
     else:
-        some = [curve for table in tables for curve in _curves(table, lines)]
+        some = [curve for table in tables if table.curve for curve in _curves(table, measured)]
         views = {line.runs[0].views for curve in some for line in curve.points.values()}
-        fields = _chosen({"": plot["ceiling"]}, lines)
+        fields = _chosen({"": plot["ceiling"]}, tables, measured)
         ceiling = next((line for line in fields if line.runs[0].views in views), None)
         draw = partial(figures.quality_over_training, some, ceiling)
         drawn = Picture(plot["file"], plot["title"], draw)
@@ -96,13 +113,12 @@ def _plot(plot: Mapping[str, Any], tables: Sequence[PaperTable], lines: Lines) -
         yield from (f"## {plot['title']}", drawn, plot["caption"].strip())
 
 
-def _curves(table: PaperTable, lines: Lines) -> Iterator[figures.Curve]:
-    """The measured lines of `table` over the course of their training, if it has curves."""
-    measured = {line.label: line for line in lines.get(table.name, ()) if line.runs}
-    for line in table.lines if table.curve else ():
-        labels = {share: table.marks[line.label, share].label for share in SHARES}
-        labels[1.0] = line.label
-        marks = {share: measured[label] for share, label in labels.items() if label in measured}
+def _curves(table: PaperTable, measured: Measured) -> Iterator[figures.Curve]:
+    """The measured lines of `table` over the course of their training."""
+    for key, line in table.lines.items():
+        of_shares = {x: measured.get(Place(table.name, CURVES, point(key, x))) for x in SHARES}
+        of_shares[1.0] = table.measured(key, measured)
+        marks = {share: mark for share, mark in of_shares.items() if mark and mark.runs}
         seeds = [{run.facts["seed"] for run in mark.runs} for mark in marks.values()]
         common = set.intersection(*seeds) if len(seeds) > 1 else set()  # of the same trainings
         points = {}
@@ -110,7 +126,7 @@ def _curves(table: PaperTable, lines: Lines) -> Iterator[figures.Curve]:
             runs = [run for run in mark.runs if run.facts["seed"] in common]
             points[_steps(runs[0]) * share] = replace(mark, runs=runs)
         if points:
-            yield figures.Curve(table.number, line.label, points)
+            yield figures.Curve(table.called, line.label, points)
 
 
 def _steps(run: Run) -> Any:
@@ -119,8 +135,10 @@ def _steps(run: Run) -> Any:
     return method.get("steps") or run.record["budget"]["renderer_steps"]
 
 
-def _images(images: Mapping[str, Any], lines: Lines) -> Iterator[Part]:
-    runs = _first_runs(_chosen(images["lines"], lines), one_scene=True)
+def _images(
+    images: Mapping[str, Any], tables: Sequence[PaperTable], measured: Measured
+) -> Iterator[Part]:
+    runs = _first_runs(_chosen(images["lines"], tables, measured), one_scene=True)
     runs = [run for run in runs if run.views == runs[0].views]
     if runs and (frames := kept_frames(runs)):
         title, stem = images["title"], f"frames-{images['title'].lower()}"
@@ -128,15 +146,17 @@ def _images(images: Mapping[str, Any], lines: Lines) -> Iterator[Part]:
         yield from frame_section(runs, frames[len(frames) // 2], stem)
 
 
-def _chosen(wanted: Mapping[str, Sequence[str]], lines: Lines) -> list[Repeated]:
-    """The measured lines in `wanted`: by their label here, a table and the first line of it that
-    was measured."""
-    known = {(table, line.label): line for table in lines for line in lines[table] if line.runs}
-    found = (
-        (label, next((known[table, x] for x in labels if (table, x) in known), None))
-        for label, (table, *labels) in wanted.items()
-    )
-    return [replace(line, label=label) for label, line in found if line]
+def _chosen(
+    wanted: Mapping[str, Sequence[str]], tables: Sequence[PaperTable], measured: Measured
+) -> list[Repeated]:
+    """The measured lines in `wanted`: by their label here, a table and the keys of its lines, of
+    which the first that was measured counts."""
+    known = {table.name: table for table in tables}
+    chosen = []
+    for label, (name, *keys) in wanted.items():
+        lines = [known[name].measured(str(key), measured) for key in keys if name in known]
+        chosen += [replace(line, label=label) for line in lines if line and line.runs][:1]
+    return chosen
 
 
 def _first_runs(lines: Sequence[Repeated], one_scene: bool) -> list[Run]:

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import pandas as pd
 
@@ -19,22 +21,20 @@ ABSENT = "–"  # of a figure that the paper does not give or that cannot be mea
 EMPTY = ("", ABSENT, NOT_AVAILABLE)
 DENSE = ".dense"  # suffix of a work counter for the work of a method that skips nothing
 
-QUALITY = {
-    "psnr": ("PSNR, dB ↑", 2),
-    "ssim": ("SSIM ↑", 4),
-    "lpips_alex": ("LPIPS alex ↓", 4),
-    "lpips_vgg": ("LPIPS vgg ↓", 4),
-    "lpips_squeeze": ("LPIPS squeeze ↓", 4),
-    "flip": ("FLIP ↓", 4),
-    "flicker": ("flicker ↓", 4),
-    "tpsnr": ("tPSNR, dB ↑", 2),
-    **{f"tlpips_{net}": (f"tLPIPS {net} ↓", 4) for net in ("alex", "vgg", "squeeze")},
-    **{f"warp_{k}": (f"warping error, {k} apart ↓", 5) for k in (1, 7)},
-    **{f"warp_{k}_true": (f"warping error of the truth, {k} apart", 5) for k in (1, 7)},
-    **{f"warp_{k}_own": (f"warping error, {k} apart, own depth ↓", 5) for k in (1, 7)},
-    "jod": ("JOD ↑", 3),
-}
-"""Label and decimals of each quality metric. The arrow points to better values."""
+
+@dataclass(frozen=True)
+class Metric:
+    """How a metric is shown: its `name` with the unit, an arrow to `better` values, "" if neither
+    is, and how its figures are written."""
+
+    name: str
+    better: str
+    write: Callable[[float], str]
+
+    @property
+    def heading(self) -> str:
+        """The head of its column."""
+        return f"{self.name} {self.better}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,9 @@ class Table:
         return "\n".join((head, f"|{'|'.join(rules)}|", *lines))
 
 
-def spread(low: float, high: float, decimals: int = 1) -> str:
-    """The ends of a range, each with this number of `decimals`."""
-    return f"{decimal(low, decimals)} – {decimal(high, decimals)}"
+def spread(low: float, high: float) -> str:
+    """The ends of a range."""
+    return f"{decimal(low, 1)} – {decimal(high, 1)}"
 
 
 def decimal(value: float | None, decimals: int) -> str:
@@ -87,6 +87,27 @@ def amount(value: float) -> str:
         if value >= size:
             return f"{decimal(value / size, 2)} {letter}"
     return decimal(value, 0)
+
+
+QUALITY = {
+    metric: Metric(name, better, partial(decimal, decimals=decimals))
+    for metric, (name, better, decimals) in {
+        "psnr": ("PSNR, dB", "↑", 2),
+        "ssim": ("SSIM", "↑", 4),
+        "lpips_alex": ("LPIPS alex", "↓", 4),
+        "lpips_vgg": ("LPIPS vgg", "↓", 4),
+        "lpips_squeeze": ("LPIPS squeeze", "↓", 4),
+        "flip": ("FLIP", "↓", 4),
+        "flicker": ("flicker", "↓", 4),
+        "tpsnr": ("tPSNR, dB", "↑", 2),
+        **{f"tlpips_{net}": (f"tLPIPS {net}", "↓", 4) for net in ("alex", "vgg", "squeeze")},
+        **{f"warp_{k}": (f"warping error, {k} apart", "↓", 5) for k in (1, 7)},
+        **{f"warp_{k}_true": (f"warping error of the truth, {k} apart", "", 5) for k in (1, 7)},
+        **{f"warp_{k}_own": (f"warping error, {k} apart, own depth", "↓", 5) for k in (1, 7)},
+        "jod": ("JOD", "↑", 3),
+    }.items()
+}
+"""The quality metrics."""
 
 
 def megabytes(size: float | None) -> str:
@@ -133,11 +154,11 @@ def _quality(rows: pd.DataFrame, suffix: str) -> Table:
     columns = (rows[name] for name in ("metric", "value", "lo", "hi", "n"))
     figures = {metric: of for metric, *of in zip(*columns, strict=True)}
     lines = []
-    for metric, (label, decimals) in QUALITY.items():
+    for metric, shown in QUALITY.items():
         if metric in figures:
             value, low, high, _ = figures[metric]
-            interval = spread(low, high, decimals) if math.isfinite(low) else ""
-            lines.append((label, decimal(value, decimals), interval))
+            interval = " – ".join(map(shown.write, (low, high))) if math.isfinite(low) else ""
+            lines.append((shown.heading, shown.write(value), interval))
     title = f"Quality{suffix}, mean of {figures['psnr'][-1]} frames"
     return Table(title, ("metric", "mean", "95 % interval"), tuple(lines))
 

@@ -106,6 +106,12 @@ def setting(name: str, text: str) -> str:
     return f"{name}='{escaped}'"
 
 
+def unquoted(text: str) -> str:
+    """What a value means that `setting` has quoted, or that is typed in quotes inside quotes."""
+    quoted = re.fullmatch(r"(['\"])(.*)\1", text)
+    return quoted[2].replace(f"\\{quoted[1]}", quoted[1]) if quoted else text
+
+
 def of_hydra(error: Exception) -> bool:
     """Whether the error comes from Hydra.
 

@@ -1,95 +1,63 @@
-"""The jobs of the tables of the paper, and the scenes of a data set that they are means over."""
+"""The jobs of tables."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
 from pathlib import Path
+from typing import NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
-from bench.errors import SteerbenchError, Unavailable, unexpected, unknown
-from bench.scenes.blender import camera_file, picture_path
-from bench.scenes.files import data_folder, frames_of, read_json
-from bench.scenes.nsvf import picture_files
-from reports.paper_tables import DATA_SETS, FIRST, METHOD, Line, PaperTable, paper_tables
+from bench.errors import SteerbenchError, Unavailable, unexpected
+from reports.paper_tables import CURVES, METHOD, SHARES, Line, PaperTable, point
 from sweeps.configured import build
+from sweeps.data_sets import DataSet, data_set_of
 from sweeps.measurement import Job
-from sweeps.overrides import CONFIGS, changed, choices, composed, setting, swept, target_of
+from sweeps.overrides import changed, choices, composed, setting, swept, target_of, unquoted
 from sweeps.processes import on_gpu
+from sweeps.tables import SEED, grid
 
-TABLES = CONFIGS / "experiment"  # the folder of the experiments that declare the tables
-
-MARKS = {"blender": camera_file("train"), "nsvf": "bbox.txt"}
-"""The file by which a scene's layout is recognised, by the value of `scene=` that reads it."""
-
-
-@dataclass(frozen=True)
-class DataSet:
-    """Scenes of one layout: NeRF-Synthetic, or Tanks & Temples in NSVF's layout.
-
-    `layout` is the value of `scene=` that reads them. By name: the folders of the `scenes`, and why
-    others are `missing`.
-    """
-
-    layout: str
-    scenes: Mapping[str, Path]
-    missing: Mapping[str, str]
+AFTER = "method.after"  # the setting for the share of its training that a method is rendered after
+OF_CURVES = {"protocol.name": "psnr", "protocol.lpips": "[]"}
+"""Curves need only PSNR; LPIPS would take most of a frame's time."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Planned(Job):
-    """A job of a table: `line` is what it fills, `block` the title of the lines beside it.
+    """A job of a table, for a line of one of its blocks; both are named by their keys.
 
-    `scene` is its scene in a data set, empty without a data set.
+    `label` is what the line is shown as.
     """
 
     table: str
     block: str
     line: str
-    scene: str = ""
+    label: str
 
 
-def chosen(
-    name: str | None, methods: Sequence[str], data_sets: Sequence[str] = (FIRST,)
-) -> list[PaperTable]:
-    """The table called `name`, or all, with the paper's figures on `data_sets`; `methods` get extra
-    lines in the table of methods."""
-    tables = {table.name: table for table in paper_tables(TABLES, data_sets)}
-    if name is not None and name not in tables:
-        raise unknown("table", name, tables)
-    wanted = [tables[name]] if name else list(tables.values())
-    of_methods = [any(METHOD in line.job for line in table.lines) for table in wanted]
-    if methods and not any(of_methods):
-        raise SteerbenchError(f"--with: {name} compares no methods; table1 does")
-    further = [Line(method, {METHOD: method}) for method in methods]
-    return [
-        replace(table, lines=[*table.lines, *further]) if compares else table
-        for table, compares in zip(wanted, of_methods, strict=True)
-    ]
-
-
-def repeats(seeds: int, beyond: bool) -> tuple[int, bool]:
-    """How much of the tables is measured: `tables` in run.yaml, which explains both."""
+def repeats(seeds: int) -> int:
+    """How much of the tables is measured: `tables` in run.yaml, which explains it."""
     if seeds < 1:
         raise ValueError(f"seeds: expected 1 or more, got {seeds}")
-    return seeds, beyond
+    return seeds
 
 
 def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -> list[Planned]:
     """The jobs of `table` under the settings in `words`, for each line, seed and scene.
 
     Scenes are those of `data` or in `words`; each goes to the blocks with figures of its data set.
-    Seeds are those in `words`, otherwise the first `tables.seeds`; methods other than the paper's
-    use only one of them, but for lines with `every_seed`. Settings that a line lacks are those of
-    the experiment. Lines at a precision that the engine lacks are left out. On a GPU the engine is
-    torch; one that `words` choose is that of all lines. SteerbenchError if a word gives several
-    values to another setting than scene and seed.
+    Seeds are those in `words`, otherwise those of the experiment's grid, otherwise the first
+    `tables.seeds`, of which lines with a method of their own use only one, but for lines with
+    `every_seed`. Settings that a line lacks are those of the experiment. Lines at a precision that
+    the engine lacks are left out. On a GPU the engine is torch; one that `words` choose is that of
+    all lines. SteerbenchError if a word gives several values to another setting than these two.
     """
     scenes = scenes_of(words, data)
-    words, seeds = _taken(words, "seed")
+    words, seeds = _taken(words, SEED)
+    seeds = seeds or grid(table.name, words).get(SEED, [])
     single = data is None and len(scenes) == 1
     words = words if single else _taken(words, "scene")[0]
     fixed = [f"+experiment={table.name}", *words, *([f"scene={data.layout}"] if data else [])]
@@ -99,7 +67,7 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
         fixed[1:1] = replaced
         experiment = composed([*fixed, *first])
     build(experiment, "budget")  # refuses a wrong one before anything runs
-    several, beyond = build(experiment, "tables")
+    several = build(experiment, "tables")
     asked = {"engine"} if any(word.startswith("engine=") for word in words) else set()
     usual = [str(seed) for seed in range(several)]
     precisions = target_of(experiment.engine).precisions
@@ -109,20 +77,22 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
         return composed([*fixed, *groups])
 
     jobs = []
-    lines = list(_lines(table, beyond))
-    if not precisions and any("precision" in line.job for _, _, line, _ in lines):
+    wanted = list(_wanted(table))
+    if not precisions and any("precision" in each.line.job for each in wanted):
         raise SteerbenchError(
             f"engine: {table.name} has lines at several precisions, and this engine chooses one"
         )
-    for title, block, line, repeated in lines:
+    for each in wanted:
+        line = each.line
         if "precision" in line.job and line.job["precision"] not in precisions:
             continue
         own_settings = {name: of for name, of in line.job.items() if name not in asked}
         settings = [f"{name}={value}" for name, value in own_settings.items()]
         groups = [word for word in settings if choices(word.partition("=")[0], fixed)]
         values = [word for word in settings if word not in groups]
+        repeated = line.every_seed or METHOD not in line.job
         of_line = seeds or (usual if repeated else usual[:1])
-        of_block = [name for name in scenes if block.data_set in (data_set_of(name), "")]
+        of_block = [name for name in scenes if each.data_set in (data_set_of(name), "")]
         for seed, name in product(of_line, of_block):
             scene = "" if single else name
             place = [] if single or data else [f"scene={name}"]
@@ -137,9 +107,9 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
             parts = (f"{table.name}: {line.label}", scene, f"seed {config.seed}")
             told = ", ".join(filter(None, parts))
             where_timed = Path(config.scene.get("path") or config.scene.get("name", "")).name
-            turns = f"{table.name}, {seed}, {where_timed}" if block.in_turns else ""
-            where = {"table": table.name, "block": title, "line": line.label, "scene": scene}
-            jobs.append(Planned(config, command, told, turns, **where))
+            turns = f"{table.name}, {seed}, {where_timed}" if each.in_turns else ""
+            where = {"table": table.name, "block": each.block, "line": each.key, "scene": scene}
+            jobs.append(Planned(config, command, told, turns, label=line.label, **where))
     return jobs
 
 
@@ -157,18 +127,25 @@ def _engine_here(experiment: DictConfig) -> list[str]:
     return []
 
 
-def _lines(table: PaperTable, beyond: bool) -> Iterator[tuple[str, PaperTable, Line, bool]]:
-    """The lines of a table's blocks and curves, each with its block and whether it repeats.
+class _Wanted(NamedTuple):
+    """A line with its key, in a block of a table whose figures are of a data set."""
 
-    Only lines of the paper's method are repeated with several seeds, because the paper's
-    conclusions are about it, and those that it is trained from. A table that varies the training
-    omits the method beyond the paper unless `beyond`.
-    """
-    for block in table.blocks if beyond or not table.curve else [table, *table.beside]:
-        for line in block.lines:
-            yield block.title, block, line, line.every_seed or METHOD not in line.job
-    curves = replace(table, in_turns=False)  # they are not timed
-    yield from (("curves", curves, line, True) for line in table.marks.values())
+    block: str
+    key: str
+    line: Line
+    data_set: str
+    in_turns: bool
+
+
+def _wanted(table: PaperTable) -> Iterator[_Wanted]:
+    """The lines of a table's blocks, then the points of its curves, which are not timed."""
+    for block in table.blocks:
+        for key, line in block.lines.items():
+            yield _Wanted(block.data_set, key, line, block.data_set, table.in_turns)
+    for (key, line), share in product(table.lines.items(), SHARES if table.curve else ()):
+        job = {**line.job, AFTER: str(share), **OF_CURVES}
+        mark = replace(line, label=f"{line.label}, after {share}", job=job)
+        yield _Wanted(CURVES, point(key, share), mark, table.blocks[0].data_set, False)
 
 
 def scenes_of(words: Sequence[str], data: DataSet | None = None) -> list[str]:
@@ -178,19 +155,7 @@ def scenes_of(words: Sequence[str], data: DataSet | None = None) -> list[str]:
     folders = [
         word.partition("=")[2] for word in words if word.lstrip("+").startswith("scene.path=")
     ]
-    return [Path(folders[-1].strip("'\"")).name] if folders else _taken(words, "scene")[1] or [""]
-
-
-def data_set_of(scene: str) -> str:
-    """The data set of the paper whose figures a scene is compared with."""
-    wanted = (name for name, of in DATA_SETS.items() if scene in (*of["scenes"], *of["stand_ins"]))
-    return next(wanted, FIRST)
-
-
-def data_sets(scenes: Sequence[str]) -> list[str]:
-    """The data sets of `scenes`, in the paper's order."""
-    there = {data_set_of(scene) for scene in scenes}
-    return [name for name in DATA_SETS if name in there]
+    return [Path(unquoted(folders[-1])).name] if folders else _taken(words, "scene")[1] or [""]
 
 
 def _taken(words: Sequence[str], name: str) -> tuple[list[str], list[str]]:
@@ -205,50 +170,3 @@ def _taken(words: Sequence[str], name: str) -> tuple[list[str], list[str]]:
     named = [word for word in words if word.lstrip("+").partition("=")[0] == name]
     values = several.get(name) or [word.partition("=")[2] for word in named[-1:]]
     return [word for word in words if word not in named], list(dict.fromkeys(values))
-
-
-def find(path: str) -> DataSet:
-    """Every scene in a subfolder of `path` that has its pictures; SteerbenchError if there is none,
-    or there are scenes of both layouts."""
-    root = data_folder(path)
-    folders = {folder.name: folder for folder in sorted(root.iterdir()) if folder.is_dir()}
-    layouts = {
-        name: layout
-        for layout, mark in MARKS.items()
-        for name, folder in folders.items()
-        if (folder / mark).is_file()
-    }
-    known = [set(of["scenes"]) for of in DATA_SETS.values()]
-    wanted: set[str] = next((names for names in known if names & folders.keys()), set())
-    no_cameras = f"no {' or '.join(MARKS.values())}"
-    why = {name: no_cameras if name in folders else "no folder" for name in wanted - layouts.keys()}
-    why |= {name: _lack(folders[name], layout) for name, layout in layouts.items()}
-    missing = {name: lack for name, lack in sorted(why.items()) if lack}
-    whole = {name: folders[name] for name in sorted(layouts) if name not in missing}
-    used = {layouts[name] for name in whole}
-    if len(used) != 1:
-        got = f"scenes of both: {', '.join(whole)}" if used else "none"
-        reasons = "".join(f"; {name}: {lack}" for name, lack in missing.items())
-        raise SteerbenchError(
-            f"data={path}: expected folders of scenes in the layout of NeRF-Synthetic or in NSVF's,"
-            f" got {got}{reasons}; of a single scene the folder is scene.path"
-        )
-    return DataSet(used.pop(), whole, missing)
-
-
-def _lack(folder: Path, layout: str) -> str:
-    """Which pictures a scene lacks, judged by file names; empty if none."""
-    root = data_folder(folder)
-    try:
-        if layout == "nsvf":
-            files = picture_files(root)
-        else:  # those named in the camera files
-            names = [root / camera_file(split) for split in ("train", "test")]
-            frames = [one for path in names for one in frames_of(read_json(root, path.name), path)]
-            files = [picture_path(root, frame["file_path"], where) for where, frame in frames]
-    except SteerbenchError as error:
-        return str(error)
-    absent = [file for file in files if not file.is_file()]
-    if len(absent) == len(files):
-        return "no pictures"
-    return f"{len(absent)} of {len(files)} pictures are not there" if absent else ""

@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from bench.errors import SteerbenchError, unknown
 from bench.study import Axis, Study, Variant, study_of
 from reports.studies import StudyLine
+from sweeps import tables
 from sweeps.configured import build
 from sweeps.measurement import Job
 from sweeps.overrides import (
@@ -87,29 +88,12 @@ class Subject:
 
     def axes(self) -> dict[str, Axis]:
         """What tables vary of the method, and what it declares itself."""
-        return {**table_axes(self.name), **self.study.axes}
+        return {**tables.axes(self.name), **self.study.axes}
 
     def lines(self, group: str, variants: Sequence[Variant], **more: Any) -> Iterator[StudyLine]:
         """The lines of a group."""
         for each in variants:
             yield StudyLine(self.name, group, each.name, each.settings, **more)
-
-
-def table_axes(method: str) -> dict[str, Axis]:
-    """The settings of `method` that tables of the paper vary, by the name of the axis."""
-    axes = {}
-    for path in sorted((CONFIGS / "experiment").glob("table*.yaml")):
-        experiment: Any = OmegaConf.to_container(OmegaConf.load(path))
-        if {"override /method": method} not in experiment["defaults"]:
-            continue
-        grid = experiment["hydra"]["sweeper"]["params"]
-        for setting, values in grid.items():
-            numbers = str(values).split(",")
-            if setting.startswith("method.") and all(map(str.isdecimal, numbers)):
-                table = experiment["table"]
-                values_of = tuple(sorted(map(int, numbers)))
-                axes[table["axis"]] = Axis(table["label"], setting, values_of)
-    return axes
 
 
 def accuracy(subject: Subject, only: Sequence[str], trained: bool) -> Iterator[StudyLine]:

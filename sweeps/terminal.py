@@ -29,25 +29,27 @@ class _Output(Console):
 
 
 def console() -> Console:
-    """Standard output; in a file or pipe it is wide enough for every table."""
+    """Standard output; in a file or pipe lines are long."""
     return _Output(width=None if sys.stdout.isatty() else 200, highlight=False)
 
 
-shown: list[Table] = []
-"""The tables that this process has printed, for documents."""
-
-
 def show(table: Table) -> None:
-    """Print `table`."""
-    shown.append(table)
-    console().print(rich_table(table))
+    """Print `table`, in a file or pipe as Markdown."""
+    if sys.stdout.isatty():
+        console().print(rich_table(table))
+    else:
+        print(f"## {table.title}\n\n{table.markdown()}\n", flush=True)
 
 
 def show_run(run: Run, heading: str) -> None:
     """Print the tables of one run below a heading."""
-    out = console()
+    tables, out = run_tables(run.rows), console()
     out.print(f"{heading}: run {run.key}", style="bold", markup=False)
-    out.print(Columns([rich_table(table) for table in run_tables(run.rows)]))
+    if out.is_terminal:
+        out.print(Columns([rich_table(table) for table in tables]))
+    else:
+        for table in tables:
+            show(table)
 
 
 def say_missing(runs: Sequence[Run]) -> None:

@@ -104,6 +104,12 @@ def test_a_compiler_is_imported_only_by_the_kernels_made_for_it(library, home):
     assert all("kernels" in path.parts[1:3] for path in users)
 
 
+def test_all_machine_code_of_a_cpu_is_kept_as_methods_kernels_cpu_keeps_it():
+    """numba's own cache does not look at the files that a function imports from."""
+    own = {path for path in SOURCES if {"numba.njit", "numba.jit"} & {*imports(path)}}
+    assert own == set()
+
+
 @pytest.mark.parametrize(("package", "floors"), [("bench", 10), ("sweeps", 6)])
 def test_a_package_has_few_floors_and_no_circle(package, floors):
     """A file's floor is one above the highest it imports; a folder is as one file."""

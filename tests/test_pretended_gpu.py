@@ -177,8 +177,6 @@ def test_afterwards_there_is_none():
 class Asking(nn.Module):
     """A network that asks for a number."""
 
-    varying = False
-
     def __init__(self) -> None:
         super().__init__()
         self.factor = nn.Parameter(torch.ones(1))
@@ -188,6 +186,6 @@ class Asking(nn.Module):
 
 
 def test_planted_a_wait_in_a_network_is_found(gpu, tmp_path, quiet_log):
-    network, inputs = Asking().to("cuda"), [(torch.ones(2, 3, device="cuda"),)]
+    built = TorchEngine().build(Asking().to("cuda"), list, lambda: tmp_path, quiet_log)
     with pytest.raises(RuntimeError, match="stream is capturing"):
-        TorchEngine().build(network, lambda: inputs, lambda: tmp_path, quiet_log)
+        built.run(torch.ones(1, 3, 4, 4, device="cuda"))

@@ -56,7 +56,7 @@ def test_every_file_beside_the_sources_is_shipped():
         for path in folders[name].glob(of)
     }  # fmt: skip
     files = (path for top in PACKAGES for path in (ROOT / top).rglob("*.*"))
-    found = {path for path in files if path.suffix != ".py" and path.parent.name != "__pycache__"}
+    found = {path for path in files if path.suffix != ".py" and "__pycache__" not in path.parts}
     assert shipped == found
 
 

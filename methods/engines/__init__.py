@@ -7,7 +7,6 @@ Kernels, reprojection and the field do not use an engine.
 from __future__ import annotations
 
 import importlib
-import json
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -38,9 +37,7 @@ Folder = Callable[[], Path]
 """Returns a folder reserved for one network and engine. Called only if a build stores something."""
 
 
-CALIBRATION = 16
-"""Number of frames whose inputs determine the ranges of all 8-bit numbers, and the numbers of rows
-to expect."""
+CALIBRATION = 16  # frames whose inputs determine the ranges of all 8-bit numbers
 
 
 class Engine(ABC):
@@ -92,10 +89,10 @@ class Engine(ABC):
             return self.precision
         return "int8 uncalibrated+fp32" if self.uncalibrated else "int8+fp32"
 
-    def samples(self, network: Network) -> int:
+    @property
+    def samples(self) -> int:
         """Number of frames whose inputs `build` needs. If it is 1, only their shapes are read."""
-        calibrated = self.precision == "int8" and not self.uncalibrated
-        return CALIBRATION if calibrated or network.varying else 1
+        return CALIBRATION if self.precision == "int8" and not self.uncalibrated else 1
 
     def key(self) -> dict[str, object]:
         """Everything that the built network depends on, besides the network and its inputs."""
@@ -111,7 +108,7 @@ class Engine(ABC):
     @abstractmethod
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
         """Build `network`, which is on the device where it will run, or load an earlier build of it
-        from `folder`. `samples` are inputs of `self.samples(network)` frames."""
+        from `folder`. `samples` are inputs of `self.samples` frames; others may differ in size."""
 
 
 def keep(path: Path, write: Callable[[Path], None], log: Log) -> None:
@@ -132,39 +129,11 @@ def keep(path: Path, write: Callable[[Path], None], log: Log) -> None:
                 part.replace(path.parent / part.name)
 
 
-def keep_model(
-    path: Path,
-    network: Network,
-    samples: Samples,
-    write: Callable[[Path, Sequence[Inputs]], None],
-    log: Log,
-) -> list[int]:
-    """As `keep`, for a model of `network` that `write` makes from `samples`; return the numbers of
-    rows to prepare for, which are noted beside it."""
-
-    def make(new: Path) -> None:
-        seen = samples()
-        write(new, seen)
-        new.with_suffix(".json").write_text(json.dumps(sizes_to_expect(seen, network)))
-
-    keep(path, make, log)
-    return json.loads(path.with_suffix(".json").read_text())
-
-
 def readable(network: Network) -> Network:
     """A copy of `network` in plain torch, which converters of engines can trace."""
     copy = deepcopy(network)
     copy.backend = "reference"
     return copy
-
-
-def sizes_to_expect(samples: Sequence[Inputs], network: Network) -> list[int]:
-    """Numbers of rows to prepare for: the range in `samples`, plus one quantum at each end."""
-    if not network.varying:
-        return []
-    seen, step = {len(inputs[0]) for inputs in samples}, network.quantum
-    least, most = max(min(seen) // step - 1, 1), -(-max(seen) // step) + 1
-    return sorted({*seen, *range(least * step, most * step + 1, step)})
 
 
 def largest(maker: str | None) -> float:

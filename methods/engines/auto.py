@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import NamedTuple
 
 import torch
 
-from bench.errors import Unavailable
+from bench.errors import SteerbenchError, Unavailable
 from bench.provenance import computed_by
 from bench.types import Log
 from methods.engines import Engine, keep
@@ -64,11 +65,19 @@ class Auto:
         return {"candidates": keys, **computed_by(Auto)}
 
     def chosen(self, device: torch.device, measure: Measure, folder: Path, log: Log) -> Engine:
-        """The engine to use on `device`: as noted in `folder`, or as `measure` shows."""
+        """The engine to use on `device`: as noted in `folder`, or as `measure` shows; raise
+        SteerbenchError if the pictures of torch in fp32 are not finite."""
         engines, path = list(self._candidates(device)), folder / "engines.json"
 
         def write(new: Path) -> None:
-            new.write_text(json.dumps(measure(engines)))
+            measured = measure(engines)
+            if not measured[0].psnr > -math.inf:
+                raise SteerbenchError(
+                    "engine=auto: expected finite pictures to compare engines with, the trained "
+                    f"network renders others with {engines[0]} (PSNR {measured[0].psnr}): train "
+                    "it again, with a smaller learning rate or another seed"
+                )
+            new.write_text(json.dumps(measured))
 
         keep(path, write, log)
         found = [Figures(*figures) for figures in json.loads(path.read_text())]

@@ -23,17 +23,14 @@ class Built:
     run: Callable[..., Inputs]
     size: int  # bytes of its weights in a file
     dtype: torch.dtype = torch.float32  # of input pictures that it need not convert
-    plain: bool = False  # whether `run` is the network itself, and so can leave pixels out
 
 
 class Network(nn.Module, ABC):
-    """A network that engines can run: it maps tensors to a tuple of tensors.
+    """A network that engines can run: it maps pictures [B, C, H, W] to a tuple of pictures.
 
-    Inputs are rows [N, C] or pictures [B, C, H, W]; only their C is always the same.
+    Of an input, only C is always the same.
     """
 
-    varying = False  # whether inputs are rows, whose N differs from frame to frame
-    quantum = 1  # N is a multiple of it while frames are rendered
     backend = "auto"  # of its kernels; engines convert it with "reference", which is plain torch
 
     @abstractmethod

@@ -59,26 +59,22 @@ class OpenVino(Engine):
         return torch.bfloat16 if self._half else torch.float32
 
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
-        """Convert `network`, for int8 quantised, and compile it for the rows to expect."""
+        """Convert `network`, for int8 quantised, and compile it."""
 
-        def write(path: Path, seen: Sequence[Inputs]) -> None:
-            model = self._channels_last(self._convert(network, seen))
+        def write(path: Path) -> None:
+            model = self._channels_last(self._convert(network, samples()))
             self._openvino.save_model(model, path, compress_to_fp16=self.precision == "bf16")
 
         path = folder() / "network.xml"
-        sizes = engines.keep_model(path, network, samples, write, log)
+        engines.keep(path, write, log)
         model = self._openvino.Core().read_model(path)
-        compiled = _Compiled(self._openvino, model, self._dtype)
-        with log.progress("compiling", len(sizes)) as progress:
-            for size in sizes:
-                compiled.prepare(size)
-                progress.advance()
         weights = [op for op in model.get_ops() if op.get_type_name() == "Constant"]
-        return Built(compiled, sum(op.data.nbytes for op in weights), self._dtype)
+        size = sum(op.data.nbytes for op in weights)
+        return Built(_Compiled(self._openvino, model, self._dtype), size, self._dtype)
 
     def _convert(self, network: Network, samples: Sequence[Inputs]) -> Any:
         # Only C is fixed: frames may have another size than the samples.
-        shapes = [[-1, x.shape[1], *[-1] * (x.dim() - 2)] for x in samples[0]]
+        shapes = [[-1, x.shape[1], -1, -1] for x in samples[0]]
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # from the tracer, and about argument checks
             model = self._openvino.convert_model(
@@ -107,14 +103,12 @@ class OpenVino(Engine):
         preprocess, layout = self._openvino.preprocess, self._openvino.Layout
         outside = preprocess.PrePostProcessor(model)
         kind = self._openvino.Type.bf16 if self._half else self._openvino.Type.f32
-        for place, port in enumerate(model.inputs):
-            if _is_picture(port):
-                outside.input(place).tensor().set_layout(layout("NHWC")).set_element_type(kind)
-                outside.input(place).model().set_layout(layout("NCHW"))
-        for place, port in enumerate(model.outputs):
-            if _is_picture(port):
-                outside.output(place).tensor().set_layout(layout("NHWC"))
-                outside.output(place).model().set_layout(layout("NCHW"))
+        for place in range(len(model.inputs)):
+            outside.input(place).tensor().set_layout(layout("NHWC")).set_element_type(kind)
+            outside.input(place).model().set_layout(layout("NCHW"))
+        for place in range(len(model.outputs)):
+            outside.output(place).tensor().set_layout(layout("NHWC"))
+            outside.output(place).model().set_layout(layout("NCHW"))
         return outside.build()
 
     def _quantised(self, model: Any, samples: Sequence[Inputs], nncf: Any) -> Any:
@@ -149,44 +143,29 @@ def _fix_ranges(model: Any) -> None:
             op.input(place).replace_source_output(opset13.constant(bound).output(0))
 
 
-def _is_picture(port: Any) -> bool:
-    return port.partial_shape.rank.get_length() == 4
-
-
 def _capabilities(openvino: Any) -> list[str]:
     return openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
 
 
 class _Compiled:
-    """A compiled model. One of rows is compiled for every number of rows when it first occurs,
-    which is a third faster than for any number. One of pictures, which are channels last, is
-    compiled once: its convolutions gain little, and each compilation holds its own memory."""
+    """A model compiled for pictures of any size: to compile it for each size gains little, and each
+    compilation holds its own memory."""
 
     def __init__(self, openvino: Any, model: Any, dtype: torch.dtype) -> None:
-        self._openvino, self._model, self._core = openvino, model, openvino.Core()
-        self._dtype = dtype
-        self._requests: dict[tuple[tuple[int, ...], ...], Any] = {}
-        self._settings = {
+        self._openvino, self._dtype = openvino, dtype
+        settings = {
             "INFERENCE_PRECISION_HINT": "bf16" if dtype == torch.bfloat16 else "f32",
             "PERFORMANCE_HINT": "LATENCY",
             "INFERENCE_NUM_THREADS": torch.get_num_threads(),
         }
-
-    def prepare(self, size: int) -> None:
-        """Compile for `size` rows, and do the one-time work of the first call."""
-        inputs = [
-            np.zeros((size, port.partial_shape[1].get_length()), port.element_type.to_dtype())
-            for port in self._model.inputs
-        ]
-        self._request(tuple(x.shape for x in inputs)).infer(inputs)
+        compiled = openvino.Core().compile_model(model, "CPU", settings)
+        self._request = compiled.create_infer_request()
 
     def __call__(self, *inputs: Tensor) -> Inputs:
-        given = [x.movedim(1, -1).to(self._dtype) if x.dim() == 4 else x for x in inputs]
-        tensors = [self._tensor(x.contiguous()) for x in given]
-        varying = () if any(x.dim() == 4 for x in inputs) else tuple(x.shape for x in given)
-        found = self._request(varying).infer(tensors, share_inputs=True, share_outputs=True)
+        tensors = [self._tensor(x.movedim(1, -1).to(self._dtype).contiguous()) for x in inputs]
+        found = self._request.infer(tensors, share_inputs=True, share_outputs=True)
         outputs = (torch.from_numpy(found[place]) for place in range(len(found)))
-        return tuple(x.movedim(-1, 1) if x.dim() == 4 else x for x in outputs)
+        return tuple(x.movedim(-1, 1) for x in outputs)
 
     def _tensor(self, x: Tensor) -> Any:
         """`x` for OpenVINO, in the same memory; numpy has no bfloat16."""
@@ -194,12 +173,3 @@ class _Compiled:
             return x.numpy()
         kind = self._openvino.Type.bf16
         return self._openvino.Tensor(x.view(torch.int16).numpy(), list(x.shape), kind)
-
-    def _request(self, shapes: tuple[tuple[int, ...], ...]) -> Any:
-        if shapes not in self._requests:
-            model = self._model.clone()
-            if shapes:
-                model.reshape(dict(enumerate(map(list, shapes))))
-            compiled = self._core.compile_model(model, "CPU", self._settings)
-            self._requests[shapes] = compiled.create_infer_request()
-        return self._requests[shapes]

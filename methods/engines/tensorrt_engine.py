@@ -32,9 +32,8 @@ PRODUCTS = ("Conv", "Gemm", "MatMul")
 class TensorRt(Engine):
     """TensorRT on a CUDA GPU.
 
-    It builds plans. A plan is valid for one GPU model, one version, and up to a number of cells,
-    which is a power of two. Plans for expected sizes are built beforehand, others on demand. With
-    int8, everything not quantised is computed in float32.
+    It builds plans. A plan is valid for one GPU model, one version, and pictures of one size; it is
+    built when that size first occurs. With int8, everything not quantised is computed in float32.
     """
 
     name = "tensorrt"
@@ -64,24 +63,23 @@ class TensorRt(Engine):
         return super().key() | {"gpu": torch.cuda.get_device_name()}
 
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
-        """Export `network` as an ONNX model, and build plans for the sizes to expect."""
+        """Export `network` as an ONNX model, of which plans are built."""
         import onnx
 
         path = folder() / "network.onnx"
 
-        def write(path: Path, seen: Sequence[Inputs]) -> None:
-            seen = [tuple(x.cpu() for x in inputs) for inputs in seen]
+        def write(path: Path) -> None:
+            seen = [tuple(x.cpu() for x in inputs) for inputs in samples()]
             plain: nn.Module = engines.readable(network).cpu()
             if self.precision == "fp16":
                 plain = _Halved(plain)
             exact = path if self.precision != "int8" else path.with_name("exported.onnx")
-            _export(plain, network, seen[0], exact)
+            _export(plain, seen[0], exact)
             if self.precision == "int8":
                 _quantise(exact, seen, path, uncalibrated=self.uncalibrated)
 
-        sizes = engines.keep_model(path, network, samples, write, log)
-        plans = _Plans(path, network, exact=self.precision != "fp16", log=log)
-        plans.prepare(sizes)
+        engines.keep(path, write, log)
+        plans = _Plans(path, exact=self.precision != "fp16", log=log)
         weights = onnx.load(path).graph.initializer
         return Built(plans, sum(onnx.numpy_helper.to_array(weight).nbytes for weight in weights))
 
@@ -94,8 +92,7 @@ class _Halved(nn.Module):
         self.network = network.half()
 
     def forward(self, *inputs: Tensor) -> Inputs:
-        halved = (x.half() if x.is_floating_point() else x for x in inputs)
-        return tuple(x.float() for x in self.network(*halved))
+        return tuple(x.float() for x in self.network(*(x.half() for x in inputs)))
 
 
 def _names(kind: str, count: int) -> list[str]:
@@ -103,8 +100,10 @@ def _names(kind: str, count: int) -> list[str]:
     return [f"{kind}{place}" for place in range(count)]
 
 
-def _export(module: nn.Module, network: Network, sample: Inputs, path: Path) -> None:
-    inputs = _names("input", len(sample))
+def _export(module: nn.Module, sample: Inputs, path: Path) -> None:
+    """Write an ONNX model of `module`, for pictures of any size."""
+    import onnx
+
     with torch.no_grad(), warnings.catch_warnings():
         outputs = len(module(*sample))
         warnings.simplefilter("ignore")  # the exporter's own deprecations
@@ -112,12 +111,17 @@ def _export(module: nn.Module, network: Network, sample: Inputs, path: Path) -> 
             module,
             sample,
             path,
-            input_names=inputs,
+            input_names=_names("input", len(sample)),
             output_names=_names("output", outputs),
-            dynamic_axes={name: [0] for name in inputs if network.varying},
             opset_version=OPSET,
             dynamo=False,
         )
+    # Not by the exporter, which would then compute parts of weights from the sizes of pictures.
+    model = onnx.load(path)
+    for tensor in (*model.graph.input, *model.graph.output):
+        for axis in (0, 2, 3):
+            tensor.type.tensor_type.shape.dim[axis].dim_param = f"{tensor.name}, axis {axis}"
+    onnx.save(model, path)
 
 
 def _quantise(exported: Path, samples: Sequence[Inputs], path: Path, *, uncalibrated: bool) -> None:
@@ -166,41 +170,30 @@ def _fixed_ranges(prepared: Path) -> dict[str, Any]:
 
 
 class _Plans:
-    """The plans of a model: for every n, one for up to 2^n cells, built when it is first needed.
+    """The plans of a model, one for each size of its inputs.
 
     `exact`: compute float32 in float32, not in TF32.
     """
 
-    def __init__(self, model: Path, network: Network, *, exact: bool, log: Log) -> None:
+    def __init__(self, model: Path, *, exact: bool, log: Log) -> None:
         import tensorrt
 
         self._tensorrt, self._logger = tensorrt, tensorrt.Logger(tensorrt.Logger.ERROR)
-        self._model, self._network, self._exact, self._log = model, network, exact, log
-        self._executions: dict[int, _Execution] = {}
-
-    def prepare(self, sizes: Sequence[int]) -> None:
-        """Build the plans for these numbers of cells; a network of fixed size has one plan."""
-        ceilings = sorted({_ceiling(size) for size in sizes or [1]})
-        with self._log.progress("building for TensorRT", len(ceilings)) as progress:
-            for ceiling in ceilings:
-                self._execution(ceiling)
-                progress.advance(note=f"up to {ceiling} cells" if sizes else "")
+        self._model, self._exact, self._log = model, exact, log
+        self._executions: dict[tuple[torch.Size, ...], _Execution] = {}
 
     def __call__(self, *inputs: Tensor) -> Inputs:
-        if not all(x.numel() for x in inputs):
-            return self._network(*inputs)
-        size = len(inputs[0]) if self._network.varying else 1
-        return self._execution(_ceiling(size))(*inputs)
+        shapes = tuple(x.shape for x in inputs)
+        if shapes not in self._executions:
+            name = "-".join("x".join(map(str, shape)) for shape in shapes)
+            path = self._model.with_name(f"{name}.plan")
+            engines.keep(path, lambda new: self._build(shapes, new), self._log)
+            self._executions[shapes] = _Execution(self._tensorrt, path, self._logger)
+        return self._executions[shapes](*inputs)
 
-    def _execution(self, ceiling: int) -> _Execution:
-        if ceiling not in self._executions:
-            path = self._model.with_name(f"upto-{ceiling}.plan")
-            engines.keep(path, lambda new: self._build(ceiling, new), self._log)
-            self._executions[ceiling] = _Execution(self._tensorrt, path, self._logger)
-        return self._executions[ceiling]
-
-    def _build(self, ceiling: int, path: Path) -> None:
-        """Write the plan for 1 to `ceiling` cells, optimised for `ceiling`."""
+    def _build(self, shapes: tuple[torch.Size, ...], path: Path) -> None:
+        """Write the plan for inputs of these `shapes`."""
+        self._log.info(f"building for TensorRT, which may take minutes: {path.stem}")
         trt = self._tensorrt
         builder = trt.Builder(self._logger)
         typed = 1 << int(trt.NetworkDefinitionCreationFlag.STRONGLY_TYPED)
@@ -212,18 +205,14 @@ class _Plans:
         if self._exact:
             config.clear_flag(trt.BuilderFlag.TF32)
         profile = builder.create_optimization_profile()
-        for tensor in map(network.get_input, range(network.num_inputs)):
-            shapes = (
-                [size if axis == -1 else axis for axis in tensor.shape]
-                for size in (1, ceiling, ceiling)  # minimum, optimum, maximum
-            )
-            profile.set_shape(tensor.name, *shapes)
+        for place, shape in enumerate(shapes):
+            profile.set_shape(network.get_input(place).name, *3 * [tuple(shape)])  # least to most
         config.add_optimization_profile(profile)
         plan = builder.build_serialized_network(network, config)
         if plan is None:
             raise SteerbenchError(
-                f"TensorRT {trt.__version__} cannot build {self._model} for up to {ceiling} cells; "
-                "it says why above"
+                f"TensorRT {trt.__version__} cannot build {self._model} for {path.stem}; it says "
+                "why above"
             )
         path.write_bytes(plan)
 
@@ -254,8 +243,3 @@ class _Execution:
             raise SteerbenchError(f"TensorRT cannot run a network on {shapes}; it says why above")
         current.wait_stream(self._stream)
         return tuple(named[name] for name in outputs)
-
-
-def _ceiling(size: int) -> int:
-    """The smallest power of two that is at least `size`; at least 1."""
-    return 1 << max(size - 1, 0).bit_length()

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from bench.errors import Unavailable
 from bench.types import Log
-from methods.engines import Built, Engine, Folder, Inputs, Network, Samples, sizes_to_expect
+from methods.engines import Built, Engine, Folder, Inputs, Network, Samples
 from methods.kernels import multiplies_bf16
 
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
@@ -43,12 +43,8 @@ class TorchEngine(Engine):
         emulated = self.precision == "bf16" and not multiplies_bf16(device.type)
         return "bf16 in fp32" if emulated else super().computed(device)
 
-    def samples(self, network: Network) -> int:
-        """Frames whose inputs `build` needs: none on a CPU, which runs the network itself."""
-        return 0 if _on_cpu(network) else super().samples(network)
-
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
-        """Make `network` compute at this precision; on a GPU, record CUDA graphs of it."""
+        """Make `network` compute at this precision, on a GPU as CUDA graphs."""
         dtype = DTYPES[self.precision]
 
         def run(*inputs: Tensor) -> Inputs:
@@ -56,12 +52,8 @@ class TorchEngine(Engine):
                 return network(*inputs)
 
         size = sum(weight.numel() for weight in network.parameters()) * dtype.itemsize
-        made = run if _on_cpu(network) else _recorded(run, network, samples, log)
-        return Built(made, size, dtype, plain=made is run and dtype == torch.float32)
-
-
-def _on_cpu(network: Network) -> bool:
-    return next(network.parameters()).device.type == "cpu"
+        on_cpu = next(network.parameters()).device.type == "cpu"
+        return Built(run if on_cpu else Replayed(run), size, dtype)
 
 
 def _arithmetic(device: torch.device, dtype: torch.dtype) -> AbstractContextManager[object]:
@@ -71,19 +63,6 @@ def _arithmetic(device: torch.device, dtype: torch.dtype) -> AbstractContextMana
     if device.type == "cuda":
         return torch.backends.cudnn.flags(enabled=True, allow_tf32=False)
     return nullcontext()
-
-
-def _recorded(run: Callable[..., Inputs], network: Network, samples: Samples, log: Log) -> Replayed:
-    """`run` as CUDA graphs, recorded beforehand for the expected sizes."""
-    replayed, seen = Replayed(run), samples()
-    sizes = sizes_to_expect(seen, network)
-    blank = [tuple(x.new_zeros(size, *x.shape[1:]) for x in seen[0]) for size in sizes]
-    expected = blank or seen[:1]
-    with torch.no_grad(), log.progress("recording CUDA graphs", len(expected)) as progress:
-        for inputs in expected:
-            replayed(*inputs)
-            progress.advance()
-    return replayed
 
 
 Replay = tuple[Callable[[], Any], Inputs]
@@ -104,8 +83,6 @@ class Replayed:
         self._pool: Any = None
 
     def __call__(self, *inputs: Tensor) -> Inputs:
-        if not all(x.numel() for x in inputs):
-            return self._run(*inputs)  # launches nothing, and CUDA cannot record an empty graph
         with torch.cuda.device_of(inputs[0]):
             sizes = tuple(x.shape for x in inputs)
             if sizes not in self._recordings:

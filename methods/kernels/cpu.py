@@ -1,8 +1,4 @@
-"""Functions shared by the numba backends.
-
-numba's cache only checks the file of the calling function. After changing a function in this file,
-one that a kernel imports from another kernel, or a constant that it imports (`PRIMES`, `TAPS`),
-remove the `__pycache__` of its callers.
+"""Functions shared by the numba backends, and how all of theirs are compiled.
 
 The process that compiles a function runs a different copy than processes that load it from the
 cache: LLVM has optimised one of them twice. Where it may choose how to round, the copies can differ
@@ -14,19 +10,26 @@ seen to give the same bits in all cases of the kernel.
 from __future__ import annotations
 
 import math
+import shutil
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
 
 import numba
 import numpy as np
 import torch
 from llvmlite import ir
 from llvmlite.binding import get_host_cpu_features
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 from torch import Tensor
 
-from methods.kernels.march import PARALLEL
+from bench.provenance import digest
+from methods.kernels.types import PARALLEL
 
 f32, i32, u32 = np.float32, np.int32, np.uint32
 
@@ -42,6 +45,8 @@ TALL = 12 if get_host_cpu_features().get("avx512f") else ROWS
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 """Flags of fastmath: reordering and fused multiply-adds are allowed; assuming that there is no NaN
 is not."""
+
+FOLDER = "machine-code-"  # begins the names of the folders in which it is kept
 
 LANES = 16  # outputs that both compute together
 
@@ -88,7 +93,40 @@ def flat(*tensors: Tensor) -> list[np.ndarray]:
     return [array.reshape(-1) for array in arrays(*tensors)]
 
 
-@njit(cache=True, error_model="numpy")
+class _Kept(FunctionCache):
+    """The machine code of a function, in a folder that is named after the digest of all files that
+    it comes from; numba's own cache looks at one file. Folders of other code are removed."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        sources = digest(function)
+        self._folder = Path(self.cache_path) / f"{FOLDER}{sources[:16]}"
+        names = str(self._folder), self._impl.filename_base
+        self._cache_file = IndexDataCacheFile(*names, sources)
+
+    def save_overload(self, *compiled: Any) -> None:
+        """As numba's, unless a process with other code removes the folder at this moment."""
+        if not self._folder.exists():
+            for other in Path(self.cache_path).glob(f"{FOLDER}*"):
+                shutil.rmtree(other, ignore_errors=True)
+        with suppress(FileNotFoundError):
+            self._folder.mkdir(exist_ok=True)
+            super().save_overload(*compiled)
+
+
+def jit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """As `numba.njit` with these `options`. The machine code is kept for other processes, until a
+    file changes that it may come from: that of the function, or one that this file imports."""
+
+    def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+        dispatcher = numba.njit(**options)(function)
+        dispatcher._cache = _Kept(function)
+        return dispatcher
+
+    return compiled
+
+
+@jit(error_model="numpy")
 def exp(x):
     """e^x of a float32 to 3 u, for -87 <= x <= 87, and beyond that of the nearer end; NaN of NaN.
 
@@ -104,26 +142,26 @@ def exp(x):
     return (f32(1) + (r + r * r * series)) * u32(bits).view(np.float32)
 
 
-@njit(cache=True, error_model="numpy")
+@jit(error_model="numpy")
 def sigmoid(x):
     """1 / (1 + e^-x) of a float32."""
     return f32(1) / (f32(1) + exp(-x))
 
 
-@njit(cache=True, error_model="numpy")
+@jit(error_model="numpy")
 def slope(direction):
     """Change of t per length along an axis; 0 for a ray that does not move along it."""
     inverse = f32(1) / direction
     return inverse if abs(direction) >= PARALLEL else f32(0)
 
 
-@njit(cache=True)
+@jit()
 def pack_bf16(low, high):
     """Two float32 rounded to nearest even bfloat16, in the low and high half of a word."""
     return u32(u32(_round_bits(low) >> u32(16)) | u32(_round_bits(high) & u32(0xFFFF0000)))
 
 
-@njit(cache=True)
+@jit()
 def _round_bits(value):
     """Bits of a float32 after rounding; the upper half is the bfloat16. NaN stays NaN: rounded like
     a number, 0x7FFFFFFF would become -0."""
@@ -176,7 +214,7 @@ def add_pair(typing, array, at, weight, first, second):
     return types.void(array, types.uint64, n, n, n), generate
 
 
-@njit(cache=True)
+@jit()
 def prefetch_row(array, at, count):
     """Ask for `count` numbers of a flat array of float32, from place `at` on."""
     for k in range(0, count, WORDS):
@@ -262,7 +300,7 @@ def _product(rows: int):
 six, tall, _one = _product(ROWS), _product(TALL), _product(1)
 
 
-@njit(cache=True)
+@jit()
 def multiply(rows, a, a_at, a_row, a_step, w, width, bias, out, out_at, count, relu):
     """`rows` rows of a matrix, any number, times w [count, width], plus bias [width], which are
     flat: out [rows, width]."""

@@ -20,6 +20,9 @@ BRICK = 4  # cells along the side of a brick; its 64 cells are one word of `Occu
 
 LARGEST_SIDE = 1008  # most cells along a side of a grid: a byte holds its clearances, in bricks
 
+PARALLEL = 2.0**-127
+"""A smaller component of a direction counts as 0, because its reciprocal overflows float32."""
+
 
 def expect(holds: bool, name: str, expected: str, got: object) -> None:
     """Raise ValueError with the `name` of a setting, and what is expected, unless that `holds`."""

@@ -129,7 +129,7 @@ class SteerNerf:
 
         @cache  # what was measured is not built again
         def build(engine: Engine) -> Built:
-            samples = partial(inputs, engine.samples(renderer.network))
+            samples = partial(inputs, engine.samples)
             return engine.build(renderer.network, samples, lambda: folder(engine.key()), log)
 
         def measure(engines: Sequence[Engine]) -> Sequence[Figures]:

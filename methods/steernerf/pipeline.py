@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import gcd, prod
 from typing import Any
 
 import torch
@@ -19,7 +18,6 @@ from methods.kernels.types import Occupancy
 from methods.rendering.compaction import compacts
 from methods.rendering.frame import FeatureFrame, everywhere, render_frame
 from methods.steernerf.buffer import Buffer, Cloud, Points, reproject
-from methods.steernerf.kernels.spans import Spans
 from methods.steernerf.options import Model, Rendering
 from methods.steernerf.unet import WHOLE, Observation, Part, Renderer2d
 
@@ -56,24 +54,6 @@ def near_matter(seen: Tensor) -> Part:
         begin = max(min((ends[0] + ends[1] + 1 - length) // 2, size - length), 0)
         part.append(slice(begin, begin + length))
     return part[0], part[1]
-
-
-def spans_near_matter(seen: Tensor, scale: int) -> Spans:
-    """In bands of low-resolution rows [h, w], the columns around all that are `seen`, and a margin.
-    A band and its columns are multiples of 16 pixels at full resolution."""
-    height, width = seen.shape
-    column, band = torch.arange(width), 16 // gcd(16, scale)
-    first = torch.where(seen, column, width).amin(1)
-    last = torch.where(seen, column, -1).amax(1)
-
-    def largest(rows: Tensor) -> Tensor:
-        """Of the rows of each band, and those within the margin."""
-        around = functional.pad(rows.float(), (MARGIN, MARGIN + -height % band), value=-torch.inf)
-        return around.unfold(0, band + 2 * MARGIN, band).amax(1)
-
-    begin, end = -largest(-first) - MARGIN, largest(last) + 1 + MARGIN
-    columns = torch.stack(((begin / band).floor().clamp(min=0), (end / band).ceil()), 1)
-    return Spans(columns.long(), band * scale)
 
 
 class Pipeline:
@@ -164,12 +144,10 @@ class Pipeline:
         # On a GPU the host would wait, and every new size would be recorded or built.
         some = rendering.skip.background and compacts(frame.alpha.device)
         part = near_matter(frame.alpha > 0) if some else WHOLE
-        drawn, spans = view.crop(part), None
-        if some and self.renderer.skips:
-            spans = spans_near_matter(frame.alpha[part] > 0, view.scale)
-        size, whole = ((seen.full.height, seen.full.width) for seen in (drawn, view))
-        probe.count("drawn_pixels", spans.count(*size) if spans else prod(size), prod(whole))
-        return Observation(frame, self.reproject(preceding, drawn), self.backend, part, spans)
+        drawn = view.crop(part)
+        pixels, every = (seen.full.width * seen.full.height for seen in (drawn, view))
+        probe.count("drawn_pixels", pixels, every)
+        return Observation(frame, self.reproject(preceding, drawn), self.backend, part)
 
     def draw(self, shown: Any, view: View, rendering: Any, probe: Probe) -> Tensor:
         """The picture I [H, W, 3] of what the 2D renderer is `shown` (Eq. 11)."""

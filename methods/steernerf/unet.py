@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.nn.functional import max_pool2d, pixel_shuffle
 
 from bench.types import NullProbe, Probe
 from methods.engines.network import Built, Network
 from methods.kernels.types import expect
 from methods.rendering.frame import FeatureFrame
 from methods.steernerf.buffer import Points
-from methods.steernerf.kernels.convolution import convolution, halved
 from methods.steernerf.kernels.drawing import corrected, shown
-from methods.steernerf.kernels.spans import Spans, inside
 
 UNWATCHED = NullProbe()
 
@@ -27,6 +25,7 @@ Part = tuple[slice, slice]
 
 WHOLE = slice(None), slice(None)
 
+RIM = 4  # pixels at the border of what is drawn, where the network reads zeros beyond
 DIVISOR = 4  # of the sides of the network's pictures, which it halves twice
 
 
@@ -38,20 +37,20 @@ class Observation:
     preceding: Points  # of preceding frames, newest first, indices [L', H', W'], L' at most L
     backend: str  # of the kernels that a renderer calls
     part: Part = WHOLE  # of the frame, to be drawn; the H' x W' pixels are of this part
-    spans: Spans | None = None  # of the part, to be drawn; None: all of it
 
-    def inside(self, height: int, width: int) -> Spans | None:
+    def inside(self, height: int, width: int) -> Part:
         """What is drawn of the `height` x `width` pixels of the part, without its border.
 
         Zeros beyond the border change what the network draws there by less than a grey level, but
-        such a line across a white background costs 0.01 of LPIPS. None: the whole picture.
+        such a line across a white background costs 0.01 of LPIPS.
         """
-        edges = []
-        for one, side in zip(self.part, self.frame.values.shape, strict=False):
+        kept = []
+        for one, side, pixels in zip(
+            self.part, self.frame.values.shape, (height, width), strict=False
+        ):
             begin, end, _ = one.indices(side)
-            edges += [begin == 0, end == side]
-        whole = self.spans is None and all(edges)
-        return None if whole else inside(self.spans, height, width, edges)
+            kept.append(slice(RIM if begin else 0, pixels - (RIM if end < side else 0)))
+        return kept[0], kept[1]
 
 
 class Renderer2d(nn.Module):
@@ -60,11 +59,6 @@ class Renderer2d(nn.Module):
 
     network: Network
     engine: Built | None = None
-
-    @property
-    def skips(self) -> bool:
-        """Whether it can leave out pixels inside a part; networks that engines compile cannot."""
-        return self.engine is None or self.engine.plain
 
     def run(self, probe: Probe, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Compute the network's output."""
@@ -101,27 +95,22 @@ class UNet(Renderer2d):
         *,
         clip: bool = False,
     ) -> Tensor:
-        """Draw all observations, which have one size and the same spans: pictures [B, H, W, 3],
-        `clip`ped to [0, 1]. Beyond what is `inside` its part and spans, a picture is its base."""
+        """Draw all observations, which have one size: pictures [B, H, W, 3], `clip`ped to [0, 1].
+        Beyond what is `inside` its part, a picture is its base."""
         once = len(observations) == 1 and not torch.is_grad_enabled()
         inputs = _stacked([self._input(o, once) for o in observations]).permute(0, 3, 1, 2)
         height, width = inputs.shape[-2:]
-        self.network.backend = observations[0].backend
         if height % DIVISOR or width % DIVISOR:
             inputs = functional.pad(inputs, (0, -width % DIVISOR, 0, -height % DIVISOR))
-        self.network.spans = observations[0].spans
-        try:
-            (correction,) = self.run(probe, inputs)  # Eq. 11
-        finally:
-            self.network.spans = None  # an engine builds a network that draws everything
+        (correction,) = self.run(probe, inputs)  # Eq. 11
         correction = correction[..., :height, :width]
         pictures = []
         for o, added in zip(observations, correction.permute(0, 2, 3, 1), strict=True):
             rgb, (top, left) = o.frame.values[..., :3], (side.start or 0 for side in o.part)
-            corner = self.scale * top, self.scale * left
-            given = rgb, added, corner, self.scale, self.aligned
-            spans = o.inside(height, width)
-            picture = corrected(*given, clip=clip, spans=spans, backend=o.backend)
+            rows, columns = o.inside(height, width)
+            corner = self.scale * top + rows.start, self.scale * left + columns.start
+            given = rgb, added[rows, columns], corner, self.scale, self.aligned
+            picture = corrected(*given, clip=clip, backend=o.backend)
             pictures.append(picture)
         return _stacked(pictures)
 
@@ -136,7 +125,7 @@ class UNet(Renderer2d):
             dtype = torch.get_autocast_dtype(kind)
         given = o.frame.values[o.part], o.preceding.values, o.preceding.index, self.frames
         memory = self._memory if once else None
-        canvas = shown(*given, dtype=dtype, memory=memory, spans=o.spans, backend=o.backend)
+        canvas = shown(*given, dtype=dtype, memory=memory, backend=o.backend)
         if once and canvas.data_ptr() != self._memory.data_ptr():
             self._memory = canvas.view(-1)
         return canvas
@@ -145,14 +134,12 @@ class UNet(Renderer2d):
 class _Network(Network):
     """The layers of `ReconstructionNet_v4`, with `width` channels at full resolution."""
 
-    spans: Spans | None = None  # of its pictures
-
     def __init__(self, inputs: int, width: int) -> None:
         super().__init__()
         self.first, self.enter = _conv(inputs, width), _conv(width, width)
         self.at_half = _Residual(width)
         self.narrow = _conv(width, 2 * width)
-        self.at_quarter = nn.ModuleList(_Residual(2 * width) for _ in range(3))
+        self.at_quarter = nn.Sequential(*(_Residual(2 * width) for _ in range(3)))
         self.widen_quarter = _conv(2 * width, 8 * width)
         self.merge_half, self.half_again = _conv(3 * width, width), _Residual(width)
         self.widen_half = _conv(width, 4 * width)
@@ -163,34 +150,22 @@ class _Network(Network):
 
     def forward(self, inputs: Tensor) -> tuple[Tensor]:
         """[B, C, H, W] to [B, 3, H, W]; H and W are multiples of `DIVISOR`."""
-        at_full, at_half, at_quarter = (self._at(size) for size in (1, 2, 4))
-        full = _drawn(self.first, inputs, **at_full)
-        full = _drawn(self.enter, full, relu=True, **at_full)
-        half = self.at_half(halved(full, **at_full), at_half)
-        quarter = halved(half, **at_half)
-        quarter = _drawn(self.narrow, quarter, relu=True, **at_quarter)
-        for block in self.at_quarter:
-            quarter = block(quarter, at_quarter)
-        wide = _drawn(self.widen_quarter, quarter, shuffle=True, **at_quarter)
-        merged = _drawn(self.merge_half, wide, half, relu=True, **at_half)
-        merged = self.half_again(merged, at_half)
-        wide = _drawn(self.widen_half, merged, shuffle=True, **at_half)
-        merged = _drawn(self.merge_full, wide, full, relu=True, **at_full)
-        merged = _drawn(self.leave, merged, relu=True, **at_full)
-        return (_drawn(self.last, merged, **at_full),)
-
-    def _at(self, size: int) -> dict[str, Any]:
-        """How a picture that is 1 / `size` as wide and high is computed."""
-        return {"backend": self.backend, "spans": self.spans and self.spans.at(size)}
+        full = self.enter(self.first(inputs)).relu()
+        half = self.at_half(max_pool2d(full, 2))
+        quarter = self.at_quarter(self.narrow(max_pool2d(half, 2)).relu())
+        wide = pixel_shuffle(self.widen_quarter(quarter), 2)
+        half = self.half_again(self.merge_half(torch.cat((wide, half), 1)).relu())
+        wide = pixel_shuffle(self.widen_half(half), 2)
+        full = self.merge_full(torch.cat((wide, full), 1)).relu()
+        return (self.last(self.leave(full).relu()),)
 
     def products(self, *inputs: Tensor) -> int:
-        """Multiplications by weights, as a plain convolution does them: every kernel counts once
-        per pixel at its resolution."""
+        """Multiplications by weights: every kernel counts once per pixel at its resolution."""
         batch, _, *size = inputs[0].shape
-        pixels = batch * (self.spans.count(*size) if self.spans else math.prod(size))
         half = dict.fromkeys(("at_half", "merge_half", "half_again", "widen_half"), 4)
         fewer = {**half, "narrow": 16, "at_quarter": 16, "widen_quarter": 16}
         weights = ((name.split(".")[0], x) for name, x in self.named_parameters() if x.dim() > 1)
+        pixels = batch * math.prod(size)
         return sum(pixels // fewer.get(layer, 1) * x.numel() for layer, x in weights)
 
 
@@ -203,15 +178,8 @@ class _Residual(nn.Module):
         for layer in (self.first, self.second):
             _kaiming(layer, 0.1)
 
-    def forward(self, x: Tensor, how: Mapping[str, Any]) -> Tensor:
-        inner = _drawn(self.first, x, relu=True, **how)
-        return _drawn(self.second, inner, plus=x, relu=True, **how)
-
-
-def _drawn(layer: nn.Conv2d, *parts: Tensor, **how: Any) -> Tensor:
-    """`layer` of the channels of all `parts`, as `convolution` does it."""
-    assert layer.bias is not None
-    return convolution(parts, layer.weight, layer.bias, **how)
+    def forward(self, x: Tensor) -> Tensor:
+        return (x + self.second(self.first(x).relu())).relu()
 
 
 def _stacked(pictures: Sequence[Tensor]) -> Tensor:

@@ -27,7 +27,7 @@ from PIL import Image
 
 from bench.errors import explained
 from bench.sharing import whole
-from reports.comparison import COST, metric_format, written
+from reports.comparison import COST, shown_as, written
 from reports.images import ZOOM, Frame, Part, Picture, still_images
 from reports.runs import Repeated, Run
 from reports.tables import QUALITY, Table
@@ -114,7 +114,7 @@ def html_page(parts: Sequence[Part], runs: Sequence[Run]) -> str:
 def _origin(run: Run) -> dict[str, str]:
     line = Repeated(run.label, [run])
     figures = [
-        f"{metric_format(metric)[0].rstrip(' ↑↓')} {written(line, metric)}"
+        f"{shown_as(metric).name} {written(line, metric)}"
         for metric in (*QUALITY, *COST)
         if metric in run.values
     ]

@@ -1,5 +1,5 @@
-"""`steerbench paper` measures every table of the SteerNeRF paper and writes a page about them;
-`steerbench report` writes the same page from the store alone."""
+"""`steerbench paper` measures the tables of the SteerNeRF paper, or another, and writes a page of
+them; `steerbench report` writes the same page from the store alone."""
 
 from __future__ import annotations
 
@@ -17,11 +17,14 @@ from bench.results import Store
 from reports import export
 from reports.outliers import outlier_table, outliers
 from reports.paper_page import write_paper_page
+from reports.paper_tables import Place
 from reports.runs import Repeated, Run, over_common_frames, over_scenes
+from sweeps.data_sets import DataSet, data_sets, find
 from sweeps.execute import Launcher, divided, run_jobs
 from sweeps.measurement import newest, of_scene
-from sweeps.overrides import composed
-from sweeps.plan import DataSet, Planned, chosen, data_sets, find, plan, scenes_of
+from sweeps.overrides import composed, unquoted
+from sweeps.plan import Planned, plan, scenes_of
+from sweeps.tables import chosen
 from sweeps.terminal import console, show
 
 DATA = "data="  # prefix of the word that names the folder of a data set
@@ -40,7 +43,8 @@ def main(options: argparse.Namespace) -> int:
     missing = data.missing if data else {}
     for name, why in missing.items():
         print(f"missing: {name}: {why}", file=sys.stderr)
-    tables = chosen(options.table, options.methods, data_sets(scenes_of(words, data)))
+    shown = data_sets(scenes_of(words, data))
+    tables = chosen(options.table, words, options.methods, shown)
     jobs = [job for table in tables for job in plan(table, words, data)]
     outputs = Path(jobs[0].config.outputs)
     failed = 0
@@ -49,10 +53,10 @@ def main(options: argparse.Namespace) -> int:
     runs = newest(Store(outputs))
     broken = outliers(list(chain(*runs.values())))
     folder = options.report or outputs / "paper"
-    lines = gather(jobs, runs)
-    page = write_paper_page(tables, lines, broken, folder, missing)
+    measured = gather(jobs, runs)
+    page = write_paper_page(tables, measured, broken, folder, missing)
     if options.format:
-        print(getattr(export, options.format)(tables, lines), end="")
+        print(getattr(export, options.format)(tables, measured), end="")
     print(f"report: {page}", file=sys.stderr)
     return int(failed > 0)
 
@@ -68,7 +72,7 @@ def data_set(words: Sequence[str]) -> tuple[list[str], DataSet | None]:
     if named and (scenes := [word for word in settings if of_scene.match(word)]):
         both = f"{named[-1]} and {scenes[0]}"
         raise SteerbenchError(f"{both}: expected one of them; data names all scenes")
-    return settings, find(named[-1].removeprefix(DATA)) if named else None
+    return settings, find(unquoted(named[-1].removeprefix(DATA))) if named else None
 
 
 def _check(store: Store) -> int:
@@ -89,44 +93,43 @@ class Outcome(NamedTuple):
     gap: str | None
 
 
-def gather(jobs: Sequence[Planned], runs: Mapping[str, Sequence[Run]]) -> dict[str, list[Repeated]]:
-    """The lines of every table, each with its runs and the reasons why others are missing.
+def gather(jobs: Sequence[Planned], runs: Mapping[str, Sequence[Run]]) -> dict[Place, Repeated]:
+    """The line of every job, with its runs and the reasons why others are missing.
 
     With several scenes, a run of a line is the mean of one seed over the scenes that all lines of
     the block have. Lines without any measurement are ignored for this. `runs` are from `newest`.
     """
-    blocks: dict[tuple[str, str], dict[str, list[Outcome]]] = {}
+    blocks: dict[tuple[str, str], dict[Place, list[Outcome]]] = {}
     for job in jobs:
-        line = blocks.setdefault((job.table, job.block), {}).setdefault(job.line, [])
-        line.append(_outcome(job, runs.get(job.key, ())))
-    tables: dict[str, list[Repeated]] = {}
-    for (table, _), of_block in blocks.items():
-        tables.setdefault(table, []).extend(_lines(of_block))
-    return tables
+        place = Place(job.table, job.block, job.line)
+        of_block = blocks.setdefault((job.table, job.block), {})
+        of_block.setdefault(place, []).append(_outcome(job, runs.get(job.key, ())))
+    return {place: line for block in blocks.values() for place, line in _lines(block).items()}
 
 
 def _outcome(job: Planned, runs: Sequence[Run]) -> Outcome:
     failure = job.failure
     if run := next((run for run in runs if of_scene(run, job.config)), None):
         why = failure and f"failed when it was tried again: {failure}"
-        return Outcome(job, replace(run, label=job.line), why)
+        return Outcome(job, replace(run, label=job.label), why)
     return Outcome(job, None, f"failed: {failure}" if failure else "not measured yet")
 
 
-def _lines(of_block: Mapping[str, Sequence[Outcome]]) -> list[Repeated]:
+def _lines(of_block: Mapping[Place, Sequence[Outcome]]) -> dict[Place, Repeated]:
     every = [each for line in of_block.values() for each in line]
     runs = iter(over_common_frames([each.run for each in every if each.run]))
     lines = {
-        label: [each._replace(run=next(runs)) if each.run else each for each in line]
-        for label, line in of_block.items()
+        place: [each._replace(run=next(runs)) if each.run else each for each in line]
+        for place, line in of_block.items()
     }
     measured = [{each.job.scene for each in line if each.run} for line in lines.values()]
     common = set.intersection(*filter(None, measured)) if any(measured) else set()
-    return [_line(label, outcomes, common) for label, outcomes in lines.items()]
+    return {place: _line(outcomes, common) for place, outcomes in lines.items()}
 
 
-def _line(label: str, outcomes: Sequence[Outcome], common: set[str]) -> Repeated:
+def _line(outcomes: Sequence[Outcome], common: set[str]) -> Repeated:
     """A line whose runs are means over the scenes `common`, one per seed that has all of them."""
+    label = outcomes[0].job.label
     by_seed: dict[int, list[Run]] = {}
     by_scene: dict[str, list[Run]] = {}
     for each in sorted(outcomes, key=lambda each: each.job.scene not in common):

@@ -62,19 +62,17 @@ def test_the_prediction_is_clipped_and_rounded_and_the_ground_truth_is_not(devic
     assert raw["psnr"] != scores["psnr"]
 
 
-def test_backbones_that_cannot_be_had_are_named_once(monkeypatch, tmp_path, log, lpips_weights):
-    monkeypatch.setattr("bench.protocol._named", set())
-    monkeypatch.setattr("bench.weights._unreachable", ["no network"])
+def test_backbones_that_cannot_be_had_are_named(monkeypatch, tmp_path, log, web, lpips_weights):
+    monkeypatch.setattr("bench.weights.ADDRESS", web.address)  # it has none
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     monkeypatch.delenv("STEERBENCH_WEIGHTS", raising=False)
     (tmp_path / "alexnet_features.pth").symlink_to(lpips_weights / "alexnet_features.pth")
     weights = (tmp_path / "alexnet_features.pth").read_bytes()
     found = EvaluationProtocol().find_lpips(tmp_path, log)
     assert found == {"alex": hashlib.sha256(weights).hexdigest(), "vgg": None}
-    for _ in range(2):
-        loaded, missing = EvaluationProtocol().load_lpips(tmp_path, log)
-        assert (list(loaded), list(missing)) == (["alex"], ["lpips_vgg"])
-        assert "no network" in missing["lpips_vgg"]
+    loaded, missing = EvaluationProtocol().load_lpips(tmp_path, log)
+    assert (list(loaded), list(missing)) == (["alex"], ["lpips_vgg"])
+    assert "404" in missing["lpips_vgg"]
     assert [message.split(":")[0] for message in log.messages] == ["lpips_vgg"]
 
 

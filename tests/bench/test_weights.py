@@ -24,7 +24,6 @@ STATE = {"features.0.weight": torch.ones(2), "classifier.1.weight": torch.zeros(
 def publisher(monkeypatch, tmp_path, web) -> Web:
     """An empty cache, no environment, and a publisher of weights with no file."""
     monkeypatch.setattr(searched, "ADDRESS", web.address)
-    monkeypatch.setattr(searched, "_unreachable", [])
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     monkeypatch.delenv("STEERBENCH_WEIGHTS", raising=False)
     return web
@@ -80,22 +79,25 @@ def test_a_file_that_would_run_code_is_refused_and_runs_none(tmp_path, quiet_log
     assert not (tmp_path / "attacked").exists()
 
 
-def test_missing_weights_are_asked_for_once_and_the_message_says_what_to_do(publisher, quiet_log):
-    for net in ("vgg", "alex", "vgg"):
+def test_a_failed_download_says_what_to_do_and_hinders_neither_others_nor_a_second_try(
+    publisher, weights, quiet_log, tmp_path
+):
+    publisher.files[f"/{weights[0]}"] = weights[1]
+    for _ in range(2):
         with pytest.raises(Unavailable) as caught:
-            locate(net, None, quiet_log)
-    assert publisher.asked == ["/vgg16-397923af.pth"]
+            locate("vgg", None, quiet_log)
+    assert locate("alex", None, quiet_log) == cache(tmp_path) / weights[0]
+    assert publisher.asked == [*["/vgg16-397923af.pth"] * 2, f"/{weights[0]}"]
     for part in (f"{publisher.address}vgg16-397923af.pth", "404", "weights_dir=", "STEERBENCH_WE"):
         assert part in str(caught.value)
 
 
-def test_downloaded_weights_are_kept_if_right(tmp_path, publisher, weights, quiet_log, monkeypatch):
+def test_downloaded_weights_are_kept_if_right(tmp_path, publisher, weights, quiet_log):
     name, content = weights
     publisher.files[f"/{name}"] = content[:-1]
     with pytest.raises(Unavailable, match="SHA-256"):
         locate("alex", None, quiet_log)
     assert not (cache(tmp_path) / name).exists()
-    monkeypatch.setattr(searched, "_unreachable", [])
     publisher.files[f"/{name}"] = content
     assert locate("alex", None, quiet_log) == cache(tmp_path) / name
     assert locate("alex", None, quiet_log).read_bytes() == content

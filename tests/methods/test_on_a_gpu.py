@@ -165,7 +165,6 @@ def one_round(monkeypatch: pytest.MonkeyPatch) -> None:
     for kind in (HashField, StudentField, KiloField, NerfField, NsvfField):
         monkeypatch.setattr(kind, "round_samples", longest_ray(STEP))
     monkeypatch.setattr(torch_engine, "WARM_UP", 1)
-    monkeypatch.setattr(TorchEngine, "samples", lambda engine, network: 1)
 
 
 @pytest.mark.parametrize("name", METHODS)

@@ -15,10 +15,11 @@ import pytest
 from matplotlib.figure import Figure
 
 from bench.results import COLUMNS, Store
-from reports.runs import Run, load
-from sweeps.plan import chosen
+from reports.paper_tables import PaperTable, Place
+from reports.runs import Repeated, Run, load
+from sweeps.tables import chosen
 
-TABLES = {table.name: table for table in chosen(None, [])}
+TABLES = {table.name: table for table in chosen()}
 """Those of the paper."""
 
 FIGURES = {
@@ -62,6 +63,15 @@ def rows_with_cold(rows: pd.DataFrame) -> pd.DataFrame:
     cold.loc[cold["metric"].str.match("frame_ms|stage_ms"), figures] *= 2
     cold.loc[cold["metric"] == "fps", figures] /= 2
     return pd.concat([rows, cold], ignore_index=True)
+
+
+def measured_of(table: PaperTable, runs: Mapping[str, Run]) -> dict[Place, Repeated]:
+    """A run of each of these lines, by key, of the first block of `table`."""
+    data_set = table.blocks[0].data_set
+    return {
+        Place(table.name, data_set, key): Repeated(table.lines[key].label, [run])
+        for key, run in runs.items()
+    }
 
 
 def run_of(rows: pd.DataFrame, label: str = "run", **record: object) -> Run:

@@ -250,8 +250,8 @@ def test_a_line_of_the_table_has_no_more_than_two_numbers_in_a_cell():
 def test_a_finding_on_a_further_data_set_has_a_line_where_its_figures_differ():
     told = replace(RISING, says="PSNR gained", main=True)
     first = replace(comparison(told, 0.9, 0.3, 1.0), table="Table 9")
-    same = replace(first, table="Table 9, Tanks & Temples")
-    other = replace(comparison(told, 0.2, 0.1, 1.0), table="Table 9, Tanks & Temples")
+    same = replace(first, data_set="Tanks & Temples")
+    other = replace(comparison(told, 0.2, 0.1, 1.0), data_set="Tanks & Temples")
     silent = comparison(RISING, 0.9, 0.3, 1.0)
     assert [line[0] for line in finding_table([first, same, silent]).lines] == ["PSNR gained (dB)"]
     table = finding_table([first, other])

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from bench.errors import SteerbenchError
-from reports.comparison import comparison, metric_format, ranks
+from reports.comparison import comparison, ranks, shown_as
 from reports.runs import Repeated, Run
 from tests.reports.conftest import changed, elsewhere, run_of
 
@@ -71,8 +71,8 @@ def test_cold_frames_have_a_line_of_their_own_and_compete_among_themselves(make,
     ],
 )
 def test_a_figure_is_written_in_its_unit(metric, label, text):
-    got, write = metric_format(metric)
-    assert (got, write(1.5e6).replace(",", "")) == (label, text)
+    shown = shown_as(metric)
+    assert (shown.heading, shown.write(1.5e6).replace(",", "")) == (label, text)
 
 
 def test_a_metric_without_a_better_side_has_no_best(make, rows):
@@ -84,4 +84,4 @@ def test_a_metric_without_a_better_side_has_no_best(make, rows):
 
 def test_a_metric_that_does_not_exist_is_refused():
     with pytest.raises(SteerbenchError, match="pnsr: no such metric; expected one as"):
-        metric_format("pnsr")
+        shown_as("pnsr")

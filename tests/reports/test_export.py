@@ -9,33 +9,34 @@ import pandas as pd
 import pytest
 
 from reports import export
-from reports.paper_tables import Line, PaperTable
+from reports.paper_tables import Block, Line, PaperTable, Place
 from reports.runs import Repeated, Run
-from tests.reports.conftest import changed
+from tests.reports.conftest import changed, measured_of
 
+LINES = {
+    "t19": Line("T = 2^19", {"method": "a"}, {"psnr": 33.0}),
+    "k3": Line("K = 3", {"method": "b"}),
+    "mine": Line("mine_1", {"method": "c"}),
+    "none": Line("not yet", {"method": "d"}, {"psnr": 30.0}),
+}
 TABLE = PaperTable(
     name="table9",
     title="Quality & size",
-    published_on="Chair",
     metrics=["psnr", "ssim", "size_bytes.total"],
-    lines=[
-        Line("T = 2^19", {"method": "a"}, {"psnr": 33.0}),
-        Line("K = 3", {"method": "b"}),
-        Line("mine_1", {"method": "c"}),
-        Line("not yet", {"method": "d"}, {"psnr": 30.0}),
-    ],
+    blocks=[Block(LINES, "First", "Chair")],
+    number=9,
 )
 
 
 @pytest.fixture
-def lines(run: Run) -> dict[str, list[Repeated]]:
+def measured(run: Run) -> dict[Place, Repeated]:
     """Three measured lines; two of them differ by less than the decimals show."""
     figures = {
-        "T = 2^19": {"psnr": 30.456, "ssim": 0.9512, "size_bytes.total": 25.24e6},
-        "K = 3": {"psnr": 30.461, "ssim": 0.9514, "size_bytes.total": 25.0e6},
-        "mine_1": {"psnr": 29.0, "ssim": 0.9, "size_bytes.total": 3e6},
+        "t19": {"psnr": 30.456, "ssim": 0.9512, "size_bytes.total": 25.24e6},
+        "k3": {"psnr": 30.461, "ssim": 0.9514, "size_bytes.total": 25.0e6},
+        "mine": {"psnr": 29.0, "ssim": 0.9, "size_bytes.total": 3e6},
     }
-    return {"table9": [Repeated(label, [changed(run, of)]) for label, of in figures.items()]}
+    return measured_of(TABLE, {key: changed(run, of) for key, of in figures.items()})
 
 
 def cells(text: str) -> dict[str, list[str]]:
@@ -46,8 +47,8 @@ def cells(text: str) -> dict[str, list[str]]:
     }
 
 
-def test_latex_is_of_booktabs_has_the_decimals_of_the_paper_and_marks_the_best(lines):
-    text = export.latex([TABLE], lines)
+def test_latex_is_of_booktabs_has_the_decimals_of_the_paper_and_marks_the_best(measured):
+    text = export.latex([TABLE], measured)
     assert r"\caption{Quality \& size." in text
     for rule in ("toprule", "midrule", "bottomrule"):
         assert text.count(f"\\{rule}") == 1
@@ -55,29 +56,40 @@ def test_latex_is_of_booktabs_has_the_decimals_of_the_paper_and_marks_the_best(l
     assert text.isascii()
     found = cells(text)
     # 0.9512 and 0.9514 are both .951: they share the first place.
-    assert found["$T = 2^{19}$"] == [r"\textbf{30.46}", r"\textbf{0.951}", "25.2"]
-    assert found["$K = 3$"] == [r"\textbf{30.46}", r"\textbf{0.951}", r"\underline{25.0}"]
+    assert found["T = 2$^{19}$"] == [r"\textbf{30.46}", r"\textbf{0.951}", "25.2"]
+    assert found["K = 3"] == [r"\textbf{30.46}", r"\textbf{0.951}", r"\underline{25.0}"]
     assert found["not yet"] == ["--", "--", "--"]  # not measured
     assert found[r"mine\_1"] == [r"\underline{29.00}", r"\underline{0.900}", r"\textbf{3.0}"]
     # Of several seeds, half of the interval: t(0.975, 1) = 12.71.
-    runs = [changed(lines["table9"][0].runs[0], {"psnr": psnr}) for psnr in (29.0, 31.0)]
-    found = cells(export.latex([TABLE], {"table9": [Repeated("K = 3", runs)]}))
-    assert found["$K = 3$"][0] == r"30.00 $\pm$ 12.71"
+    place = Place("table9", "First", "k3")
+    runs = [changed(measured[place].runs[0], {"psnr": psnr}) for psnr in (29.0, 31.0)]
+    found = cells(export.latex([TABLE], {place: Repeated("K = 3", runs)}))
+    assert found["K = 3"][0] == r"30.00 $\pm$ 12.71"
 
 
-def test_a_metric_that_the_paper_lacks_is_written_as_on_our_pages(lines):
+def test_a_metric_that_the_paper_lacks_is_written_as_on_our_pages(measured):
     table = replace(TABLE, metrics=["flip", "peak_bytes"])
-    (line, *_) = lines["table9"]
-    (run,) = line.runs
+    (run,) = measured[Place("table9", "First", "t19")].runs
     rows = run.rows.replace({"metric": {"ssim": "flip"}})
     shown = changed(replace(run, rows=rows), {"flip": 0.1234, "peak_bytes": 2.5e9})
-    found = cells(export.latex([table], {"table9": [Repeated(line.label, [shown])]}))
-    assert found["$T = 2^{19}$"] == ["0.1234", "2,500.00"]
+    found = cells(export.latex([table], measured_of(table, {"t19": shown})))
+    assert found["T = 2$^{19}$"] == ["0.1234", "2,500.00"]
 
 
-def test_csv_has_a_figure_a_row_as_it_was_measured(lines):
-    found = pd.read_csv(io.StringIO(export.csv([TABLE], lines)))
-    assert len(found) == len(TABLE.lines) * len(TABLE.metrics)
-    row = found.set_index(["line", "metric"]).loc[("T = 2^19", "psnr")]
+def test_a_rule_stands_before_what_is_of_a_further_data_set(measured):
+    table = replace(TABLE, blocks=[*TABLE.blocks, Block({"k3": LINES["k3"]}, "Second")])
+    of_first = measured[Place("table9", "First", "k3")]
+    text = export.latex([table], {**measured, Place("table9", "Second", "k3"): of_first})
+    first, second = text.split("\\midrule\n")[1:]
+    assert "(Second)" not in first
+    assert second.startswith("K = 3 (Second) & ")
+    assert "Second" not in export.latex([table], measured)
+
+
+def test_csv_has_a_figure_a_row_as_it_was_measured(measured):
+    found = pd.read_csv(io.StringIO(export.csv([TABLE], measured)))
+    assert len(found) == len(LINES) * len(TABLE.metrics)
+    row = found.set_index(["line", "metric"]).loc[("t19", "psnr")]
+    assert row["label"] == "T = 2^19"
     assert (row["measured"], row["published"], row["runs"]) == (30.456, 33.0, 1)
     assert pd.isna(row["half_interval"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import pytest
@@ -12,9 +12,10 @@ from reports import figures
 from reports.images import Picture
 from reports.outliers import Outlier
 from reports.paper_page import PAGE, _curves, write_paper_page
-from reports.paper_tables import Line
+from reports.paper_tables import CURVES, Block, Line, PaperTable, Place, point
 from reports.runs import Repeated, Run
-from tests.reports.conftest import TABLES, changed, shifted
+from sweeps.tables import chosen
+from tests.reports.conftest import TABLES, changed, measured_of, shifted
 
 
 def of(run: Run, label: str) -> Repeated:
@@ -23,22 +24,20 @@ def of(run: Run, label: str) -> Repeated:
 
 
 def test_every_line_that_is_shown_in_a_figure_is_one_of_the_tables():
-    blocks = [block for table in TABLES.values() for block in table.blocks]
-    lines = {(block.name, line.label) for block in blocks for line in block.lines}
+    lines = {(table.name, key) for table in TABLES.values() for key in table.lines}
     shown = [entry["lines"] for entry in (*PAGE["plots"], *PAGE["images"]) if "lines" in entry]
     shown += [{"": plot["ceiling"]} for plot in PAGE["plots"] if "ceiling" in plot]
-    named = [(table, label) for x in shown for table, *labels in x.values() for label in labels]
+    named = [(table, str(key)) for x in shown for table, *keys in x.values() for key in keys]
     assert len(named) > len(shown) > 4
     assert {*named} <= lines
 
 
 def test_the_page_has_every_table_and_every_figure(run, tmp_path):
-    lines = {
-        name: [of(run, line.label) for block in table.blocks for line in block.lines]
-        for name, table in TABLES.items()
-    }
+    measured: dict[Place, Repeated] = {}
+    for table in TABLES.values():
+        measured |= measured_of(table, dict.fromkeys(table.lines, run))
     found = [Outlier(run.key, "13 dB among 30s"), Outlier("another", "not of this page")]
-    page = write_paper_page([*TABLES.values()], lines, found, tmp_path)
+    page = write_paper_page([*TABLES.values()], measured, found, tmp_path)
     text = page.read_text()
     shown = re.findall(r"!\[[^]]*\]\((.+?)\)", text)
     assert len(shown) == 6
@@ -56,8 +55,8 @@ def test_the_page_has_every_table_and_every_figure(run, tmp_path):
 def test_a_method_has_one_mark_at_its_first_measured_line_and_an_added_one_too(
     run, tmp_path, monkeypatch
 ):
-    table = replace(TABLES["table1"], lines=[*TABLES["table1"].lines, Line("x", {"method": "x"})])
-    labels = [line.label for line in table.lines if line.label != "SteerNeRF, half precision"]
+    (table,) = chosen("table1", methods=["x"])
+    measured = measured_of(table, dict.fromkeys(table.lines.keys() - {"bf16"}, run))
     drawn: list[list[str]] = []
     real = figures.quality_plot
 
@@ -66,21 +65,21 @@ def test_a_method_has_one_mark_at_its_first_measured_line_and_an_added_one_too(
         return real(shown, metric)
 
     monkeypatch.setattr(figures, "quality_plot", watched)
-    write_paper_page([table], {"table1": [of(run, label) for label in labels]}, [], tmp_path)
+    write_paper_page([table], measured, [], tmp_path)
     methods = ["NeRF", "NSVF", "KiloNeRF", "PlenOctree", "DIVeR", "Instant-NGP", "3D Gaussians"]
     assert drawn == 2 * [[*methods, "SteerNeRF", "x"]]
 
 
 def test_findings_come_first_all_comparisons_last(run, tmp_path):
     table, seeds = TABLES["table6"], range(3)
-    lines = [
-        Repeated(
+    measured = {
+        Place("table6", table.blocks[0].data_set, key): Repeated(
             line.label,
             [shifted(run, 0.1 * place + 0.01 * seed * place, seed=seed) for seed in seeds],
         )
-        for place, line in enumerate(reversed(table.lines))
-    ]
-    text = write_paper_page([table], {"table6": lines}, [], tmp_path).read_text()
+        for place, (key, line) in enumerate(reversed(table.lines.items()))
+    }
+    text = write_paper_page([table], measured, [], tmp_path).read_text()
     before, after = text.split("## The tables")
     says = "PSNR lost by a hash table of 2^16 against 2^19"
     assert f"| **{says} (dB)** | +0.02 | +0.11 | " in before
@@ -91,12 +90,20 @@ def test_findings_come_first_all_comparisons_last(run, tmp_path):
 
 
 def test_a_page_of_nothing_still_says_what_is_missing(tmp_path):
-    lines = {"table5": [Repeated("with joint training", [], ["not measured yet"])]}
-    text = write_paper_page([*TABLES.values()], lines, [], tmp_path).read_text()
+    lines = [Repeated("with joint training", [], ["not measured yet"])]
+    measured = {Place("table5", TABLES["table5"].blocks[0].data_set, "joint"): lines[0]}
+    text = write_paper_page([*TABLES.values()], measured, [], tmp_path).read_text()
     assert "| with joint training: not measured yet | – (+1.07) |" in text
     assert "comparisons" not in text
     assert "![" not in text
     assert "Outliers" not in text
+
+
+def test_a_page_of_ones_own_table_has_its_title(run, tmp_path):
+    table = PaperTable("mine", "My table", ["psnr"], [Block({"a": Line("here", {})})])
+    text = write_paper_page([table], measured_of(table, {"a": run}), [], tmp_path).read_text()
+    assert text.startswith("# My table\n")
+    assert "paper" not in text
 
 
 def test_a_curve_has_a_point_for_every_scored_frame_and_hollow_ones_for_cold(run, tmp_path, drawn):
@@ -116,20 +123,32 @@ def test_a_mark_stands_where_its_line_is_in_quality_and_cost(run, tmp_path, draw
     assert mark.get_xydata().tolist() == [[104e-6, run.values["psnr"]]]
 
 
+def on_curves(
+    table: PaperTable, runs: Mapping[str, Mapping[float, Sequence[Run]]]
+) -> dict[Place, Repeated]:
+    """These runs of each line after each share of its training, in the order of the shares."""
+    data_set = table.blocks[0].data_set
+    return {
+        Place(table.name, data_set, key)
+        if share == 1
+        else Place(table.name, CURVES, point(key, share)): Repeated("", of_share)
+        for key, shares in runs.items()
+        for share, of_share in shares.items()
+    }
+
+
 @pytest.mark.parametrize(("of_method", "of_budget"), [(None, 80), (80, 7)])
 def test_a_curve_has_a_point_for_every_measured_share(of_method, of_budget, run, tmp_path, drawn):
     table = TABLES["table5"]
     made_of = {"config": {"method": {"steps": of_method}}}
     budget = {"renderer_steps": of_budget}
     trained = replace(run, record={**run.record, "budget": budget, "made_of": made_of})
-    first, second = table.lines
-    halves = [table.marks[line.label, 0.5].label for line in table.lines]
-    quarter = table.marks[first.label, 0.25].label
-    measured = [of(trained, label) for label in (first.label, second.label, *halves, quarter)]
-    curves = list(_curves(table, {"table5": measured}))
+    halves = {key: {0.5: [trained], 1.0: [trained]} for key in table.lines}
+    halves["joint"][0.25] = [trained]
+    curves = list(_curves(table, on_curves(table, halves)))
     assert [(curve.label, list(curve.points)) for curve in curves] == [
-        (first.label, [20, 40, 80]),
-        (second.label, [40, 80]),
+        ("with joint training", [20, 40, 80]),
+        ("without joint training", [40, 80]),
     ]
     ceiling = Repeated("field", [changed(run, {"psnr": 99.0})])
     figures.quality_over_training(curves, ceiling, tmp_path / "curves.png")
@@ -145,14 +164,9 @@ def test_a_curve_has_a_point_for_every_measured_share(of_method, of_budget, run,
 
 
 def test_all_points_of_a_curve_are_of_the_same_seeds(run):
-    table, (line, *_) = TABLES["table5"], TABLES["table5"].lines
-    seeds = {0.25: (0, 1), 0.5: (0, 2), 1.0: (0, 1, 2)}
-    labels = {share: table.marks[line.label, share].label for share in (0.25, 0.5)}
-    measured = [
-        Repeated({**labels, 1.0: line.label}[share], [changed(run, {}, seed=x) for x in some])
-        for share, some in seeds.items()
-    ]
-    (curve,) = _curves(table, {"table5": measured})
+    table, seeds = TABLES["table5"], {0.25: (0, 1), 0.5: (0, 2), 1.0: (0, 1, 2)}
+    runs = {share: [changed(run, {}, seed=x) for x in some] for share, some in seeds.items()}
+    (curve,) = _curves(table, on_curves(table, {"joint": runs}))
     assert [[r.facts["seed"] for r in x.runs] for x in curve.points.values()] == 3 * [[0]]
 
 

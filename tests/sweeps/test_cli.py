@@ -39,6 +39,12 @@ def test_help_completion_and_list_answer_without_torch():
     subprocess.run([sys.executable, "-c", program], capture_output=True, check=True)
 
 
+@pytest.mark.parametrize(("terminal", "begins"), [(False, "## Choices\n\n| choice |"), (True, "┏")])
+def test_tables_are_markdown_but_in_a_terminal(steerbench, monkeypatch, terminal, begins):
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: terminal, raising=False)
+    assert begins in steerbench("list").out
+
+
 def test_list_shows_choices_backends_and_why_an_engine_cannot_be_used(steerbench, monkeypatch):
     monkeypatch.setitem(sys.modules, "openvino", None)
     out = steerbench("list", "--here").out

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import re
 import shlex
-import shutil
 import sys
 from argparse import Namespace
 from collections.abc import Iterator
@@ -17,11 +16,11 @@ from typing import Any
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
-from sweeps.variants import METHOD
 
 from sweeps import cli, overrides
 from sweeps.overrides import choices, composed, swept
-from sweeps.plan import chosen, plan
+from sweeps.plan import plan
+from sweeps.tables import chosen
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -91,31 +90,35 @@ WITHOUT_LPIPS = ("protocol.lpips=[]", "protocol.name=quick")
 
 def test_what_the_document_makes_is_listed_measured_and_studied(steerbench, mine, monkeypatch):
     assert "The mean colour of the training pictures." in steerbench(*typed("list")).out
-    measured = steerbench(*typed("run"), *WITHOUT_LPIPS).ok()
+    measured = steerbench(*typed("run --config-dir"), *WITHOUT_LPIPS).ok()
     assert "19.83" in measured.out  # 20 log10(255 / 26)
     assert "paint" in measured.out
-    refused = steerbench(*typed("run"), *WITHOUT_LPIPS, "method.shade=2.0")
+    refused = steerbench(*typed("run --config-dir"), *WITHOUT_LPIPS, "method.shade=2.0")
     assert refused.err.endswith("method: shade: expected 0 to 1, got 2.0\n")
-    monkeypatch.setattr("methods.checks.found", lambda name: [])  # no kernels
-    studied = steerbench(*typed("accuracy"), "--repeats", "1").ok()
+    studied = steerbench(*typed("accuracy"), "protocol.rounds=2").ok()
     assert "shade 0.9" in studied.out
 
 
 def test_the_method_of_the_document_has_a_line_in_a_table(mine, monkeypatch):
-    seen = captured(monkeypatch, typed("paper"))
-    (table,) = chosen(seen.table, seen.methods)
-    assert "mean_colour" in [job.line for job in plan(table, seen.overrides)]
-    assert captured(monkeypatch, typed("report")).methods == seen.methods
+    seen = captured(monkeypatch, typed("paper .* --table table1"))
+    (table,) = chosen(seen.table, seen.overrides, seen.methods)
+    assert "mean_colour" in [job.label for job in plan(table, seen.overrides)]
+    assert captured(monkeypatch, typed("report .* --table table1")).methods == seen.methods
 
 
-def test_the_table_of_the_document_is_planned(tmp_path, monkeypatch):
-    configs = tmp_path / overrides.CONFIGS.relative_to(ROOT)
-    shutil.copytree(overrides.CONFIGS, configs)
-    assert "sweeps/configs/experiment/table7.yaml" in write_files("extending.md", tmp_path)
-    monkeypatch.setattr(overrides, "CONFIGS", configs)
-    monkeypatch.setattr("sweeps.plan.TABLES", configs / "experiment")
-    (table,) = chosen("table7", [])
-    assert [job.line for job in plan(table, ["seed=0"])] == [line.label for line in table.lines]
+def test_the_table_of_the_document_is_measured_reported_and_the_same_sweep(steerbench, mine):
+    words = typed("paper --config-dir configs --table shades")
+    steerbench(*words, *WITHOUT_LPIPS).ok()
+    page = Path("outputs/paper/report.md")
+    written = page.read_text()
+    assert written.startswith("# Shades of the mean colour\n")
+    assert "| method.shade=1.0 | **19.83** |" in written  # 20 log10(255 / 26)
+    assert "seed 0 / 1" in written
+    page.unlink()
+    steerbench(*typed("report --config-dir configs --table shades"), *WITHOUT_LPIPS).ok()
+    assert page.read_text() == written
+    swept = steerbench(*typed("run -m"), *WITHOUT_LPIPS).ok()
+    assert swept.err.count("already measured") == 4
 
 
 # All documents
@@ -179,9 +182,7 @@ def test_every_command_of_a_document_can_be_typed(document, words, monkeypatch, 
             return
     else:
         options = captured(monkeypatch, words)
-        studied = cli.COMMANDS[words[0]]["group"] == "studies of a method"
-        usual = [METHOD] if studied else []
-        settings = [*usual, *getattr(options, "overrides", [])]
+        settings = getattr(options, "overrides", [])
     settings = [word for word in settings if not word.startswith(ELSEWHERE)]
     several = swept(settings)
     settings = [word for word in settings if word.partition("=")[0] not in several]

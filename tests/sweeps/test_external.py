@@ -100,8 +100,7 @@ def test_the_worker_of_the_document_takes_turns_with_ours(steerbench, documented
     assert first["beside"] == second["beside"]
 
 
-def test_the_worker_of_the_document_has_a_line_in_a_table(steerbench, documented, monkeypatch):
-    monkeypatch.setattr("sweeps.plan.TABLES", HERE / "configs/experiment")
+def test_the_worker_of_the_document_has_a_line_in_a_table(steerbench, documented):
     words = typed("paper --config-dir")
     steerbench(*(word.replace("table1", "table9") for word in words), *WHITE, "seed=0").ok()
     assert "| mine |" in Path("outputs/paper/report.md").read_text()

@@ -12,7 +12,7 @@ import pytest
 from bench.case import Case
 from bench.errors import Unavailable
 from bench.types import Log
-from sweeps import terminal
+from reports.tables import Table
 from sweeps.commands.kernels import wrong_of
 from sweeps.processes import lock_file
 
@@ -58,10 +58,11 @@ def test_the_last_line_is_json_and_a_wrong_kernel_fails(steerbench, asked):
     assert outcome.json == [SMALL, REFERENCE, RIGHT, WRONG]
 
 
-def test_a_fast_version_has_a_line_with_the_time_of_its_reference(steerbench, asked):
-    terminal.shown.clear()
+def test_a_fast_version_has_a_line_with_the_time_of_its_reference(steerbench, asked, monkeypatch):
+    shown: list[Table] = []
+    monkeypatch.setattr("sweeps.commands.kernels.show", shown.append)
     steerbench("kernels")
-    (table,) = terminal.shown
+    (table,) = shown
     wrong, right, small = (dict(zip(table.columns, line, strict=True)) for line in table.lines)
     assert wrong["kernel"] == "march"  # first, then those that save most
     assert [right[x] for x in ("error", "tolerance")] == ["1.0e-07", "1.0e-06"]
@@ -176,8 +177,9 @@ def test_cases_nearest_to_their_tolerances_are_shown_again(steerbench, monkeypat
         for number in range(10)
     ]
     monkeypatch.setattr("methods.checks.found", lambda name: cases)
-    terminal.shown.clear()
+    shown: list[Table] = []
+    monkeypatch.setattr("sweeps.commands.stress.show", shown.append)
     steerbench("stress")
-    nearest = terminal.shown[-1].lines
+    nearest = shown[-1].lines
     assert [line[1] for line in nearest] == ["9", "8", "7", "6", "5"]
     assert nearest[0][3:] == ("reference", "cpu", "fp32", "4.0e-07", "5.0e-07", "ok")

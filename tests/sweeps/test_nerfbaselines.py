@@ -48,6 +48,18 @@ def test_what_was_exported_is_imported_with_equal_figures(steerbench, exported):
         assert theirs["n"][metric] == 2
 
 
+def test_a_perfect_frame_keeps_its_infinite_psnr(run, steerbench):
+    assert run("pictures=2", "method.level=1.0").status == 0  # white, as the scene is
+    (key,) = Store(Path("outputs")).rows()["run"].unique()
+    steerbench("export", "nerfbaselines", key, "--to", "theirs").ok()
+    results = json.loads(Path("theirs/results.json").read_text())
+    assert results["metrics"]["psnr"] == float("inf")  # as NerfBaselines itself writes it
+    steerbench("import", "nerfbaselines", "theirs/results.json").ok()
+    rows = Store(Path("outputs")).rows()
+    imported = rows[rows["device"] == "imported"].set_index("metric")["value"]
+    assert (imported["psnr"], imported["ssim"]) == (float("inf"), 1.0)
+
+
 def test_the_files_are_those_of_the_run(exported):
     key, folder = exported
     results = json.loads((folder / "results.json").read_text())

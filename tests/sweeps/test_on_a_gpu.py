@@ -30,7 +30,7 @@ FRAMES = ["--frames", "3", "--repeats", "1"]
         ["skips", *FRAMES],
         ["accuracy", *FRAMES, "--filter", "stop"],
         ["scaling", "--frames", "3", "--axis", "L"],
-        ["paper", "--table", "table2", "tables.beyond=false"],
+        ["paper", "--table", "table2"],
         ["kernels", "--filter", "adam"],
     ],
     ids=" ".join,

@@ -13,9 +13,10 @@ import torch
 from bench.errors import SteerbenchError, Unavailable
 from bench.results import Store
 from bench.study import Axis, Study, turned
+from sweeps import tables
 from sweeps.commands.study import decibels
 from sweeps.overrides import engine_kinds
-from sweeps.studies import subjects, table_axes
+from sweeps.studies import subjects
 from tests.sweeps.conftest import QUICK, STAND_INS, Outcome
 
 ROUNDS = ["trajectory=test", "engine=torch", "protocol=study-1", "protocol.rounds=2"]
@@ -241,11 +242,11 @@ def test_scaling_has_pixels_and_threads_for_every_method_and_scores_nothing_at_o
 
 
 def test_axes_of_tables_belong_to_their_method():
-    axes = table_axes("steernerf")
+    axes = tables.axes("steernerf")
     assert axes["L"] == Axis("L = {}", "method.model.frames", (0, 1, 2, 3))
     assert axes["T"].size(14) == 2**14
     assert axes["K"].size(9) == 9
-    assert table_axes("ngp") == {}
+    assert tables.axes("ngp") == {}
 
 
 def test_several_methods_get_what_they_have_of_the_settings(elsewhere):

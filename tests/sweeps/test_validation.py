@@ -8,7 +8,8 @@ from bench.results import Store
 from bench.types import Scene
 from sweeps.measurement import described
 from sweeps.overrides import composed
-from sweeps.plan import chosen, plan
+from sweeps.plan import plan
+from sweeps.tables import chosen
 from tests.sweeps.conftest import STAND_INS
 
 SPLIT = "split=validation"
@@ -51,7 +52,7 @@ def test_a_study_scores_what_it_did_not_learn_from(steerbench, learned_from, mon
         assert not set(HELD_OUT) & set(scene.splits["train"].names)
 
 
-@pytest.mark.parametrize("table", chosen(None, []), ids=lambda table: table.name)
+@pytest.mark.parametrize("table", chosen(), ids=lambda table: table.name)
 def test_every_job_of_the_paper_goes_to_the_held_out_views(table):
     assert {job.config.trajectory.split for job in plan(table, [SPLIT])} == {"validation"}
 

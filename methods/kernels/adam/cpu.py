@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import get_num_threads, njit, prange
+from numba import get_num_threads, prange
 from torch import Tensor
 
 from methods.kernels.adam import BETAS, EPS, AdamState, corrections
-from methods.kernels.cpu import check_float32, f32, pack_bf16, u64
+from methods.kernels.cpu import check_float32, f32, jit, pack_bf16, u64
 from methods.kernels.encode import HashGrid
 from methods.kernels.encode.cpu import by_channel, level_arrays, scatter_level
 
@@ -55,14 +55,14 @@ def _arrays(
     return (*tables, state.steps.numpy(), words), (*corrections().numpy(), f32(rate))
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@jit(parallel=True, error_model="numpy")
 def _update(grad, features, own, how):
     entries = len(own[3])
     for chunk in prange((entries + CHUNK - 1) // CHUNK):
         _entries(chunk * CHUNK, min(entries, (chunk + 1) * CHUNK), features, grad, own, how)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@jit(parallel=True, error_model="numpy")
 def _update_levels(positions, grad, shapes, tables, how, workers):
     """As `_update`, with the gradient `grad` [levels * features, N] of samples at `positions`."""
     scales, strides, offsets = shapes
@@ -84,7 +84,7 @@ def _update_levels(positions, grad, shapes, tables, how, workers):
                 _entries(entry, last, features, total, own, how)
 
 
-@njit(cache=True, error_model="numpy")
+@jit(error_model="numpy")
 def _entries(a, b, features, grad, own, how):
     """Update the entries from `a` to `b`, at most `CHUNK`, and clear their gradient.
 
@@ -102,7 +102,7 @@ def _entries(a, b, features, grad, own, how):
         _step(touched, count, features, grad, table, first, second, steps, packed, to1, to2, rate)
 
 
-@njit(inline="always")
+@jit(inline="always")
 def _find(a, b, features, grad, touched):
     """List the entries from `a` to `b` that have a gradient; return their number. There is no
     branch, which a CPU would mispredict at almost every other entry."""
@@ -116,7 +116,7 @@ def _find(a, b, features, grad, touched):
     return count
 
 
-@njit(inline="always")
+@jit(inline="always")
 def _step(touched, count, features, grad, table, first, second, steps, packed, to1, to2, rate):
     """Update the first `count` entries of `touched`."""
     last = len(to1) - 1

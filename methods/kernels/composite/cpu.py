@@ -10,10 +10,10 @@ import math
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
-from methods.kernels.cpu import arrays, check_float32, f32
+from methods.kernels.cpu import arrays, check_float32, f32, jit
 from methods.kernels.types import Intervals, Pixels
 
 CHUNK = 64  # rays
@@ -69,13 +69,13 @@ class _Composite(torch.autograd.Function):
         return *results, None, None, None, None, None
 
 
-@njit(cache=True)
+@jit()
 def _opacity(sigma, delta):
     # A sample of length 0 has opacity 0 even at infinite density (avoids inf * 0).
     return -math.expm1(-f64(sigma * delta)) if delta > 0 else 0.0
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _forward(sigma, values, t, delta, offsets, stop, front, out, depth_sum, alpha, opacity):
     """`opacity` keeps the opacities of samples for `_backward`, unless it is empty."""
     rays, channels = out.shape
@@ -100,7 +100,7 @@ def _forward(sigma, values, t, delta, offsets, stop, front, out, depth_sum, alph
             alpha[ray] += f64(front[ray]) - transmittance
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _weights(sigma, delta, offsets, stop, front, weight):
     rays = len(offsets) - 1
     for chunk in prange((rays + CHUNK - 1) // CHUNK):
@@ -114,7 +114,7 @@ def _weights(sigma, delta, offsets, stop, front, weight):
                 transmittance -= part
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _visible(sigma, delta, offsets, front, stop, counts, left):
     for ray in prange(len(offsets) - 1):
         transmittance = f64(front[ray])
@@ -125,7 +125,7 @@ def _visible(sigma, delta, offsets, front, stop, counts, left):
         counts[ray], left[ray] = i - offsets[ray], transmittance
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _backward(opacity, values, t, delta, offsets, stop, light, grad_sigma, grad_values):
     """With g_i = dL/dw_i and T_{i+1} = T_i (1 - alpha_i):
 

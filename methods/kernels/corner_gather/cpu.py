@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numba import get_num_threads, njit, prange, types
+from numba import get_num_threads, prange, types
 from numba.extending import overload
 from torch import Tensor
 
-from methods.kernels.cpu import FAST, arrays, check_float32, u32
+from methods.kernels.cpu import FAST, arrays, check_float32, jit, u32
 
 CHUNK = 256  # samples
 
@@ -49,7 +49,7 @@ class _Gather(torch.autograd.Function):
         return target if ctx.grad_buffer is None else None, None, None, None, None
 
 
-@njit(cache=True)
+@jit()
 def eight_of(values, i):
     """The eight numbers of a row; as separate variables they stay in registers."""
     return (
@@ -76,7 +76,7 @@ def _as_float_of(number):
     return lambda number: number
 
 
-@njit(cache=True, fastmath=FAST)
+@jit(fastmath=FAST)
 def blended(table, rows, weights, k):
     """Channel `k` of the sum of eight `rows` of `table` with `weights`."""
     r0, r1, r2, r3, r4, r5, r6, r7 = rows
@@ -93,7 +93,7 @@ def blended(table, rows, weights, k):
     )
 
 
-@njit(cache=True, fastmath=FAST, parallel=True)
+@jit(fastmath=FAST, parallel=True)
 def _gather(table, corners, voxel, weights, out):
     total, channels = out.shape
     for chunk in prange((total + CHUNK - 1) // CHUNK):
@@ -103,7 +103,7 @@ def _gather(table, corners, voxel, weights, out):
                 out[i, k] = blended(table, rows, shares, k)
 
 
-@njit(cache=True, fastmath=FAST, parallel=True)
+@jit(fastmath=FAST, parallel=True)
 def _scatter(grad, corners, voxel, weights, target, shares):
     """Adjoint of `_gather`: target[row] += weight * grad; `shares` is a power of 2."""
     total, channels = grad.shape

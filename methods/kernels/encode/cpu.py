@@ -14,10 +14,21 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numba import get_num_threads, njit, prange
+from numba import get_num_threads, prange
 from torch import Tensor
 
-from methods.kernels.cpu import FAST, add_pair, arrays, check_float32, f32, i32, pack_bf16, u32, u64
+from methods.kernels.cpu import (
+    FAST,
+    add_pair,
+    arrays,
+    check_float32,
+    f32,
+    i32,
+    jit,
+    pack_bf16,
+    u32,
+    u64,
+)
 from methods.kernels.encode import PRIMES, HashGrid
 
 CHUNK = 256  # samples; 256 * (8 indices + 8 weights + 8 values) * 4 bytes = 24 KiB
@@ -75,7 +86,7 @@ def level_arrays(grid: HashGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.array(grid.scales, np.float32), strides, offsets
 
 
-@njit(cache=True, fastmath=FAST)
+@jit(fastmath=FAST)
 def _load(positions, first, count, xyz):
     """Copy positions [first, first + count) axis by axis, clamped to [0, 1], NaN as 0: it must not
     become an address."""
@@ -86,7 +97,7 @@ def _load(positions, first, count, xyz):
             xyz[axis * CHUNK + i] = value if value < f32(1) else f32(1)
 
 
-@njit(cache=True, fastmath=FAST)
+@jit(fastmath=FAST)
 def _weights(x, y, z, scale):
     """Cell and trilinear weights of a position; those along y and z are already multiplied."""
     px, py, pz = x * scale + f32(0.5), y * scale + f32(0.5), z * scale + f32(0.5)
@@ -96,7 +107,7 @@ def _weights(x, y, z, scale):
     return u32(ix), u32(iy), u32(iz), gx, fx, gy * gz, fy * gz, gy * fz, fy * fz
 
 
-@njit(cache=True, fastmath=FAST)
+@jit(fastmath=FAST)
 def _put_weights(weight, i, gx, fx, w00, w10, w01, w11):
     """Weights of the eight corners of sample i, x varying fastest."""
     weight[i], weight[CHUNK + i] = gx * w00, fx * w00
@@ -105,7 +116,7 @@ def _put_weights(weight, i, gx, fx, w00, w10, w01, w11):
     weight[6 * CHUNK + i], weight[7 * CHUNK + i] = gx * w11, fx * w11
 
 
-@njit(cache=True, fastmath=FAST)
+@jit(fastmath=FAST)
 def _corners_hashed(xyz, count, scale, mask, index, weight):
     for i in range(count):
         ix, iy, iz, gx, fx, w00, w10, w01, w11 = _weights(
@@ -126,13 +137,13 @@ def _corners_hashed(xyz, count, scale, mask, index, weight):
         _put_weights(weight, i, gx, fx, w00, w10, w01, w11)
 
 
-@njit(cache=True, fastmath=FAST)
+@jit(fastmath=FAST)
 def _wrap(entry, size):
     """entry mod size, for entry < 2 size."""
     return u32(entry - size) if entry >= size else entry
 
 
-@njit(cache=True, fastmath=FAST)
+@jit(fastmath=FAST)
 def _corners_dense(xyz, count, scale, stride, size, index, weight):
     slice_ = u32(stride * stride)
     for i in range(count):
@@ -153,7 +164,7 @@ def _corners_dense(xyz, count, scale, stride, size, index, weight):
         _put_weights(weight, i, gx, fx, w00, w10, w01, w11)
 
 
-@njit(cache=True)
+@jit()
 def _corners(xyz, count, scale, stride, size, index, weight):
     if stride:
         _corners_dense(xyz, count, scale, stride, size, index, weight)
@@ -161,14 +172,14 @@ def _corners(xyz, count, scale, stride, size, index, weight):
         _corners_hashed(xyz, count, scale, u32(size - u32(1)), index, weight)
 
 
-@njit(cache=True)
+@jit()
 def _gather(level_table, index, count, value):
     for corner in range(8):
         for i in range(count):
             value[corner * CHUNK + i] = level_table[index[corner * CHUNK + i]]
 
 
-@njit(cache=True, fastmath=FAST)
+@jit(fastmath=FAST)
 def _blend(value, weight, count, blended):
     for i in range(count):
         total = f32(0)
@@ -177,7 +188,7 @@ def _blend(value, weight, count, blended):
         blended[i] = total
 
 
-@njit(cache=True, fastmath=FAST)
+@jit(fastmath=FAST)
 def _blend_packed(word, weight, count, blended):
     for i in range(count):
         low, high = f32(0), f32(0)
@@ -189,7 +200,7 @@ def _blend_packed(word, weight, count, blended):
         blended[i] = pack_bf16(low, high)
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _encode_packed(positions, table, scales, strides, offsets, out):
     total, levels = out.shape
     for chunk in prange((total + CHUNK - 1) // CHUNK):
@@ -210,7 +221,7 @@ def _encode_packed(positions, table, scales, strides, offsets, out):
                 out[first + i, level] = blended[level, i]
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _encode_float(positions, table, scales, strides, offsets, out):
     total, channels = out.shape
     levels, features = len(scales), table.shape[1]
@@ -233,7 +244,7 @@ def _encode_float(positions, table, scales, strides, offsets, out):
                 out[first + i, channel] = blended[channel, i]
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _widen_by_channel(words, columns):
     """Pairs of bfloat16 [N, C / 2] as float32 [C, N]."""
     total, pairs = words.shape
@@ -245,7 +256,7 @@ def _widen_by_channel(words, columns):
                 columns[2 * pair + 1, i] = u32(word & u32(0xFFFF0000)).view(np.float32)
 
 
-@njit(cache=True)
+@jit()
 def _scatter_pairs(index, weight, count, first, second, target):
     for i in range(count):
         for corner in range(8):
@@ -254,7 +265,7 @@ def _scatter_pairs(index, weight, count, first, second, target):
             add_pair(target, place, weight[at], first[i], second[i])
 
 
-@njit(cache=True)
+@jit()
 def _scatter_one(index, weight, count, grad, target, feature, features):
     for i in range(count):
         for corner in range(8):
@@ -263,7 +274,7 @@ def _scatter_one(index, weight, count, grad, target, feature, features):
             target[place] += weight[at] * grad[i]
 
 
-@njit(cache=True)
+@jit()
 def scatter_level(level, positions, grad, scales, strides, offsets, target):
     """Adjoint of `_encode_float` at one level: target[corner] += weight * grad. `grad` is
     [channels, N], of all levels; `target` the level's [entries, features], flat."""
@@ -283,7 +294,7 @@ def scatter_level(level, positions, grad, scales, strides, offsets, target):
                 _scatter_one(index, weight, count, part[feature], target, feature, features)
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _scatter(positions, grad, scales, strides, offsets, target, workers):
     """`scatter_level` for all levels; `grad` is [channels, N], `target` the whole table, flat."""
     levels = len(scales)

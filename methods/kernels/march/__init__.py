@@ -22,8 +22,9 @@ from methods.kernels.types import Extent, Occupancy, Samples, check_rays, expect
 
 MAX_SAMPLES = 1024  # most samples of a ray through the unit cube at the usual step, sqrt(3) / 1024
 
-PARALLEL = 2.0**-127
-"""A smaller component of a direction counts as 0, because its reciprocal overflows float32."""
+LEAST_STEP = 2.0**-126
+"""A ray whose step in t is smaller has no samples: float32 holds such numbers with few digits, and
+their reciprocals overflow."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,8 @@ def march(
 ) -> Samples:
     """Sample R `rays` inside the unit cube. Not differentiable.
 
-    A ray has no samples if it misses the cube, is not finite, or has a direction that is zero or so
-    short that t overflows.
+    A ray has no samples if it misses the cube, is not finite, or has a direction that is zero, so
+    short that t overflows, or so long that a step in t is below `LEAST_STEP`.
 
     Args:
         step: world length of a step, scene units.

@@ -15,7 +15,7 @@ from torch.nn.functional import normalize
 from bench.case import DTYPES, U32, Bound, Case, Given, Operation, Property, placed
 from bench.types import Rays
 from methods.kernels.dispatch import served
-from methods.kernels.march import MAX_SAMPLES, march
+from methods.kernels.march import LEAST_STEP, MAX_SAMPLES, march
 from methods.kernels.types import Occupancy
 
 STEP = math.sqrt(3) / MAX_SAMPLES
@@ -50,6 +50,14 @@ def special_rays() -> Rays:
     return Rays(origins, torch.cat((ahead, ahead, last)))
 
 
+def long_rays() -> Rays:
+    """Rays from inside with directions up to the largest number, and lengths beyond it."""
+    rays, sizes = some_rays(32), torch.tensor([1e30, 1e34, 1e35, 1e36, 1e37, 1e38, 2e38])
+    origins, signs = rays.origins[3::4], rays.directions[3::4].sign()
+    directions = sizes[:, None, None] * signs
+    return Rays(origins.repeat(len(sizes), 1), directions.flatten(0, 1))
+
+
 MIDDLE = torch.full((3,), 0.5)
 SPECIAL = {
     "along axes": Rays(MIDDLE - 2 * AXES, AXES),
@@ -74,6 +82,9 @@ SPECIAL = {
     "along an edge, off it by 1e-40": Rays(torch.zeros(6, 3), AXES.abs() + 1e-40),
     "along an edge, off it by 1e-30": Rays(torch.zeros(6, 3), AXES.abs() + 1e-30),
 }
+
+TOO_LONG = {f"of direction {size:g}": Rays(MIDDLE - 2 * SOME, size * SOME) for size in (1e37, 3e38)}
+"""3e38: all three components are finite, the length is not."""
 
 
 def cells(kind: str, size: int) -> Tensor:
@@ -154,6 +165,7 @@ def _agreements() -> list[Case]:
         "full grid": (some_rays(65), "full", {}),
         "one cell": (some_rays(65), "one", {}),
         "axes, planes, corners and what is not finite": (special_rays(), "dust", {}),
+        "long directions": (long_rays(), "porous shell", {}),
     }
     found = []
     for name, (rays, grid, options) in kinds.items():
@@ -172,7 +184,7 @@ def _ways() -> Iterator[Case]:
         ("one", "samples add up to the way through the cell, and lie on it", 1.0),
         ("empty", "no samples", 0.0),
     ):
-        for kind, rays in SPECIAL.items():
+        for kind, rays in (SPECIAL | TOO_LONG).items():
             if "1e6" in kind and grid == "one":
                 continue  # there, rounding of t is as large as the cell
             size = rays.origins.abs().max().item() + 1
@@ -196,7 +208,8 @@ def _way_error(grid: str, given: Rays, backend: str, device: str, precision: str
     if (samples.t.diff()[same] < 0).any() or (samples.resume >= 0).any():
         return math.inf
     lower = occupied.nonzero() / SIZE
-    way = slab_lengths(rays, lower, lower + 1 / SIZE).sum(dim=1)
+    step_t = STEP / rays.directions.cpu().double().norm(dim=1)
+    way = slab_lengths(rays, lower, lower + 1 / SIZE).sum(dim=1) * (step_t >= LEAST_STEP)
     wrong = (samples.offsets.diff().cpu() * STEP - way).abs().max().item()
     outside = (samples.positions - 0.5).abs().max().item() - 0.5 if len(samples) else 0.0
     return max(wrong, outside)

@@ -12,11 +12,11 @@ import math
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
-from methods.kernels.cpu import arrays, check_float32, f32, i32, slope, u64
-from methods.kernels.march import Segments, longest_ray
+from methods.kernels.cpu import arrays, check_float32, f32, i32, jit, slope, u64
+from methods.kernels.march import LEAST_STEP, Segments, longest_ray
 from methods.kernels.types import Extent, Occupancy, Samples, offsets_of
 
 CHUNK = 128  # rays that are marched together; their numbers stay in the first-level cache
@@ -28,6 +28,7 @@ columns without a ray is not read."""
 f64 = np.float64
 INF = f32(np.inf)
 ZEROS, ONES = (f32(0),) * 3, (f32(1),) * 3
+LEAST = f32(LEAST_STEP)
 FAR_AWAY = f32(2**30)  # a step that no ray reaches; the numbers of steps are int32
 
 # Rows of a chunk: what is known of each ray, in float32 ...
@@ -65,25 +66,25 @@ def march(segments: Segments, occupancy: Occupancy, extent: Extent | None) -> Sa
     return Samples(t, torch.full((total,), step), offsets, ray, positions, resume)
 
 
-@njit(cache=True)
+@jit()
 def _at(row, column):
     """Place of a number of a ray, which has a column of its own in a chunk."""
     return u64(row) * u64(CHUNK) + u64(column)
 
 
-@njit(cache=True)
+@jit()
 def _three(numbers, row, column):
     """Three numbers of a ray, from `row` on."""
     return numbers[_at(row, column)], numbers[_at(row + 1, column)], numbers[_at(row + 2, column)]
 
 
-@njit(cache=True)
+@jit()
 def _padded(columns):
     """Columns that a loop runs over; see `VECTOR`."""
     return (columns + VECTOR - 1) // VECTOR * VECTOR
 
 
-@njit(cache=True)
+@jit()
 def _load(floats, integers, origins, directions, window, jitter, start, first, rays):
     """Fill the first columns of a chunk with the rays from `first` on."""
     for i in range(rays):
@@ -95,7 +96,7 @@ def _load(floats, integers, origins, directions, window, jitter, start, first, r
         integers[_at(K, i)], integers[_at(RAY, i)] = start[first + i], i
 
 
-@njit(cache=True, error_model="numpy")
+@jit(error_model="numpy")
 def _cross_slab(floats, i, axis, low, high):
     """Where a ray enters and leaves a slab between two planes; enter > leave if it misses."""
     origin, along = floats[_at(ORIGIN + axis, i)], floats[_at(SLOPE + axis, i)]
@@ -105,7 +106,7 @@ def _cross_slab(floats, i, axis, low, high):
     return enter if along != f32(0) else outside, leave if along != f32(0) else -outside
 
 
-@njit(cache=True, error_model="numpy")
+@jit(error_model="numpy")
 def _cross(floats, i, low, high):
     """Where a ray enters and leaves a box (slab test); enter > leave if it misses."""
     x, x_end = _cross_slab(floats, i, 0, low[0], high[0])
@@ -114,14 +115,14 @@ def _cross(floats, i, low, high):
     return max(x, max(y, z)), min(x_end, min(y_end, z_end))
 
 
-@njit(cache=True)
+@jit()
 def _whole(number):
     """A number of steps, rounded down; 0 of NaN."""
     number = number if number > f32(0) else f32(0)
     return i32(number if number < FAR_AWAY else FAR_AWAY)
 
 
-@njit(cache=True, error_model="numpy")
+@jit(error_model="numpy")
 def _begin(floats, integers, rays, low, high, step):
     """Clip rays to the cube and their windows, and skip the steps in front of the box of occupied
     cells, from `low` to `high`. FREE is 1 if there is something to march."""
@@ -136,7 +137,7 @@ def _begin(floats, integers, rays, low, high, step):
         enter, leave = _cross(floats, i, ZEROS, ONES)
         near, far = max(enter, f32(0)), min(leave, floats[_at(FAR, i)])
         x, y, z = _three(floats, ORIGIN, i)
-        finite = (abs(x) + abs(y) + abs(z) < INF) & (f32(0) < length) & (length < INF)
+        finite = (abs(x) + abs(y) + abs(z) < INF) & (step_t >= LEAST) & (step_t < INF)
         alive = finite & (near < far) & (far < INF) & (integers[_at(K, i)] >= 0)
         enter, leave = _cross(floats, i, low, high)
         integers[_at(FREE, i)] = i32(alive & (enter <= leave))
@@ -149,7 +150,7 @@ def _begin(floats, integers, rays, low, high, step):
         floats[_at(RATE, i)] = rate
 
 
-@njit(cache=True)
+@jit()
 def _move(floats, integers, source, target):
     """Move a ray to another column."""
     for row in range(FLOATS):
@@ -158,7 +159,7 @@ def _move(floats, integers, source, target):
         integers[_at(row, target)] = integers[_at(row, source)]
 
 
-@njit(cache=True)
+@jit()
 def _cell(coordinate, size):
     """Cell of one axis; truncating a number above -1 rounds down or to 0."""
     at = coordinate * size
@@ -167,7 +168,7 @@ def _cell(coordinate, size):
     return i32(at if at < last else last)
 
 
-@njit(cache=True, error_model="numpy")
+@jit(error_model="numpy")
 def _locate(floats, integers, rays, size):
     """t of the next step of each ray, +inf if it has left, and the cell there."""
     for i in range(_padded(rays)):
@@ -184,7 +185,7 @@ def _locate(floats, integers, rays, size):
         floats[_at(T, i)] = t if inside else INF
 
 
-@njit(cache=True)
+@jit()
 def _leave_axis(floats, integers, i, axis, free, width):
     """t at which a ray leaves, along one axis, the cells around it that are known to be empty at a
     clearance of `free` bricks; at 0 that is its own cell."""
@@ -197,7 +198,7 @@ def _leave_axis(floats, integers, i, axis, free, width):
     return leave if along != f32(0) else INF
 
 
-@njit(cache=True, error_model="numpy")
+@jit(error_model="numpy")
 def _advance(floats, integers, rays, width):
     """The next step of each ray: the one after a sample, or the last in the empty space around."""
     for i in range(_padded(rays)):
@@ -215,7 +216,7 @@ def _advance(floats, integers, rays, width):
         integers[_at(K, i)] = beyond if beyond > after else after
 
 
-@njit(cache=True)
+@jit()
 def _march_chunk(
     floats, integers, active, words, clearance, resolution, limit, scratch, owners, counts, resume
 ):
@@ -248,7 +249,7 @@ def _march_chunk(
         _advance(floats, integers, active, width)
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _find(given, grid, resolution, step, most, found):
     origins, directions, window, jitter, start = given
     words, clearance, bounds = grid
@@ -272,7 +273,7 @@ def _find(given, grid, resolution, step, most, found):
         _march_chunk(floats, integers, active, words, clearance, resolution, most, *own)
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _place(origins, directions, scratch, owners, most, offsets, t, positions, ray_of):
     rays = len(origins)
     for chunk in prange((rays + CHUNK - 1) // CHUNK):

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from methods.kernels.march import PARALLEL, Segments, longest_ray
-from methods.kernels.types import Extent, Occupancy, Samples, offsets_of
+from methods.kernels.march import LEAST_STEP, Segments, longest_ray
+from methods.kernels.types import PARALLEL, Extent, Occupancy, Samples, offsets_of
 
 BLOCK = 1 << 12  # rays that are tested at a time: [BLOCK, 1024, 3] positions are 50 MB
 
@@ -91,8 +91,8 @@ def clip(segments: Segments) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     length = lengths(directions)
     # A true division: `step / length` would multiply by the reciprocal, which is an ulp off.
     step_t = torch.full_like(length, segments.step) / length
-    alive = (near < far) & far.isfinite() & step_t.isfinite() & (segments.start >= 0)
-    return near, far, step_t, alive
+    alive = (near < far) & far.isfinite() & (segments.start >= 0)
+    return near, far, step_t, alive & step_t.isfinite() & (step_t >= LEAST_STEP)
 
 
 def lengths(directions: Tensor) -> Tensor:

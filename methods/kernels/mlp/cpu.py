@@ -11,11 +11,11 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 from torch.nn import functional
 
-from methods.kernels.cpu import LANES, check_float32, f32, flat, multiply, u64
+from methods.kernels.cpu import LANES, check_float32, f32, flat, jit, multiply, u64
 from methods.kernels.mlp.reference import layer_by_layer
 
 DEEP = 96  # samples whose activations, with 64 channels, stay in the first-level cache
@@ -127,7 +127,7 @@ def _joined(weights: Sequence[Tensor], *, turned: bool) -> Tensor:
     return torch.cat(parts)
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _rectify(x):
     for chunk in prange((len(x) + RELU_CHUNK - 1) // RELU_CHUNK):
         part = x[chunk * RELU_CHUNK : (chunk + 1) * RELU_CHUNK]
@@ -135,7 +135,7 @@ def _rectify(x):
             part[i] = NOTHING if part[i] <= MINUS_INFINITY else part[i]
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _pass_on(out, grad, passed):
     for chunk in prange((len(out) + RELU_CHUNK - 1) // RELU_CHUNK):
         here = slice(chunk * RELU_CHUNK, (chunk + 1) * RELU_CHUNK)
@@ -144,7 +144,7 @@ def _pass_on(out, grad, passed):
             kept[i] = NOTHING if shown[i] == NOTHING else given[i]
 
 
-@njit(cache=True, error_model="numpy")
+@jit(error_model="numpy")
 def _copy(rows, width, source, at, source_row, target, to, target_row):
     """Copy `rows` rows of `width` numbers between flat arrays."""
     for r in range(rows):
@@ -153,7 +153,7 @@ def _copy(rows, width, source, at, source_row, target, to, target_row):
             target[b + u64(i)] = source[a + u64(i)]
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@jit(parallel=True, error_model="numpy")
 def _forward(left, right, a, weights, widths, sizes, kept, out):
     """`kept` [layers - 1, S, outputs] is filled with the hidden activations, unless it is empty.
 
@@ -195,7 +195,7 @@ def _forward(left, right, a, weights, widths, sizes, kept, out):
             _copy(rows, outputs, result, 0, last, out, first * outputs, outputs)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@jit(parallel=True, error_model="numpy")
 def _backward(left, right, a, turned, widths, sizes, kept, grad, of_left, of_right, of_weights):
     """`of_weights` [CHUNKS, all weights] is added to; `of_left`, `of_right` may be empty."""
     b, outputs, layers = widths[0] - a, widths[-1], len(widths) - 1

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
-from methods.kernels.cpu import arrays, check_float32, f32, u64
+from methods.kernels.cpu import arrays, check_float32, f32, jit, u64
 from methods.kernels.spherical import FACTORS
 
 BLOCK = 256  # directions at a time; their 16 harmonics stay in the first-level cache
@@ -54,7 +54,7 @@ class _Shade(torch.autograd.Function):
         return grads, None
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _evaluate(directions, out):
     count = len(directions)
     for chunk in prange((count + BLOCK - 1) // BLOCK):
@@ -65,7 +65,7 @@ def _evaluate(directions, out):
                 out[first + i, k] = basis[k * BLOCK + i]
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _shade(coefficients, directions, terms, colours):
     """`coefficients` are flat."""
     count = len(directions)
@@ -84,7 +84,7 @@ def _shade(coefficients, directions, terms, colours):
             colours[first + i, 0], colours[first + i, 1], colours[first + i, 2] = red, green, blue
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _unshade(grad, directions, terms, grads):
     """`grads` are flat."""
     count = len(directions)
@@ -102,7 +102,7 @@ def _unshade(grad, directions, terms, grads):
                 at, of = at + THREE, of + NEXT
 
 
-@njit(cache=True)
+@jit()
 def _harmonics(directions, first, size):
     """A block with the harmonics of `size` directions, number k of direction i at k * `BLOCK` + i.
 

@@ -11,10 +11,10 @@ import math
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 
 from bench.types import Rays
-from methods.kernels.cpu import arrays, check_float32, f32, i32, slope
+from methods.kernels.cpu import arrays, check_float32, f32, i32, jit, slope
 from methods.kernels.voxel_walk import Crossings, Voxels
 
 CHUNK = 64  # rays
@@ -54,19 +54,19 @@ def walk(rays: Rays, voxels: Voxels) -> Crossings:
     return Crossings(t, delta, offsets.cumsum(dim=0), near, far, ray, voxel)
 
 
-@njit(cache=True)
+@jit()
 def length_of(dx, dy, dz):
     """Length of a direction."""
     return f32(math.sqrt(f64(dx) ** 2 + f64(dy) ** 2 + f64(dz) ** 2))
 
 
-@njit(cache=True)
+@jit()
 def _plane(k, width, origin, slope):
     """t at which a ray crosses plane `k` of an axis."""
     return (f32(k) * width - origin) * slope
 
 
-@njit(cache=True)
+@jit()
 def _slab(origin, slope, size, width):
     """The range of t in which a ray is inside the cube, along one axis."""
     if slope == 0:
@@ -75,7 +75,7 @@ def _slab(origin, slope, size, width):
     return min(a, b), max(a, b)
 
 
-@njit(cache=True)
+@jit()
 def _cell(t, origin, direction, slope, size, width):
     """The cell of an axis in which a ray is at `t`: the one behind the last crossed plane."""
     cell = min(max(int((origin + t * direction) * f32(size)), 0), size - 1)
@@ -92,7 +92,7 @@ def _cell(t, origin, direction, slope, size, width):
     return cell
 
 
-@njit(cache=True)
+@jit()
 def _leave(first, end, width, origin, slope):
     """t at which a ray leaves the cells [first, end) of one axis."""
     if slope == 0:
@@ -100,14 +100,14 @@ def _leave(first, end, width, origin, slope):
     return _plane(end if slope > 0 else first, width, origin, slope)
 
 
-@njit(cache=True)
+@jit()
 def _empty_cells(cell, free, size):
     """The cells of one axis that are known to be empty around `cell`, at a clearance of `free`."""
     brick = cell >> 3
     return max(brick - free + 1, 0) << 3, min((brick + free) << 3, size)
 
 
-@njit(cache=True, error_model="numpy")
+@jit(error_model="numpy")
 def walk_ray(origin, direction, maps, start, limit, out):
     """Write entry, exit and voxel of at most `limit` crossings into the three arrays of `out`;
     return their count, and the t to resume from."""
@@ -178,7 +178,7 @@ def walk_ray(origin, direction, maps, start, limit, out):
                 tz = _plane(z + step_z, width, oz, sz)
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _find(origins, directions, maps, limit, scratch, counts):
     rays = len(counts)
     nears, fars, voxels = scratch
@@ -190,7 +190,7 @@ def _find(origins, directions, maps, limit, scratch, counts):
             used += counts[ray]
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _place(first, directions, scratch, limit, counts, ends, out):
     rays = len(counts)
     nears, fars, voxels = scratch

@@ -19,7 +19,7 @@ import onnxruntime
 
 __version__ = "11.4.0"
 
-ONNX_TYPES = {"tensor(float)": np.float32, "tensor(int32)": np.int32}
+ONNX_TYPES = {"tensor(float)": np.float32}
 
 
 class Logger:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 import torch
 
-from bench.errors import Unavailable
+from bench.errors import SteerbenchError, Unavailable
 from bench.types import Log
 from methods.engines import Engine, auto
 from methods.engines.auto import Auto, Figures
@@ -65,6 +66,18 @@ def test_what_was_measured_is_remembered(tmp_path: Path, quiet_log: Log) -> None
     first = Auto(0.07).chosen(CPU, measured, tmp_path, quiet_log)
     again = Auto(0.07).chosen(CPU, lambda engines: pytest.fail("again"), tmp_path, quiet_log)
     assert str(again) == str(first)
+
+
+@pytest.mark.parametrize("psnr", [math.nan, -math.inf])
+def test_pictures_that_are_not_finite_are_an_error_and_not_remembered(
+    psnr: float, tmp_path: Path, quiet_log: Log
+) -> None:
+    def broken(engines: Sequence[Engine]) -> list[Figures]:
+        return [Figures(psnr, 9.0) for _ in engines]
+
+    with pytest.raises(SteerbenchError, match=r"finite pictures .* renders others with exact, fp"):
+        Auto(0.05).chosen(CPU, broken, tmp_path, quiet_log)
+    assert str(Auto(0.07).chosen(CPU, measured, tmp_path, quiet_log)) == "quick, int8"
 
 
 def test_a_choice_depends_on_what_there_is_to_choose_from(monkeypatch: pytest.MonkeyPatch) -> None:

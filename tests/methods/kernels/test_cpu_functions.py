@@ -1,8 +1,14 @@
-"""Functions of all kernels for the CPU: the exponential against float64, rounding against torch."""
+"""Functions of all kernels for the CPU: the exponential against float64, rounding against torch;
+which machine code is kept."""
 
 from __future__ import annotations
 
 import math
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -42,3 +48,39 @@ def test_numbers_are_rounded_to_bfloat16_as_torch_does(bits: int) -> None:
         got = torch.tensor([int(word)]).to(torch.uint32).view(torch.bfloat16)
         assert torch.equal(got.nan_to_num(), torch.cat(pair).bfloat16().nan_to_num())
         assert torch.equal(got.isnan(), torch.cat(pair).isnan())
+
+
+CALLER = """
+import numpy as np
+from methods.kernels.cpu import exp, jit
+
+@jit()
+def called(x):
+    return exp(x)
+
+print(round(called(np.float32(2))), *called.stats.cache_hits.values())
+"""
+
+
+@pytest.mark.slow
+def test_machine_code_is_used_until_a_file_changes_that_it_comes_from(tmp_path: Path) -> None:
+    root, apart = Path(__file__).parents[3], shutil.ignore_patterns("__pycache__", "scenes")
+    for package in ("bench", "methods/kernels"):
+        shutil.copytree(root / package, tmp_path / package, ignore=apart)
+    shutil.copy(root / "methods/__init__.py", tmp_path / "methods")
+    caller, shared = tmp_path / "methods/caller", tmp_path / "methods/kernels/cpu.py"
+    caller.mkdir()
+    (caller / "__init__.py").touch()
+    (caller / "cpu.py").write_text(CALLER)
+
+    def called() -> str:
+        command = [sys.executable, "-c", "import methods.caller.cpu"]
+        given = {**os.environ, "PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": ""}
+        done = subprocess.run(command, cwd=tmp_path, env=given, capture_output=True, text=True)
+        return done.stdout.strip() or done.stderr
+
+    assert called() == "7"
+    assert called() == "7 1"  # loaded
+    shared.write_text(shared.read_text().replace("EDGE = f32(87)", "EDGE = f32(0)"))
+    assert called() == "1"
+    assert len(list(caller.glob("__pycache__/machine-code-*"))) == 1

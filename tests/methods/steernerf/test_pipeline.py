@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Literal
 
@@ -12,11 +11,10 @@ from torch.nn import functional
 
 from bench.cameras import cast, project
 from bench.types import NullProbe
-from methods.engines import readable
 from methods.steernerf.buffer import Buffer, Cloud
-from methods.steernerf.kernels.spans import RIM
 from methods.steernerf.options import RangeReduction
-from methods.steernerf.pipeline import MARGIN, near_matter, spans_near_matter
+from methods.steernerf.pipeline import near_matter
+from methods.steernerf.unet import RIM
 from tests.methods.conftest import Work, look_at_the_middle
 from tests.methods.models import new_pipeline, small_model, small_rendering
 
@@ -148,26 +146,8 @@ def test_the_part_that_is_drawn_surrounds_matter(rows, columns, part) -> None:
     assert near_matter(seen) == part
 
 
-@pytest.mark.parametrize("scale", [1, 3, 4, 8])
-def test_spans_reach_a_margin_beyond_what_is_seen_and_end_with_their_unit(scale: int) -> None:
-    """In Python, row by row; the last band is not whole."""
-    seen = torch.rand(50, 70, generator=torch.Generator().manual_seed(scale)) < 0.003
-    seen[20:44] = False  # nothing near the middle of it
-    spans, band = spans_near_matter(seen, scale), math.lcm(16, scale) // scale
-    assert spans.unit == band * scale
-    rows, columns = seen.nonzero().unbind(1)
-    for number, (begin, end) in enumerate(spans.columns.tolist()):
-        near = (rows >= number * band - MARGIN) & (rows < (number + 1) * band + MARGIN)
-        if near.any():
-            first, last = columns[near].min().item(), columns[near].max().item()
-            assert begin == max(first - MARGIN, 0) // band
-            assert end == -(-(last + 1 + MARGIN) // band)
-        else:
-            assert begin >= end
-
-
 def test_far_from_matter_a_picture_is_background_and_near_it_that_of_the_whole() -> None:
-    """At the border of its spans the network sees less than in the whole picture; what it draws of
+    """At the border of its part the network sees less than in the whole picture; what it draws of
     a pixel depends on no other farther away than 52: 2 + 3 convolutions at full size, 2 + 4 at
     half and 8 at a quarter of it, and what is pooled."""
     lens = {"fx": 500.0, "fy": 500.0, "cx": 400.0, "cy": 400.0}
@@ -181,11 +161,9 @@ def test_far_from_matter_a_picture_is_background_and_near_it_that_of_the_whole()
     assert torch.equal(every.alpha, some.alpha)
     seen = every.alpha[::4, ::4] > 0
     rows, columns = near_matter(seen)
-    spans = spans_near_matter(seen[rows, columns], 4)
     drawn = torch.zeros(800, 800, dtype=torch.bool)
-    part = drawn[4 * rows.start : 4 * rows.stop, 4 * columns.start : 4 * columns.stop]
-    part[:] = spans.mask(*part.shape)
-    assert 0.05 < drawn.float().mean() < 0.9 * part.numel() / 800**2
+    drawn[4 * rows.start : 4 * rows.stop, 4 * columns.start : 4 * columns.stop] = True
+    assert 0.05 < drawn.float().mean() < 0.9
     border = functional.max_pool2d((~drawn)[None].float(), 2 * RIM + 1, 1, RIM)[0] == 1
     assert (some.rgb[border] == pipeline.background[:3]).all()
     inner = functional.max_pool2d((~drawn)[None].float(), 105, 1, 52)[0] == 0
@@ -196,15 +174,3 @@ def test_far_from_matter_a_picture_is_background_and_near_it_that_of_the_whole()
     less, more = (probe.done["products"] for probe in work)
     left_out = (~drawn).float().mean() * pipeline.renderer.network.products(drawn[None, None])
     assert more - less == pytest.approx(left_out.item(), rel=1e-4)
-
-
-def test_an_engine_gets_a_network_that_draws_everything() -> None:
-    """Also after a frame that left out what is far from matter."""
-    camera, pipeline = replace(CAMERA, width=400, height=400, cx=200.0, cy=200.0), new_pipeline()
-    network = pipeline.renderer.network
-    inputs = torch.rand(1, network.first.in_channels, 400, 400)
-    with torch.no_grad():
-        (before,) = readable(network)(inputs)
-        pipeline.render(camera, Buffer(maxlen=2), USUAL, NullProbe())
-        (after,) = readable(network)(inputs)
-    assert torch.equal(before, after)

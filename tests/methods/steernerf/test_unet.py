@@ -88,7 +88,6 @@ def test_any_features_frames_and_sizes_are_taken(
 @pytest.mark.parametrize(("height", "width", "channels"), [(8, 12, 64), (4, 8, 16)])
 def test_its_products_are_those_that_torch_counts(height: int, width: int, channels: int) -> None:
     network = unet(6, 2, 4, channels).network
-    network.backend = "reference"
     inputs = torch.zeros(2, 18, height, width)
     with FlopCounterMode(display=False) as counter:
         network(inputs)

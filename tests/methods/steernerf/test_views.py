@@ -8,8 +8,6 @@ import torch
 from bench.metrics import psnr
 from bench.types import Log, Scene, composite
 from methods.engines import Built
-from methods.steernerf import pipeline
-from methods.steernerf.kernels.spans import Spans
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.views import COMPARED, Views
 from tests.methods.models import new_pipeline, small_joint, small_model
@@ -53,17 +51,6 @@ def test_what_a_network_is_built_on_is_what_it_is_shown_whatever_ran_before(
     views.pipeline.renderer.engine = Built(lambda *inputs: pytest.fail("asked"), 0)
     again = views.inputs(2)
     assert all(torch.equal(a, b) for (a,), (b,) in zip(first, again, strict=True))
-
-
-def test_what_a_network_is_built_on_is_defined_away_from_matter_too(
-    ball_scene: Scene, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Where torch would leave pixels out, what is in memory must not set the ranges of int8."""
-    half = Spans(torch.tensor([[0, 1], [0, 1]]), 16)  # the left one
-    monkeypatch.setattr(pipeline, "spans_near_matter", lambda *_: half)
-    views = views_of(ball_scene, quiet_log)
-    views.pipeline.renderer._memory = torch.full((2 * 4 * 32 * 32,), torch.nan)
-    assert all(inputs.isfinite().all() for (inputs,) in views.inputs(2))
 
 
 def test_a_frame_is_recorded_as_in_training_behind_as_many_as_the_buffer_holds_and_one_more(

@@ -12,14 +12,24 @@ import math
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 from torch.nn import functional
 
 from bench.types import Rays
 from methods.diver.kernels.segments import Corners, Layers
 from methods.kernels.corner_gather.cpu import FAST, blended, eight_of
-from methods.kernels.cpu import LANES, ROWS, arrays, check_float32, f32, multiply, prefetch, sigmoid
+from methods.kernels.cpu import (
+    LANES,
+    ROWS,
+    arrays,
+    check_float32,
+    f32,
+    jit,
+    multiply,
+    prefetch,
+    sigmoid,
+)
 from methods.kernels.types import Pixels
 from methods.kernels.voxel_walk import Crossings, Voxels
 from methods.kernels.voxel_walk.cpu import maps_of, walk_ray
@@ -83,7 +93,7 @@ def _whole_lanes(weights: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
     return functional.pad(weights.T, (0, idle)), functional.pad(bias, (0, idle))
 
 
-@njit(cache=True, fastmath=FAST)
+@jit(fastmath=FAST)
 def _corner_weights(x, y, z):
     """Trilinear weights of the eight corners, x varying fastest."""
     gx, gy, gz = f32(1) - x, f32(1) - y, f32(1) - z
@@ -91,14 +101,14 @@ def _corner_weights(x, y, z):
     return gx * w00, x * w00, gx * w10, x * w10, gx * w01, x * w01, gx * w11, x * w11
 
 
-@njit(cache=True)
+@jit()
 def _put(weights, i, found):
     """Store the eight weights of a sample."""
     weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3] = found[0:4]
     weights[i, 4], weights[i, 5], weights[i, 6], weights[i, 7] = found[4:8]
 
 
-@njit(cache=True, fastmath=FAST)
+@jit(fastmath=FAST)
 def _mean_weights(ax, ay, az, bx, by, bz):
     """A weight is a cubic along the segment, for which two Gauss-Legendre nodes are exact."""
     half = f32(0.5)
@@ -118,19 +128,19 @@ def _mean_weights(ax, ay, az, bx, by, bz):
     )
 
 
-@njit(cache=True)
+@jit()
 def _local(origin, direction, t, resolution, corner):
     """Local coordinate, along an axis, in the voxel that begins at `corner`."""
     place = (origin + t * direction) * resolution - f32(corner)
     return min(max(place, f32(0)), f32(1))
 
 
-@njit(cache=True)
+@jit()
 def _three(values, row):
     return values[row, 0], values[row, 1], values[row, 2]
 
 
-@njit(cache=True)
+@jit()
 def _weights_between(origin, direction, near, far, resolution, corner):
     """Mean weights in the voxel that begins at `corner`, on a ray from t = `near` to `far`."""
     (ox, oy, oz), (dx, dy, dz), (x, y, z) = origin, direction, corner
@@ -144,7 +154,7 @@ def _weights_between(origin, direction, near, far, resolution, corner):
     )
 
 
-@njit(cache=True, fastmath=FAST, parallel=True)
+@jit(fastmath=FAST, parallel=True)
 def _segment_weights(origins, directions, ray, near, far, coordinates, voxel, resolution, weights):
     total = len(near)
     for chunk in prange((total + SEGMENTS - 1) // SEGMENTS):
@@ -155,13 +165,13 @@ def _segment_weights(origins, directions, ray, near, far, coordinates, voxel, re
             _put(weights, i, found)
 
 
-@njit(cache=True)
+@jit()
 def _layer(rows, inputs, count, weights, bias, outputs, relu):
     """`rows` rows of `count` numbers times `weights`, plus `bias`; all are flat."""
     multiply(rows, inputs, 0, count, 1, weights, len(bias), bias, outputs, 0, count, relu)
 
 
-@njit(cache=True)
+@jit()
 def _shade(count, waiting, buffers, layers, sums, first):
     """Add the colours of `count` segments, of which hidden channels, rays and weights were
     `waiting`, to the `sums` of their rays, which begin at ray `first`."""
@@ -183,7 +193,7 @@ def _shade(count, waiting, buffers, layers, sums, first):
             sums[rays[i] - first, channel] += weights[i] * seen
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@jit(parallel=True, error_model="numpy")
 def _render(given, maps, voxels, resolution, parts, bounds, out):
     origins, directions, towards = given
     coordinates, corners, table = voxels

@@ -12,12 +12,12 @@ import math
 import numba
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
 from methods.gaussians.kernels.blending import LARGEST_ALPHA
 from methods.gaussians.kernels.projection import LEAST_ALPHA, Ellipses
-from methods.kernels.cpu import arrays, check_float32, f32, i32
+from methods.kernels.cpu import arrays, check_float32, f32, i32, jit
 from methods.kernels.types import Pixels
 
 TILE = 16  # pixels, along both axes
@@ -107,7 +107,7 @@ def _lists(boxes: np.ndarray, width: int, height: int) -> tuple[np.ndarray, ...]
     return offsets, ranks, first, slots
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _pack(order, centres, conics, opacities, colours, depth, extents, width, height, packed, boxes):
     """Pack Gaussians in depth order, and the pixel box of each: [left, right), [top, bottom)."""
     for rank in prange(len(order)):
@@ -130,7 +130,7 @@ def _pack(order, centres, conics, opacities, colours, depth, extents, width, hei
             box[2], box[3] = i32(math.floor(top)), i32(math.ceil(bottom))
 
 
-@njit(cache=True)
+@jit()
 def _tiles(box):
     """The tiles [left, right) x [top, bottom) that a box of pixels touches."""
     if box[1] <= box[0]:
@@ -139,7 +139,7 @@ def _tiles(box):
     return box[0] // TILE, (box[1] + last) // TILE, box[2] // TILE, (box[3] + last) // TILE
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _count(boxes, across, threads, counts, entries):
     """Count the entries of each tile and of each Gaussian (shifted by one); each of n threads has
     every n-th row of tiles."""
@@ -153,7 +153,7 @@ def _count(boxes, across, threads, counts, entries):
                     counts[row * across + column] += 1
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _fill(boxes, across, threads, filled, first, ranks, slots):
     for thread in prange(threads):
         for rank in range(len(boxes)):
@@ -168,7 +168,7 @@ def _fill(boxes, across, threads, filled, first, ranks, slots):
                     slots[slot + column - left] = entry
 
 
-@njit(cache=True, fastmath=LANES)
+@jit(fastmath=LANES)
 def _exp(x):
     """e^x for x <= 0, relative error of a few roundings; 2^-126 below that."""
     y = max(x * LOG2_E, f32(-126))
@@ -178,7 +178,7 @@ def _exp(x):
     return power * i32((i32(whole) + i32(127)) << i32(23)).view(np.float32)
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _forward(packed, boxes, offsets, ranks, stop, threads, values, depth, alpha):
     height, width = alpha.shape
     across = -(-width // TILE)
@@ -200,7 +200,7 @@ def _forward(packed, boxes, offsets, ranks, stop, threads, values, depth, alpha)
                     alpha[row, column] = ONE - state[at]
 
 
-@njit(cache=True, fastmath=LANES)
+@jit(fastmath=LANES)
 def _tile_forward(packed, boxes, ranks, stop, top, left, state):
     """`state`: transmittance, r, g, b and depth sum of each pixel of the tile."""
     state[:PIXELS] = ONE
@@ -230,7 +230,7 @@ def _tile_forward(packed, boxes, ranks, stop, top, left, state):
                 state[at + np.uint64(4 * PIXELS)] += weight * z
 
 
-@njit(cache=True, fastmath=LANES)
+@jit(fastmath=LANES)
 def _largest(state):
     largest = ZERO
     for at in range(PIXELS):
@@ -238,7 +238,7 @@ def _largest(state):
     return largest
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _backward(packed, boxes, offsets, ranks, stop, threads, grad, gain, sums):
     height, width = gain.shape
     across = -(-width // TILE)
@@ -262,7 +262,7 @@ def _backward(packed, boxes, offsets, ranks, stop, threads, grad, gain, sums):
             _tile_backward(packed, boxes, own, stop, top, left, state, total)
 
 
-@njit(cache=True, error_model="numpy")  # saves a branch at the division
+@jit(error_model="numpy")  # saves a branch at the division
 def _tile_backward(packed, boxes, ranks, stop, top, left, state, sums):
     """With g_i = dL/dw_i: dL/dalpha_i = T_i g_i - (sum_{j > i} w_j g_j) / (1 - alpha_i).
 
@@ -319,7 +319,7 @@ def _tile_backward(packed, boxes, ranks, stop, top, left, state, sums):
                 sums[n, k] += state[IN_LANES + k * TILE + lane]
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _collect(order, packed, first, slots, sums, centres, conics, opacities, colours):
     """Compute the gradients of each Gaussian from its sums in all tiles."""
     for rank in prange(len(order)):

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
 from bench.types import Camera
 from methods.gaussians.kernels.projection import BLUR, FRUSTUM, LEAST_ALPHA, NEAR, Ellipses
-from methods.kernels.cpu import arrays, check_float32, f32
+from methods.kernels.cpu import arrays, check_float32, f32, jit
 
 ZERO, ONE, TWO = f32(0), f32(1), f32(2)
 BLUR32, NEAR32, INFINITE = f32(BLUR), f32(NEAR), f32(np.inf)
@@ -56,17 +56,17 @@ def _view(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.ascontiguousarray(pose[:, :3].T), np.ascontiguousarray(pose[:, 3]), intrinsics
 
 
-@njit(cache=True)
+@jit()
 def _row(matrix, row):
     return matrix[row, 0], matrix[row, 1], matrix[row, 2]
 
 
-@njit(cache=True)
+@jit()
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(cache=True)
+@jit()
 def _load(block, sources, first, size):
     """Copy `size` rows of each source, from `first` on; their columns become rows of the block."""
     row = 0
@@ -77,7 +77,7 @@ def _load(block, sources, first, size):
             row += 1
 
 
-@njit(cache=True)
+@jit()
 def _store(block, row, targets, first, size):
     """The way back of `_load`, from a `row` of the block on."""
     for target in targets:
@@ -87,13 +87,13 @@ def _store(block, row, targets, first, size):
             row += 1
 
 
-@njit(cache=True)
+@jit()
 def _three(block, row, i):
     """Three rows of the block, from `row` on, of Gaussian `i`."""
     return block[row * BLOCK + i], block[(row + 1) * BLOCK + i], block[(row + 2) * BLOCK + i]
 
 
-@njit(cache=True, error_model="numpy")
+@jit(error_model="numpy")
 def _place(block, i, w0, w1, w2, origin, limit_x, limit_y):
     """Depth z of Gaussian `i`, 1 / z, x / z and y / z, and the last two within the limits of J."""
     x, y, z = _three(block, 0, i)
@@ -106,7 +106,7 @@ def _place(block, i, w0, w1, w2, origin, limit_x, limit_y):
     return depth, inverse, u, v, tx, ty
 
 
-@njit(cache=True, error_model="numpy")
+@jit(error_model="numpy")
 def _rotation(qw, qx, qy, qz):
     """Columns of R of a quaternion, and 1 over its length."""
     inverse = ONE / math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
@@ -119,7 +119,7 @@ def _rotation(qw, qx, qy, qz):
     )
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@jit(parallel=True, error_model="numpy")
 def _forward(given, world, origin, view, out):
     count = len(given[0])
     for chunk in prange((count + BLOCK - 1) // BLOCK):
@@ -130,7 +130,7 @@ def _forward(given, world, origin, view, out):
         _store(block, 11, out, first, size)
 
 
-@njit(cache=True, error_model="numpy")
+@jit(error_model="numpy")
 def _project(block, size, world, origin, view):
     """Rows of the block: means, scales, quaternions and reach; centres, conics, depth, extents."""
     fx, fy, cx, cy, limit_x, limit_y = view
@@ -165,7 +165,7 @@ def _project(block, size, world, origin, view):
         block[18 * BLOCK + i] = math.sqrt(rise * yy) if shown else ZERO
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@jit(parallel=True, error_model="numpy")
 def _backward(given, world, origin, view, out):
     count = len(given[0])
     for chunk in prange((count + BLOCK - 1) // BLOCK):
@@ -176,7 +176,7 @@ def _backward(given, world, origin, view, out):
         _store(block, 20, out, first, size)
 
 
-@njit(cache=True, error_model="numpy")
+@jit(error_model="numpy")
 def _differentiate(block, size, world, origin, view):
     """With H = J W R diag s, V' = H H^T + BLUR I and Q = V'^-1: dL/dV' = -Q dL/dQ Q, and
     dL/dH = 2 dL/dV' H.
@@ -239,7 +239,7 @@ def _differentiate(block, size, world, origin, view):
         block[29 * BLOCK + i] = (gz - same * z) * shrink if shown else ZERO
 
 
-@njit(cache=True)
+@jit()
 def _column(g, ax, ay, tx, ty, s, across, down, depth):
     """What one column of W R, (across, down, depth), has of the gradients: its scale, itself, and
     tx, ty, ax, ay."""

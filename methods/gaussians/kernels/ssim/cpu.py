@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
 from methods.gaussians.kernels.ssim import C1, C2, REACH, WINDOW
-from methods.kernels.cpu import arrays, check_float32, f32
+from methods.kernels.cpu import arrays, check_float32, f32, jit
 
 WEIGHTS = np.array(WINDOW, np.float32)
 MARGIN = 3 * REACH
@@ -47,19 +47,19 @@ class _Ssim(torch.autograd.Function):
         return grads * (grad / grads.numel()), None
 
 
-@njit(cache=True, fastmath={"contract"})
+@jit(fastmath={"contract"})
 def _add(out, weight, x):
     for i in range(len(out)):
         out[i] += weight * x[i]
 
 
-@njit(cache=True, fastmath={"contract"})
+@jit(fastmath={"contract"})
 def _add_product(out, weight, x, y):
     for i in range(len(out)):
         out[i] += weight * x[i] * y[i]
 
 
-@njit(cache=True)
+@jit()
 def _across(out, padded):
     """Apply the window along a row with `MARGIN` zeros on both sides."""
     out[:] = f32(0)
@@ -67,7 +67,7 @@ def _across(out, padded):
         _add(out, WEIGHTS[k], padded[3 * k : 3 * k + len(out)])
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _different(picture, target, spans):
     """The range [low, high) of each row in which the pictures differ; 0, 0 if nowhere."""
     height, size = picture.shape
@@ -80,7 +80,7 @@ def _different(picture, target, spans):
         spans[row, 0], spans[row, 1] = (low, high) if low < high else (0, 0)
 
 
-@njit(cache=True)
+@jit()
 def _reached(spans, row, size):
     """The range [low, high) of window centres on `row` whose window may see any of `spans`."""
     low, high = size, 0
@@ -90,7 +90,7 @@ def _reached(spans, row, size):
     return (max(low - MARGIN, 0), min(high + MARGIN, size)) if low < high else (0, 0)
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _compare(picture, target, spans, slopes, sums, seen):
     """Sums of the similarity of each row; its derivatives by the mean of x, of x x and of x y. Only
     windows from which a difference can be `seen` are computed: where both pictures are equal, the
@@ -121,7 +121,7 @@ def _compare(picture, target, spans, slopes, sums, seen):
         sums[row] += _slopes(means, by_mean, by_square, by_product)
 
 
-@njit(cache=True, fastmath={"contract", "reassoc"}, error_model="numpy")
+@jit(fastmath={"contract", "reassoc"}, error_model="numpy")
 def _slopes(means, by_mean, by_square, by_product):
     total = 0.0
     for i in range(means.shape[1]):
@@ -139,7 +139,7 @@ def _slopes(means, by_mean, by_square, by_product):
     return total
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _spread(picture, target, slopes, seen, grads):
     """The gradient of the sum: each derivative is spread over all pixels under its window."""
     height, size = picture.shape

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 from torch.nn import functional
 
@@ -20,6 +20,7 @@ from methods.kernels.cpu import (
     arrays,
     check_float32,
     f32,
+    jit,
     multiply,
     prefetch,
     prefetch_row,
@@ -135,7 +136,7 @@ class _Linear(torch.autograd.Function):
         return grad_inputs[:, :channels] if wanted else None, *cut, None, None
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@jit(parallel=True, error_model="numpy")
 def _locate(positions, cubes, corner, side, networks, local):
     for s in prange(len(positions)):
         inside = True
@@ -152,7 +153,7 @@ def _locate(positions, cubes, corner, side, networks, local):
             networks[s] = cubes[x, y, z]
 
 
-@njit(cache=True)
+@jit()
 def _sort(networks, offsets, places):
     """Counting sort; samples of the same network keep their order."""
     for s in range(len(networks)):
@@ -168,7 +169,7 @@ def _sort(networks, offsets, places):
             filled[n] += 1
 
 
-@njit(cache=True)
+@jit()
 def _borders(offsets):
     """The networks of each of `CHUNKS` parts with about equally many samples; [CHUNKS + 1]."""
     ends = np.empty(CHUNKS + 1, np.int64)
@@ -178,7 +179,7 @@ def _borders(offsets):
     return ends
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _linear(inputs, weights, biases, offsets, relu, out):
     channels, outputs = weights.shape[1:]
     borders = _borders(offsets)
@@ -190,7 +191,7 @@ def _linear(inputs, weights, biases, offsets, relu, out):
             multiply(rows, flat, at, channels, 1, w, outputs, b, flat_out, to, channels, relu)
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _backward(inputs, weights, offsets, out, grad, relu, grad_inputs, grad_weights, grad_biases):
     channels, outputs = weights.shape[1:]
     width = grad_inputs.shape[1]
@@ -233,7 +234,7 @@ def _backward(inputs, weights, offsets, out, grad, relu, grad_inputs, grad_weigh
                     )
 
 
-@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+@jit(fastmath={"contract"}, error_model="numpy")
 def _sine_and_cosine(angle):
     """Sine and cosine of an angle of up to some thousand quarter turns."""
     whole = np.floor(angle * PER_TURN + f32(0.5))
@@ -252,7 +253,7 @@ def _sine_and_cosine(angle):
     return (-shown_sine if down else shown_sine), (-shown_cosine if left else shown_cosine)
 
 
-@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+@jit(fastmath={"contract"}, error_model="numpy")
 def _encode(encoded, frequencies):
     """Fill in sines and cosines: channel c of sample r is encoded[c * SLOT + r], 0 to 2 given."""
     block = 3 * SLOT
@@ -273,7 +274,7 @@ def _encode(encoded, frequencies):
                 target_cosine[j] = ONE - TWO * sine * sine
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _encode_all(inputs, frequencies, out):
     count, channels = out.shape
     blocks = (count + TALL - 1) // TALL
@@ -290,14 +291,14 @@ def _encode_all(inputs, frequencies, out):
                     out[block * TALL + r, c] = encoded[c * SLOT + r]
 
 
-@njit(cache=True)
+@jit()
 def _block(a, a_row, a_step, w, bias, out, out_row, count, relu):
     """`TALL` rows times w [count, 32], plus bias [32]: out [TALL, 32 of `out_row`]."""
     for left in range(0, HIDDEN, LANES):
         tall(a, 0, a_row, a_step, w, left, HIDDEN, bias, left, out, left, out_row, count, relu)
 
 
-@njit(cache=True, parallel=True, fastmath={"contract", "reassoc"})
+@jit(parallel=True, fastmath={"contract", "reassoc"})
 def _densities(given, layers, groups, frequencies, raw, geometry):
     positions = given[0]
     permutation, offsets = groups
@@ -334,7 +335,7 @@ def _densities(given, layers, groups, frequencies, raw, geometry):
                     raw[s] = total
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _colours(given, layers, groups, raw):
     """Colours before the sigmoid."""
     geometry, directions = given

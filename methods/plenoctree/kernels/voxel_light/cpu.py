@@ -10,12 +10,21 @@ import math
 
 import numpy as np
 import torch
-from numba import get_num_threads, njit, prange
+from numba import get_num_threads, prange
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from bench.types import Rays
-from methods.kernels.cpu import arrays, check_float32, f32, prefetch, prefetch_row, sigmoid, u64
+from methods.kernels.cpu import (
+    arrays,
+    check_float32,
+    f32,
+    jit,
+    prefetch,
+    prefetch_row,
+    sigmoid,
+    u64,
+)
 from methods.kernels.spherical import CHANNELS, spherical_harmonics
 from methods.kernels.types import Pixels
 from methods.kernels.voxel_walk import Voxels
@@ -82,7 +91,7 @@ class _Shade(torch.autograd.Function):
         return target if buffer is None else None, None, None, None, None
 
 
-@njit(cache=True, error_model="numpy")
+@jit(error_model="numpy")
 def _weighted_sum(harmonics, voxel, basis, ray, terms):
     """Three colours of a voxel as a ray sees it, before the sigmoid; `harmonics` and `basis` are
     flat."""
@@ -96,7 +105,7 @@ def _weighted_sum(harmonics, voxel, basis, ray, terms):
     return red, green, blue
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@jit(parallel=True, error_model="numpy")
 def _shade(harmonics, voxel, ray, basis, terms, colours):
     """`harmonics` and `basis` are flat."""
     total = len(voxel)
@@ -112,7 +121,7 @@ def _shade(harmonics, voxel, ray, basis, terms, colours):
             shown[j] = sigmoid(shown[j])
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _scatter(voxel, ray, basis, colours, grad, target, terms, parts):
     """Adjoint of `_shade`: target[voxel] += Y(d) times the gradient before the sigmoid. `basis` and
     `target` are flat, `parts` a power of two."""
@@ -131,7 +140,7 @@ def _scatter(voxel, ray, basis, colours, grad, target, terms, parts):
                     at, of = at + THREE, of + ONE
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _render(rays, light, terms, maps, bounds, out):
     """Flat: the harmonics' values in the directions of rays, and the coefficients of the light."""
     origins, directions, basis = rays

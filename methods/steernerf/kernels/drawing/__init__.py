@@ -14,7 +14,6 @@ from torch import Tensor
 
 from bench.types import check_shape
 from methods.kernels.dispatch import implementation, torch_for_gpu
-from methods.steernerf.kernels.spans import Spans
 
 
 def shown(
@@ -25,7 +24,6 @@ def shown(
     *,
     dtype: torch.dtype | None = None,
     memory: Tensor | None = None,
-    spans: Spans | None = None,
     backend: str = "auto",
 ) -> Tensor:
     """Lay out the features of the present and L preceding `frames`: [H, W, K (L + 1)] of `dtype`
@@ -36,13 +34,13 @@ def shown(
     own. All else is 0.
     Differentiable in `present` and `values`; the gradient of a row is the sum over all pixels that
     show it. Without a gradient, a CPU writes the result into the beginning of `memory` [M], if that
-    is given: fresh pages of the system take as long as the work itself. `spans` are of the result.
+    is given: fresh pages of the system take as long as the work itself.
     """
     check_shape("present", present, None, None, None)
     check_shape("values", values, None, present.shape[2])
     check_shape("index", index, None, None, None)
     chosen, given = _by(backend, present), (present, values, index.contiguous())
-    return _Shown.apply(*given, frames, dtype or present.dtype, memory, spans, chosen)
+    return _Shown.apply(*given, frames, dtype or present.dtype, memory, chosen)
 
 
 def corrected(
@@ -53,21 +51,20 @@ def corrected(
     aligned: bool,
     *,
     clip: bool = False,
-    spans: Spans | None = None,
     backend: str = "auto",
 ) -> Tensor:
     """Enlarge `rgb` [h, w, 3] bilinearly to [h s, w s, 3], and add `correction` [H', W', 3] from
     the pixel `corner` (row, column) on; `clip` the sum to [0, 1].
 
     If `aligned`, every pixel stays in its place; if not, the corners of the picture do, as torch
-    calls it. `spans` are of the correction. Differentiable in both tensors, unless clipped.
+    calls it. Differentiable in both tensors, unless clipped.
     """
     check_shape("rgb", rgb, None, None, 3)
     check_shape("correction", correction, None, None, 3)
     how, chosen = (corner, scale, aligned), _by(backend, rgb)
     if clip:
-        return chosen.corrected(rgb.detach(), correction.detach(), *how, spans, clip=True)
-    return _Corrected.apply(rgb, correction, how, spans, chosen)
+        return chosen.corrected(rgb.detach(), correction.detach(), *how, clip=True)
+    return _Corrected.apply(rgb, correction, how, chosen)
 
 
 def _by(backend: str, x: Tensor) -> ModuleType:
@@ -76,28 +73,28 @@ def _by(backend: str, x: Tensor) -> ModuleType:
 
 class _Shown(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, present, values, index, frames, dtype, memory, spans, chosen):
+    def forward(ctx, present, values, index, frames, dtype, memory, chosen):
         ctx.save_for_backward(index)
         ctx.chosen, ctx.dtype = chosen, present.dtype
         ctx.given = frames, present.shape[:2], len(values)
         moved = (x.detach().to(dtype).contiguous() for x in (present, values))
         if memory is None or any(ctx.needs_input_grad):
             memory = present.new_empty(0, dtype=dtype)
-        return chosen.shown(*moved, index, frames, memory, spans)
+        return chosen.shown(*moved, index, frames, memory)
 
     @staticmethod
     def backward(ctx, grad):
         (index,) = ctx.saved_tensors
         grads = ctx.chosen.collected(grad.to(ctx.dtype).contiguous(), index, *ctx.given)
-        return *grads, None, None, None, None, None, None
+        return *grads, None, None, None, None, None
 
 
 class _Corrected(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, rgb, correction, how, spans, chosen):
-        ctx.how, ctx.spans, ctx.chosen = how, spans, chosen
+    def forward(ctx, rgb, correction, how, chosen):
+        ctx.how, ctx.chosen = how, chosen
         ctx.sizes, ctx.dtype = (rgb.shape[:2], correction.shape[:2]), correction.dtype
-        return chosen.corrected(rgb.detach(), correction.detach(), *how, spans, clip=False)
+        return chosen.corrected(rgb.detach(), correction.detach(), *how, clip=False)
 
     @staticmethod
     def backward(ctx, grad):
@@ -107,6 +104,4 @@ class _Corrected(torch.autograd.Function):
         if ctx.needs_input_grad[0]:
             base = ctx.chosen.reduced(grad.contiguous(), size, scale, aligned)
         added = grad[top : top + rows, left : left + columns].to(ctx.dtype)
-        if ctx.spans is not None:
-            added = torch.where(ctx.spans.mask(rows, columns)[..., None], added, 0)
-        return base, added, None, None, None
+        return base, added, None, None

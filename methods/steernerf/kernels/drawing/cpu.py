@@ -7,11 +7,10 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
-from methods.kernels.cpu import arrays, check_float32, f32
-from methods.steernerf.kernels.spans import Spans, ends
+from methods.kernels.cpu import arrays, check_float32, f32, jit
 
 Axis = tuple[Tensor, Tensor, Tensor]
 """Of each place along a side of the picture: the two pixels it lies between, and how near it is to
@@ -24,7 +23,6 @@ def shown(
     index: Tensor,
     frames: int,
     memory: Tensor,
-    spans: Spans | None,
 ) -> Tensor:
     """As the reference, of numbers of 16 or 32 bits, which are moved and not computed; in `memory`
     if that has room."""
@@ -33,8 +31,7 @@ def shown(
     out = memory[: shape.numel()].view(shape) if fits else present.new_empty(shape)
     moved = (x.view(torch.int16) if x.dtype.itemsize == 2 else x for x in (present, values, out))
     present, values, filled = moved
-    of_rows = ends(spans, *shape[:2])
-    _shown(*arrays(present, values, index, of_rows), frames + 1, filled.numpy())
+    _shown(*arrays(present, values, index), frames + 1, filled.numpy())
     return out
 
 
@@ -55,7 +52,6 @@ def corrected(
     corner: tuple[int, int],
     scale: int,
     aligned: bool,
-    spans: Spans | None,
     *,
     clip: bool,
 ) -> Tensor:
@@ -64,8 +60,7 @@ def corrected(
     check_float32(rgb)
     down, across = (_axis(side, scale, aligned) for side in rgb.shape[:2])
     out = torch.empty(len(down[0]), len(across[0]), 3)
-    of_rows = ends(spans, *correction.shape[:2])
-    given = arrays(rgb, correction, of_rows, *down, *across, out)
+    given = arrays(rgb, correction, *down, *across, out)
     _corrected(*given, *corner, clip)
     return out
 
@@ -91,23 +86,23 @@ def _axis(side: int, scale: int, aligned: bool) -> Axis:
     return first.int(), (first + 1).clamp(max=side - 1).int(), (place - first).float()
 
 
-@njit(cache=True, parallel=True)
-def _shown(present, values, index, ends, frames, out):
+@jit(parallel=True)
+def _shown(present, values, index, frames, out):
     step = out.shape[0] // present.shape[0]
     for row in prange(out.shape[0]):
-        line, (first, end) = out[row], ends[row]
-        line[first:end] = 0
+        line = out[row]
+        line[:] = 0
         if row % step == 0:
-            for column in range((first + step - 1) // step, (end + step - 1) // step):
+            for column in range(present.shape[1]):
                 _put(present[row // step, column], 0, frames, line[column * step])
         for frame in range(index.shape[0]):
-            for column in range(first, end):
+            for column in range(out.shape[1]):
                 point = index[frame, row, column]
                 if point >= 0:
                     _put(values[point], frame + 1, frames, line[column])
 
 
-@njit(cache=True)
+@jit()
 def _put(features, frame, frames, pixel):
     """Write the features of one of the frames to a pixel: RGB of all come first."""
     for k in range(3):
@@ -117,7 +112,7 @@ def _put(features, frame, frames, pixel):
         pixel[3 * frames + rest * frame + k] = features[3 + k]
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _collected(grad, index, present, values, frames):
     """Adjoint of `_shown`. A thread a frame, because frames share no points."""
     step = grad.shape[0] // present.shape[0]
@@ -135,7 +130,7 @@ def _collected(grad, index, present, values, frames):
                         _add(grad[row, column], frame, frames, values[point])
 
 
-@njit(cache=True)
+@jit()
 def _add(pixel, frame, frames, features):
     """Adjoint of `_put`."""
     for k in range(3):
@@ -145,9 +140,9 @@ def _add(pixel, frame, frames, features):
         features[3 + k] += pixel[3 * frames + rest * frame + k]
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _corrected(
-    rgb, correction, ends, above, below, lower, left, right, nearer, out, top, start, clip
+    rgb, correction, above, below, lower, left, right, nearer, out, top, start, clip
 ):  # fmt: skip
     for y in prange(out.shape[0]):
         first, second, share = rgb[above[y]], rgb[below[y]], lower[y]
@@ -159,8 +154,8 @@ def _corrected(
             for c in range(3):
                 line[x, c] = _mixed(between[left[x], c], between[right[x], c], nearer[x])
         if top <= y < top + correction.shape[0]:
-            added, (first_added, end) = correction[y - top], ends[y - top]
-            for x in range(first_added, end):
+            added = correction[y - top]
+            for x in range(len(added)):
                 for c in range(3):
                     line[start + x, c] += added[x, c]
         if clip:
@@ -170,12 +165,12 @@ def _corrected(
                     line[x, c] = f32(0) if v < 0 else f32(1) if v > 1 else v  # NaN stays
 
 
-@njit(cache=True)
+@jit()
 def _mixed(first, second, share):
     return first * (f32(1) - share) + second * share
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _reduced(grad, above, below, lower, left, right, nearer, rows, sums):
     """Adjoint of enlarging: first along the rows of the picture, then along its columns."""
     for y in prange(grad.shape[0]):

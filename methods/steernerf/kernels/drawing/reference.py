@@ -6,8 +6,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from methods.steernerf.kernels.spans import Spans
-
 
 def shown(
     present: Tensor,
@@ -15,9 +13,8 @@ def shown(
     index: Tensor,
     frames: int,
     memory: Tensor,
-    spans: Spans | None,
 ) -> Tensor:
-    """The features of all frames, [H, W, K (L + 1)]; `memory` and `spans` are not used."""
+    """The features of all frames, [H, W, K (L + 1)]; `memory` is not used."""
     s, (preceding, height, width) = index.shape[1] // present.shape[0], index.shape
     every = present.new_zeros(frames + 1, height, width, present.shape[2])
     every[0, ::s, ::s] = present
@@ -47,7 +44,6 @@ def corrected(
     corner: tuple[int, int],
     scale: int,
     aligned: bool,
-    spans: Spans | None,
     *,
     clip: bool,
 ) -> Tensor:
@@ -57,8 +53,6 @@ def corrected(
     base = functional.interpolate(given, size, mode="bilinear", align_corners=not aligned)
     picture = base[0].permute(1, 2, 0).contiguous()
     (top, left), (height, width) = corner, correction.shape[:2]
-    if spans is not None:
-        correction = torch.where(spans.mask(height, width)[..., None], correction, 0)
     picture[top : top + height, left : left + width] += correction
     return picture.clamp_(0, 1) if clip else picture
 

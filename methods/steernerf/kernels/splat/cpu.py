@@ -6,10 +6,10 @@ No two threads write to the same pixel, and the result does not depend on their 
 from __future__ import annotations
 
 import numpy as np
-from numba import get_num_threads, njit, prange
+from numba import get_num_threads, prange
 from torch import Tensor
 
-from methods.kernels.cpu import arrays, check_float32, i32
+from methods.kernels.cpu import arrays, check_float32, i32, jit
 
 
 def splat(pixels: Tensor, depth: Tensor, first: int, index: Tensor) -> None:
@@ -18,7 +18,7 @@ def splat(pixels: Tensor, depth: Tensor, first: int, index: Tensor) -> None:
     _splat(*arrays(pixels, depth), first, index.numpy(), get_num_threads())
 
 
-@njit(cache=True, parallel=True)
+@jit(parallel=True)
 def _splat(pixels, depth, first, index, bands):
     height, width = index.shape
     for band in prange(bands):

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from methods.steernerf.kernels.drawing import corrected, shown
-from methods.steernerf.kernels.spans import Spans
 
 BACKENDS = ["reference", "cpu"]
 HEIGHT, WIDTH, SCALE, FEATURES = 2, 3, 4, 5
@@ -51,21 +50,6 @@ def test_features_of_16_bits_are_rounded_before_they_are_moved(backend: str) -> 
     got = shown(*given, 2, dtype=torch.bfloat16, backend=backend)
     assert got.dtype == torch.bfloat16
     assert torch.equal(got, shown(*given, 2, backend=backend).bfloat16())
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_spans_are_laid_out_alike_and_alone_are_corrected(backend: str) -> None:
-    """In bands and units of 4 of 8 x 12 pixels; beyond them, the correction may be anything."""
-    spans = Spans(torch.tensor([[1, 2], [0, 9]]), 4)
-    mask, given = spans.mask(HEIGHT * SCALE, WIDTH * SCALE)[..., None], features()
-    found, want = (shown(*given, 2, spans=x, backend=backend) for x in (spans, None))
-    assert torch.equal(torch.where(mask, found, 0), torch.where(mask, want, 0))
-    rgb, added = given[0][..., :3], torch.where(mask, want[..., :3] - 0.5, 0)
-    how = {"corner": (0, 0), "scale": SCALE, "aligned": True, "backend": backend}
-    for clip in (False, True):
-        unknown = torch.where(mask, added, torch.nan)
-        picture = corrected(rgb, unknown, **how, clip=clip, spans=spans)
-        assert torch.equal(picture, corrected(rgb, added, **how, clip=clip))
 
 
 def test_memory_is_used_where_it_has_room_and_nothing_needs_a_gradient() -> None:

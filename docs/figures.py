@@ -1,20 +1,23 @@
-"""`steerbench figures`: measures what the documents of a checkout show, and puts it into them.
+"""Measures what the documents show, and puts it into them: `make figures`.
 
 docs/figures.toml names the commands. A document shows a part of what one of them wrote between two
 comments, `<!-- figures NAME | HEADING | WHAT -->` and `<!-- end of figures -->`: of the section of
 its page whose heading begins so (none: the first), the first `table`, the `bold` lines of it, the
 first `picture`, or `all`. `table 8` has its first lines, `table of case, ms` those columns whose
-heading is so up to its unit. What is between the comments is replaced.
+heading is so up to its unit. What is between the comments is replaced. The page of a command is
+what it writes into {folder}, or else what it prints.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import hashlib
 import json
 import re
 import shlex
 import subprocess
+import sys
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -24,11 +27,6 @@ from pathlib import Path
 from PIL import Image
 
 from bench import provenance
-from bench.console import ConsoleLog
-from bench.errors import SteerbenchError, unknown
-from bench.results import content_key
-from bench.sharing import whole
-from sweeps import cli, terminal
 
 LIST = Path("docs/figures.toml")
 RESULTS = Path("docs/results")
@@ -36,6 +34,7 @@ CODE = ("bench", "methods", "sweeps")  # what figures depend on
 FOLDER = Path("outputs/figures")
 PAGE = "report.md"
 MADE = "made.json"  # beside a page: what made it
+STEERBENCH = Path(sys.executable).with_name("steerbench")
 
 REGION = re.compile(
     r"<!-- figures (?P<name>[\w-]+) \| (?P<heading>[^|\n]*?) \| "
@@ -69,54 +68,52 @@ class Made:
         return f"`{command}`, at {self.commit}, on {self.machine}:"
 
 
-def main(options: argparse.Namespace) -> int:
-    """Measure what is missing or of other code, fill the documents; return 1 if anything failed.
-
-    With `check`, name what is missing or of other code instead, and return 1 if anything is.
-    """
-    if not LIST.is_file():
-        raise SteerbenchError(f"{LIST}: no such file; expected to be in a checkout of steerbench")
+def main(argv: Sequence[str]) -> int:
+    """Measure what is missing or of other code, fill the documents; return 1 if anything failed."""
+    parser = argparse.ArgumentParser(description="Measure all that the documents show.")
+    parser.add_argument("--only", help="only what has this name in the list", action="append")
+    parser.add_argument("--data", help="the folder of NeRF-Synthetic; what needs it is left out")
+    parser.add_argument(
+        "--check",
+        help="measure nothing; name what is missing or of other code",
+        action="store_true",
+    )
+    options = parser.parse_args(argv)
     wanted = tomllib.loads(LIST.read_text(encoding="utf-8"))
-    for name in options.only:
-        if name not in wanted:
-            raise unknown("--only", name, wanted)
-    log, code, failed = ConsoleLog(Path()), _code(), 0
+    code, failed = _code(), 0
     for name in options.only or wanted:
         command, folder = f"steerbench {wanted[name]['command']}", FOLDER / name
         before = _read(folder)
         if before and (before.command, before.code) == (command, code):
-            log.info(f"{name}: made at {before.commit}")
+            _say(f"{name}: made at {before.commit}")
         elif options.check:
-            found = f"made at {before.commit}, of other code" if before else "missing"
-            log.info(f"{name}: {found}")
+            _say(f"{name}: {f'made at {before.commit}, of other code' if before else 'missing'}")
             failed += 1
         elif "{data}" in command and options.data is None:
-            log.info(f"{name}: left out, it needs --data DIR")
+            _say(f"{name}: left out, it needs --data DIR")
         else:
-            _, *words = (
-                word.format(folder=folder, data=options.data) for word in shlex.split(command)
-            )
-            log.info(f"{name}: steerbench {shlex.join(words)}")
+            _, *words = (x.format(folder=folder, data=options.data) for x in shlex.split(command))
+            _say(f"{name}: steerbench {shlex.join(words)}")
             failed += not _measure(words, folder, Made(command, _commit(), code, _machine()))
     if not options.check:
         _fill({name: FOLDER / name for name in wanted if _read(FOLDER / name)})
     return int(failed > 0)
 
 
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
 def _measure(words: Sequence[str], folder: Path, made: Made) -> bool:
     """Run a command and keep its page in `folder`; whether it succeeded."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / MADE).unlink(missing_ok=True)  # a command that fails may have written its page
-    terminal.shown.clear()
-    if status := cli.guard(cli.dispatch, words):
-        if status == cli.INTERRUPTED:
-            raise KeyboardInterrupt
+    ended = subprocess.run([STEERBENCH, *words], stdout=subprocess.PIPE, text=True, check=False)
+    if ended.returncode:
         return False
     if "{folder}" not in made.command:
-        parts = (f"## {table.title}\n\n{table.markdown()}\n" for table in terminal.shown)
-        (folder / PAGE).write_text("\n".join(parts), encoding="utf-8")
-    with whole(folder / MADE) as new:
-        new.write_text(json.dumps(asdict(made), indent=1) + "\n", encoding="utf-8")
+        (folder / PAGE).write_text(ended.stdout, encoding="utf-8")
+    (folder / MADE).write_text(json.dumps(asdict(made), indent=1) + "\n", encoding="utf-8")
     return True
 
 
@@ -127,9 +124,11 @@ def _read(folder: Path) -> Made | None:
 
 def _code() -> str:
     """A digest of all files below `CODE`."""
-    files = sorted(path for top in CODE for path in Path(top).rglob("*") if path.is_file())
-    kept = (path for path in files if "__pycache__" not in path.parts)
-    return content_key({str(path): provenance.sha256(path) for path in kept})[:16]
+    digest = hashlib.sha256()
+    for path in sorted(path for top in CODE for path in Path(top).rglob("*") if path.is_file()):
+        if "__pycache__" not in path.parts:
+            digest.update(f"{path}\n".encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def _commit() -> str:
@@ -139,10 +138,8 @@ def _commit() -> str:
 
 
 def _git(*words: str) -> str:
-    ended = subprocess.run(["git", *words, "--", *CODE], capture_output=True, text=True)
-    if ended.returncode:
-        raise SteerbenchError(f"git: {ended.stderr.strip()}; expected to be in a git checkout")
-    return ended.stdout.strip()
+    command = ["git", *words, "--", *CODE]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def _machine() -> str:
@@ -192,7 +189,7 @@ def _region(
     if part != "all":
         found = (PICTURE if part == "picture" else TABLE).search(text)
         if not found:
-            raise SteerbenchError(f"{document}: figures {name} | {heading}: it has no {part}")
+            raise SystemExit(f"{document}: figures {name} | {heading}: it has no {part}")
         text = found[0]
     to_results = RESULTS if document.parent == Path() else RESULTS.relative_to(document.parent)
 
@@ -224,7 +221,7 @@ def _of_columns(rows: Sequence[str], wanted: Sequence[str]) -> list[str]:
     names = [UNIT.split(cell)[0] for cell in cells[0]]
     for name in wanted:
         if name not in names:
-            raise unknown("column", name, names)
+            raise SystemExit(f"expected one of the columns {', '.join(names)}, got {name}")
     chosen = [names.index(name) for name in wanted] or range(len(names))
     return [f"|{'|'.join(row[column] for column in chosen)}|" for row in cells]
 
@@ -240,9 +237,7 @@ def _section(text: str, heading: str, name: str) -> str:
         if title in sections:
             return sections[title]
     there = ", ".join(repr(each[1]) for each in found)
-    raise SteerbenchError(
-        f"figures {name}: expected a heading that begins {heading!r}, got {there}"
-    )
+    raise SystemExit(f"figures {name}: expected a heading that begins {heading!r}, got {there}")
 
 
 def _copy(picture: Path, name: str) -> str:
@@ -272,3 +267,7 @@ def _rows(text: str) -> Iterator[list[str]]:
             cells = [cell.strip() for cell in CELL.split(line)[1:-1]]
             yield [cell.replace("\\|", "|").strip("*") for cell in cells]
         inside = line.startswith("|")
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,139 @@
+"""What experiments declare as tables, and what is refused in a declaration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from bench.errors import SteerbenchError
+from reports.tables import QUALITY
+from sweeps.data_sets import DATA_SETS, FIRST
+from sweeps.tables import chosen, grid
+
+_, SECOND = DATA_SETS
+TABLES = {table.name: table for table in chosen()}
+BOTH = {table.name: table for table in chosen(data_sets=[FIRST, SECOND])}
+METRICS = {*QUALITY, "fps", "frame_ms", "size_bytes.total", "work.samples"}
+
+
+def test_the_experiments_declare_the_six_tables_of_the_paper():
+    assert list(TABLES) == [f"table{number}" for number in range(1, 7)]
+    for table in TABLES.values():
+        assert len({line.label for line in table.lines.values()}) == len(table.lines)
+        for line in table.lines.values():
+            assert set(line.published) <= {*table.metrics, "frame_ms"}, line.label
+
+
+def test_milliseconds_follow_from_published_frames_per_second():
+    fast = TABLES["table1"].lines["plenoctree"]
+    assert fast.published["frame_ms"] == pytest.approx(1000 / 167.7)
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_second_data_set_has_its_figures_in_a_block_if_the_paper_has_any(name):
+    (alone,) = chosen(name, data_sets=[SECOND])
+    first, *further = BOTH[name].blocks
+    assert [first] == list(TABLES[name].blocks)
+    assert [block.data_set for block in further] == [SECOND] * (name in ("table1", "table2"))
+    assert alone.blocks[0].data_set == (SECOND if further else "")
+    assert {key: line.job for key, line in alone.lines.items()} == {
+        key: line.job for key, line in first.lines.items()
+    }
+    for block in further:
+        assert block.lines.items() <= alone.lines.items()
+        assert block.published_on == alone.blocks[0].published_on != first.published_on
+    if not further:
+        assert not any(line.published for line in alone.lines.values())
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_the_lines_of_a_table_take_every_value_of_its_grid_and_no_other(name):
+    jobs = [line.job for line in TABLES[name].lines.values()]
+    for setting, (usual, *others) in grid(name).items():
+        assert {usual, *(job[setting] for job in jobs if setting in job)} == {usual, *others}
+
+
+MINE = """
+# @package _global_
+hydra:
+  mode: MULTIRUN
+  sweeper:
+    params:
+      method.level: 0.25,0.5
+      seed: 0,1
+table:
+  title: Mine
+  metrics: [psnr, fps]
+"""
+
+
+def declared(folder: Path, more: str = "", text: str = MINE) -> list[str]:
+    """A folder with an experiment `mine`, as a word."""
+    (folder / "experiment").mkdir()
+    (folder / "experiment" / "mine.yaml").write_text(f"{text}{more}")
+    return [f"--config-dir={folder}"]
+
+
+def test_a_table_of_ones_own_has_a_line_for_each_job_of_its_grid(tmp_path):
+    words = declared(tmp_path)
+    assert grid("mine", words) == {"method.level": ["0.25", "0.5"], "seed": ["0", "1"]}
+    (table,) = chosen("mine", words)
+    assert {key: (line.label, line.job) for key, line in table.lines.items()} == {
+        x: (f"method.level={x}", {"method.level": x}) for x in ("0.25", "0.5")
+    }
+    assert table.called == "Mine"
+    assert table.name not in [of_paper.name for of_paper in chosen(words=words)]
+
+
+def test_several_axes_have_a_line_for_each_combination(tmp_path):
+    two = (
+        MINE.replace("seed: 0,1", "method.shade: a,b")
+        .replace("psnr", "psnr")
+        .replace(
+            "title: Mine",
+            "title: Mine\n  label: '{} in {}'\n  lines: {'0.5, b': {published: [30, 20]}}",
+        )
+    )
+    (table,) = chosen("mine", declared(tmp_path, "  published_on: there\n", two))
+    labels = [line.label for line in table.lines.values()]
+    assert labels == ["0.25 in a", "0.25 in b", "0.5 in a", "0.5 in b"]
+    assert table.lines["0.5, b"].job == {"method.level": "0.5", "method.shade": "b"}
+    assert table.lines["0.5, b"].published == {"psnr": 30, "fps": 20, "frame_ms": 50}
+    assert table.lines["0.5, a"].published == {}
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ("  claim: []", "unknown setting 'experiment mine: table.claim'"),
+        ("  lines: {0.75: {label: bright}}", "unknown line '0.75'"),
+        ("  lines: {0.5: {lable: bright}}", "lines.0.5.lable'. Did you mean"),
+        ("  lines: {0.5: {published: [30, 1]}}", "published_on: expected what `published` was"),
+        (
+            "  lines: {0.5: {published: [30]}}\n  published_on: there",
+            "lines.published: expected 2 figures, one for each of metrics, got 1",
+        ),
+        ("  claims: [{metric: psnr, margin: 0.1, rising: [0.5, 1.0]}]", "unknown line '1.0'"),
+        (
+            "  claims: [{metric: psnr, margin: 0.1, alike: [0.5], says: '{loss}'}]",
+            "unknown line 'loss'",
+        ),
+        ("  claims: [{metric: psrn, margin: 0.1, alike: [0.5]}]", "psrn: no such metric"),
+        ("  claims: [{metric: psnr, alike: [0.5]}]", "claims.margin is not set"),
+        ("  reference: 1.0", "unknown line '1.0'"),
+        ("  instead: {0.5: 1.0}", "unknown line '1.0'"),
+        ("  beside: [1.0]", "unknown line '1.0'"),
+    ],
+)
+def test_what_is_wrong_in_a_declaration_is_named(tmp_path, more, said):
+    with pytest.raises(SteerbenchError) as error:
+        chosen("mine", declared(tmp_path, more))
+    assert said in str(error.value)
+
+
+def test_an_experiment_without_a_table_or_a_grid_is_refused(tmp_path):
+    with pytest.raises(SteerbenchError, match="demo: table: expected a section"):
+        chosen("demo")
+    with pytest.raises(SteerbenchError, match="expected settings in hydra"):
+        chosen("mine", declared(tmp_path, text=MINE.replace("hydra", "hydro")))
