@@ -20,7 +20,6 @@ from methods.instant_ngp.field import Precision
 from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
 from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.composite import STOP, check_stop
-from methods.kernels.dispatch import refuse_gpu
 from methods.kernels.encode import HashGrid
 from methods.kernels.types import expect
 from methods.rendering.frame import FeatureFrame
@@ -69,7 +68,6 @@ class GaussianSplatting:
         expect(self.stored in ("fp32", "int8"), "stored", "fp32 or int8", self.stored)
         expect(self.degree in range(4), "degree", "0 to 3", self.degree)
         check_stop(self.stop)
-        refuse_gpu(self.backend, self.name)
         where = self.backend, self.device, self.seed
         self.setup = Setup.resolved(self.grid, self.training, self.precision, *where)
         self.reads = [] if self.checkpoint is None else [Path(self.checkpoint)]
@@ -143,4 +141,4 @@ class GaussianSplatting:
         return {"gaussians": plain if self.stored == "fp32" else stored_bytes(self.gaussians)}
 
     def settings(self) -> dict[str, str]:
-        return self.setup.settings() | {"precision": self.stored, "engine": "none"}
+        return self.setup.settings(type(self)) | {"precision": self.stored, "engine": "none"}

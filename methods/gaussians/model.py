@@ -11,7 +11,7 @@ from torch.nn import functional
 from bench.types import Camera, Probe
 from methods.gaussians.kernels.blending import blend
 from methods.gaussians.kernels.projection import project_gaussians
-from methods.kernels.spherical import shade
+from methods.kernels.shade import shade
 from methods.kernels.types import Pixels
 
 Y00 = 1 / math.sqrt(4 * math.pi)  # the first spherical harmonic, a constant

@@ -79,4 +79,4 @@ class InstantNgp:
 
     def settings(self) -> dict[str, str]:
         """The settings that a row of results shows, as they really are."""
-        return self.setup.settings()
+        return self.setup.settings(type(self))

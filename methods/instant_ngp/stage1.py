@@ -12,6 +12,7 @@ from methods.instant_ngp.field import HashField, Precision
 from methods.instant_ngp.table import SuitedGrid
 from methods.instant_ngp.training import FieldTraining, TrainingOptions, new_grid, restore_field
 from methods.kernels import multiplies_bf16, resolve
+from methods.kernels.dispatch import by_kernel
 from methods.kernels.encode import HashGrid
 from methods.kernels.types import Occupancy
 from methods.rendering.occupancy import DensityGrid
@@ -53,12 +54,12 @@ class Setup:
         place = torch.device(device)
         return cls(grid, training, precision, resolve(backend, place), place, seed)
 
-    def settings(self) -> dict[str, str]:
-        """The settings that a row of results shows, as they really are."""
+    def settings(self, method: type) -> dict[str, str]:
+        """The settings that a row of `method` shows, as they really are."""
         multiplied = self.precision == "fp32" or multiplies_bf16(self.device.type)
         return {
             "device": str(self.device),
-            "backend": self.backend,
+            "backend": by_kernel(self.backend, method),
             "engine": "torch",
             "precision": self.precision if multiplied else "bf16 in fp32",
         }

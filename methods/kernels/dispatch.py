@@ -15,6 +15,7 @@ from types import ModuleType
 import torch
 
 from bench.errors import Unavailable
+from bench.provenance import sources
 
 BACKENDS = ("reference", "cpu", "gpu")
 
@@ -64,19 +65,13 @@ def resolve(backend: str, device: torch.device | str) -> str:
     return backend
 
 
-def refuse_gpu(backend: str, method: str) -> None:
-    """Raise `Unavailable` if `backend` is "gpu": `method` has kernels without a Triton version."""
-    if backend == "gpu":
-        raise Unavailable(
-            f"backend='gpu': {method} has no Triton kernels: use backend=auto, which computes with "
-            "torch on a GPU"
-        )
-
-
-def torch_for_gpu(backend: str) -> str:
-    """The backend of a kernel that has no Triton version and that methods with others need: with
-    "gpu", torch computes it."""
-    return "reference" if backend == "gpu" else backend
+def by_kernel(backend: str, method: type) -> str:
+    """`backend`, with the names of the kernels that `method` imports, directly or not, and that
+    have no such version: the reference computes those. For rows."""
+    files = sources(method)
+    folders = [Path(name).parent for name in files if name.endswith("/reference.py")]
+    lacking = sorted(x.name for x in folders if (x / f"{backend}.py").as_posix() not in files)
+    return f"{backend}, but reference: {', '.join(lacking)}" if lacking else backend
 
 
 @cache
@@ -94,19 +89,13 @@ def multiplies_bf16(kind: str) -> bool:
 def implementation(kernel: str, backend: str, device: torch.device) -> ModuleType:
     """The module that implements `kernel`, a package, for tensors on `device`.
 
-    With `auto`, a kernel without a version for the CPU is computed there by its reference. Raises
-    `Unavailable` as `resolve` does, or if the kernel has no such version.
+    The reference computes a kernel that has no such version; see `by_kernel`. Raises `Unavailable`
+    as `resolve` does.
     """
     for called in _calls:
         called.add(kernel)
-    backend = _forced.get(kernel, backend)
-    name = resolve(backend, device)
+    name = resolve(_forced.get(kernel, backend), device)
     if name not in served(kernel):
-        if backend != "auto":
-            raise Unavailable(
-                f"backend={name!r}: {kernel.rpartition('.')[2]} has no such version, only "
-                f"{' and '.join(served(kernel))}: use backend=auto"
-            )
         name = "reference"
     if name == "cpu":
         _load("methods.kernels.cpu").follow_torch_threads()

@@ -155,4 +155,4 @@ class SteerNerf:
     def settings(self) -> dict[str, str]:
         """Those of the field, with the engine and precision of the 2D renderer."""
         engine, computed = self.chosen.name, self.chosen.computed(self.setup.device)
-        return self.setup.settings() | {"engine": engine, "precision": computed}
+        return self.setup.settings(type(self)) | {"engine": engine, "precision": computed}

@@ -19,7 +19,6 @@ from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
 from methods.instant_ngp.training import PixelOptions
 from methods.kernels.composite import check_stop
-from methods.kernels.dispatch import refuse_gpu
 from methods.kernels.types import Occupancy, expect
 from methods.rendering.frame import Render, render_frame
 from methods.training import checkpoint, loop
@@ -50,7 +49,6 @@ class Student(ABC):
 
     def __post_init__(self) -> None:
         check_stop(self.stop)
-        refuse_gpu(self.teacher.backend, self.name)
         expect(self.steps is None or self.steps >= 1, "steps", "1 or more, or none", self.steps)
         self.train_s = 0.0
 
@@ -110,4 +108,4 @@ class Student(ABC):
 
     def settings(self) -> dict[str, str]:
         """What a row says of how it ran."""
-        return self.teacher.settings() | {"engine": "none"}
+        return self.teacher.settings(type(self)) | {"engine": "none"}

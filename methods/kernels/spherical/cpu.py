@@ -7,51 +7,28 @@ import torch
 from numba import prange
 from torch import Tensor
 
-from methods.kernels.cpu import arrays, check_float32, f32, jit, u64
+from methods.kernels.cpu import arrays, check_float32, f32, jit
 from methods.kernels.spherical import FACTORS
 
 BLOCK = 256  # directions at a time; their 16 harmonics stay in the first-level cache
 
 ROWS = 19  # rows of a block: the harmonics, and x, y, z
 
-ZERO = f32(0)
-ONE, TWO, THREE, NEXT = u64(1), u64(2), u64(3), u64(BLOCK)
 C00, C1, C2, C20, C22, C33, C3XYZ, C31, C30, C32 = map(f32, FACTORS)
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:
-    _check(directions)
+    check_directions(directions)
     values = torch.empty(len(directions), 16)
     _evaluate(*arrays(directions, values))
     return values
 
 
-def shade(coefficients: Tensor, directions: Tensor) -> Tensor:
-    _check(directions, coefficients)
-    return _Shade.apply(coefficients, directions.contiguous())
-
-
-def _check(directions: Tensor, *others: Tensor) -> None:
-    check_float32(directions, *others)
+def check_directions(directions: Tensor) -> None:
+    """Raise ValueError unless they are of float32, and ask for no gradient."""
+    check_float32(directions)
     if directions.requires_grad:
         raise ValueError("backend 'cpu' gives no gradient for directions: use backend='reference'")
-
-
-class _Shade(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, coefficients, directions):
-        colours = torch.empty(len(directions), 3)
-        _shade(*arrays(coefficients.flatten(), directions), coefficients.shape[1], colours.numpy())
-        ctx.save_for_backward(directions)
-        ctx.shape = coefficients.shape
-        return colours
-
-    @staticmethod
-    def backward(ctx, grad):
-        (directions,) = ctx.saved_tensors
-        grads = torch.empty(ctx.shape)
-        _unshade(*arrays(grad, directions), ctx.shape[1], grads.view(-1).numpy())
-        return grads, None
 
 
 @jit(parallel=True)
@@ -59,51 +36,14 @@ def _evaluate(directions, out):
     count = len(directions)
     for chunk in prange((count + BLOCK - 1) // BLOCK):
         first, size = chunk * BLOCK, min(BLOCK, count - chunk * BLOCK)
-        basis = _harmonics(directions, first, size)
+        basis = harmonics(directions, first, size)
         for i in range(size):
             for k in range(16):
                 out[first + i, k] = basis[k * BLOCK + i]
 
 
-@jit(parallel=True)
-def _shade(coefficients, directions, terms, colours):
-    """`coefficients` are flat."""
-    count = len(directions)
-    for chunk in prange((count + BLOCK - 1) // BLOCK):
-        first, size = chunk * BLOCK, min(BLOCK, count - chunk * BLOCK)
-        basis = _harmonics(directions, first, size)
-        for i in range(size):
-            at, of = u64((first + i) * terms * 3), u64(i)
-            red, green, blue = ZERO, ZERO, ZERO
-            for _ in range(terms):
-                value = basis[of]
-                red += value * coefficients[at]
-                green += value * coefficients[at + ONE]
-                blue += value * coefficients[at + TWO]
-                at, of = at + THREE, of + NEXT
-            colours[first + i, 0], colours[first + i, 1], colours[first + i, 2] = red, green, blue
-
-
-@jit(parallel=True)
-def _unshade(grad, directions, terms, grads):
-    """`grads` are flat."""
-    count = len(directions)
-    for chunk in prange((count + BLOCK - 1) // BLOCK):
-        first, size = chunk * BLOCK, min(BLOCK, count - chunk * BLOCK)
-        basis = _harmonics(directions, first, size)
-        for i in range(size):
-            at, of = u64((first + i) * terms * 3), u64(i)
-            red, green, blue = grad[first + i, 0], grad[first + i, 1], grad[first + i, 2]
-            for _ in range(terms):
-                value = basis[of]
-                grads[at] = value * red
-                grads[at + ONE] = value * green
-                grads[at + TWO] = value * blue
-                at, of = at + THREE, of + NEXT
-
-
 @jit()
-def _harmonics(directions, first, size):
+def harmonics(directions, first, size):
     """A block with the harmonics of `size` directions, number k of direction i at k * `BLOCK` + i.
 
     The directions are copied into it first: in a loop over one array LLVM sees what it may

@@ -32,8 +32,3 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
         C33 * x * (xx - 3 * yy),
     )
     return torch.stack(values, dim=-1)
-
-
-def shade(coefficients: Tensor, directions: Tensor) -> Tensor:
-    basis = spherical_harmonics(directions)[:, : coefficients.shape[1]]
-    return (basis[:, :, None] * coefficients).sum(dim=1)

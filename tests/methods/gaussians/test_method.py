@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from bench.types import Budget, Log, NullProbe, Scene, Unavailable
+from bench.types import Budget, Log, NullProbe, Scene
 from methods.gaussians.method import GaussianSplatting
 from methods.gaussians.training import Fitting
 from tests.methods.trainings import GRID, PIXEL, QUICK, TAUGHT, quality, shows_the_ball
@@ -64,11 +64,6 @@ def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, shared_log: Log) -
     assert small.sizes()["gaussians"] < plain.sizes()["gaussians"] / 3.5
     assert small.settings()["precision"] == "int8"
     assert abs(quality(small, ball_scene) - quality(plain, ball_scene)) < 0.5
-
-
-def test_by_triton_there_are_none() -> None:
-    with pytest.raises(Unavailable, match="gaussians has no Triton kernels: use backend=auto"):
-        GaussianSplatting(grid=GRID, training=QUICK, fitting=Fitting(), count=9, backend="gpu")
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from plyfile import PlyData, PlyElement
 from bench.types import Scene, SteerbenchError
 from methods.gaussians import ply
 from methods.gaussians.model import Gaussians
-from methods.kernels.spherical import shade
+from methods.kernels.shade import shade
 
 
 @pytest.fixture

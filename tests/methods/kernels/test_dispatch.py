@@ -34,14 +34,13 @@ def test_backend_that_cannot_be_used_says_why(monkeypatch: pytest.MonkeyPatch) -
     availability.cache_clear()
 
 
-def test_a_version_that_a_kernel_lacks_is_refused_and_auto_does_without(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize("backend", ["auto", "cpu"])
+def test_a_kernel_without_a_version_is_computed_by_its_reference(
+    backend: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(dispatch, "served", lambda kernel: ("reference",))
     kernel, device = "methods.kernels.spherical", torch.device("cpu")
-    with pytest.raises(Unavailable, match="spherical has no such version, only reference"):
-        dispatch.implementation(kernel, "cpu", device)
-    assert dispatch.implementation(kernel, "auto", device).__name__ == f"{kernel}.reference"
+    assert dispatch.implementation(kernel, backend, device).__name__ == f"{kernel}.reference"
 
 
 def test_for_a_while_a_kernel_is_computed_by_its_reference_whatever_is_asked_for() -> None:

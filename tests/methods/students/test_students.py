@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 
-from bench.types import Log, NullProbe, Scene, Unavailable
+from bench.types import Log, NullProbe, Scene
 from methods.diver.training import DiverLessons
 from methods.instant_ngp.stage1 import train_field
 from methods.kilonerf.method import KiloLessons
@@ -22,7 +22,6 @@ from methods.students.fields import FieldLessons
 from methods.training import loop
 from tests.methods.small_students import LEAVES, SMALL, budget, fitted
 from tests.methods.trainings import (
-    EXACT_TEACHER,
     PIXEL,
     TEACHER,
     goes_on_after_a_kill,
@@ -86,12 +85,6 @@ def test_a_training_is_found_again(name: str, ball_scene: Scene, shared_log: Log
 def test_a_row_of_kilonerf_names_its_own_precision_not_that_of_the_teacher() -> None:
     method = SMALL["kilonerf"](teacher=replace(TEACHER, precision="bf16"))
     assert method.settings()["precision"] == "fp32"
-
-
-@names
-def test_by_triton_there_is_none(name: str) -> None:
-    with pytest.raises(Unavailable, match=f"{name} has no Triton kernels: use backend=auto"):
-        SMALL[name](teacher=replace(EXACT_TEACHER, backend="gpu"))
 
 
 REFUSED: list[tuple[Callable[..., Any], str, Any]] = [

@@ -14,7 +14,7 @@ from torch import Tensor
 from bench.types import Rays, check_shape
 from methods.kernels.composite import STOP, check_stop
 from methods.kernels.dispatch import implementation
-from methods.kernels.spherical import check_harmonics
+from methods.kernels.shade import check_harmonics
 from methods.kernels.types import Pixels, check_rays
 from methods.kernels.voxel_walk import Voxels
 

@@ -8,7 +8,7 @@ from torch.nn.functional import normalize
 
 from bench.types import Rays
 from methods.kernels.composite import composite, visible, weights
-from methods.kernels.spherical import shade
+from methods.kernels.shade import shade
 from methods.kernels.types import Pixels
 from methods.kernels.voxel_walk import Voxels, walk
 from methods.plenoctree.kernels.voxel_light import Light

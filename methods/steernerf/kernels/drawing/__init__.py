@@ -2,7 +2,7 @@
 
 `shown` lays the features of all frames out at full resolution; `corrected` adds the output of the
 network to the enlarged colours. Arrays are pictures [H, W, C], which convolutions read channels
-last. There is no Triton version: on a GPU torch computes both.
+last.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from bench.types import check_shape
-from methods.kernels.dispatch import implementation, torch_for_gpu
+from methods.kernels.dispatch import implementation
 
 
 def shown(
@@ -68,7 +68,7 @@ def corrected(
 
 
 def _by(backend: str, x: Tensor) -> ModuleType:
-    return implementation(__name__, torch_for_gpu(backend), x.device)
+    return implementation(__name__, backend, x.device)
 
 
 class _Shown(torch.autograd.Function):

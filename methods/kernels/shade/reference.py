@@ -1,0 +1,12 @@
+"""Sums of harmonics in plain torch."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from methods.kernels.spherical.reference import spherical_harmonics
+
+
+def shade(coefficients: Tensor, directions: Tensor) -> Tensor:
+    basis = spherical_harmonics(directions)[:, : coefficients.shape[1]]
+    return (basis[:, :, None] * coefficients).sum(dim=1)
