@@ -34,12 +34,11 @@ from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from bench.results import Store
 from bench.types import Budget, Camera, Frame, Method, NullProbe, Probe, Scene, Split
-from reports.runs import Run, load
+from reports.runs import Run, load_runs
 from sweeps import configured
-from sweeps.commands.list import described
-from sweeps.commands.score import score
 from sweeps.measurement import Job, obtain
-from sweeps.overrides import composed
+from sweeps.overrides import composed, described
+from sweeps.scored import score
 from sweeps.terminal import write_page
 
 __all__ = [
@@ -73,7 +72,7 @@ def run(*settings: str) -> Run:
     config = composed(settings)
     job = Job(config, ["steerbench", "run", *settings])
     (key,), _ = obtain([job])
-    (run,) = load(job.store, {key: key})
+    (run,) = load_runs(job.store, {key: key})
     label = str(run.facts["method"])
     write_page(config.report, job.store, {key: label})
     return replace(run, label=label)

@@ -18,13 +18,13 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, ScalarFormat
 from matplotlib.transforms import Bbox
 from numpy.typing import ArrayLike
 
+from bench.clock import OTHER
 from bench.results import COLD
 from reports.comparison import written
 from reports.images import Picture
 from reports.runs import Repeated, Run
 from reports.tables import NOT_AVAILABLE
 
-STAGE, OTHER = "stage_ms.", "stage_ms.other"
 LEGEND_COLUMNS = 4
 MARKERS = "osD^vP*X<>"
 COLOURS = [matplotlib.colormaps["tab20"](index) for index in (*range(0, 20, 2), *range(1, 20, 2))]
@@ -42,34 +42,25 @@ PLACES = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
 RELEASE_STEPS = 300_000  # of stage 2
 STEP_TICKS = (10, 100, 1000, 10_000, RELEASE_STEPS)
 
-OF_FIELD = ("rays", "march", "field", "composite")
-"""Stages of methods that are nothing but volume rendering, of which others have one stage."""
-
 MARK = "mark-{}"  # the `gid` of the mark of the line with this number
 
 NAME_SIZE = (160, 13)  # width and height in pixels of the name of a setting on a plot
 
 
 def stage_bars(runs: Sequence[Run], path: Path) -> None:
-    """Write a PNG: one bar per run, its mean frame time in ms split into stages.
-
-    A stage includes its nested stages, and `field` all of volume rendering. Time outside all stages
-    is grey and comes last.
-    """
-    names = (name for run in runs for name in run.values if name.startswith(STAGE))
-    parts: dict[str, list[str]] = {}
-    for stage in dict.fromkeys(name.partition("/")[0] for name in names):
-        own = stage.removeprefix(STAGE)
-        parts.setdefault("field" if own in OF_FIELD else own, []).append(stage)
-    stages = sorted(parts, key=lambda stage: STAGE + stage == OTHER)
-    legend_lines = -(-len(stages) // LEGEND_COLUMNS)
+    """Write a PNG: one bar per run, its mean frame time in ms split into parts; time outside all
+    stages is grey and comes last."""
+    of_runs = [run.parts for run in runs]
+    there = dict.fromkeys(part for of in of_runs for part in of)
+    parts = [*(part for part in there if part != OTHER), OTHER]
+    legend_lines = -(-len(parts) // LEGEND_COLUMNS)
     figure = Figure(figsize=(8, 0.7 + 0.25 * legend_lines + 0.5 * len(runs)), layout="constrained")
     axes = figure.subplots()
     ends = np.zeros(len(runs))
-    for number, stage in enumerate(stages):
-        widths = np.array([sum(run.figure(x) or 0.0 for x in parts[stage]) for run in runs])
-        colour = "lightgrey" if STAGE + stage == OTHER else COLOURS[number % len(COLOURS)]
-        axes.barh(range(len(runs)), widths, left=ends, height=0.6, label=stage, color=colour)
+    for number, part in enumerate(parts):
+        widths = np.array([of.get(part, 0.0) for of in of_runs])
+        colour = "lightgrey" if part == OTHER else COLOURS[number % len(COLOURS)]
+        axes.barh(range(len(runs)), widths, left=ends, height=0.6, label=part, color=colour)
         ends = ends + widths
     for line, end in enumerate(ends):
         axes.text(end, line, f" {end:.1f}", va="center")

@@ -12,7 +12,7 @@ from reports import figures
 from reports.comparison import comparison, conditions_of
 from reports.images import MOST_RENDERINGS, Part, Picture, frame_section, kept_frames
 from reports.publish import publish
-from reports.runs import Repeated, Run, load, missing_figures, over_common_frames
+from reports.runs import Repeated, Run, load_runs, missing_figures, over_common_frames
 from reports.tables import Table, run_tables
 
 
@@ -25,7 +25,7 @@ def write_page(
     the page, by key and in its order; `failures` says why a run is missing, by its label. Raises
     SteerbenchError if a run is not in the store or `folder` cannot be written to.
     """
-    runs = over_common_frames(load(store, labels))
+    runs = over_common_frames(load_runs(store, labels))
     parts = [
         *_heading(runs, failures),
         *_tradeoffs(runs),

@@ -12,12 +12,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bench.clock import OTHER
 from bench.errors import SteerbenchError
 from bench.intervals import half_interval
 from bench.neighbours import Neighbours
 from bench.results import COLD, STEADY, WHOLE, Store, content_key, unreadable
 from bench.rows import phase_rows
+from bench.study import part_of
 from reports.tables import phases, run_tables
+
+STAGE = "stage_ms."  # prefix of the metrics of stages
 
 FIGURES = ("metric", "unit", "phase", "value", "n", "lo", "hi")
 """The columns of rows that are not facts about the whole run."""
@@ -70,6 +74,18 @@ class Run:
             if name == metric or name.startswith(f"{metric}/")
         ]
         return math.fsum(figures) if figures else None
+
+    @property
+    def parts(self) -> dict[str, float]:
+        """The mean ms of each part of a frame, as the method groups its stages, the rest last."""
+        grouping: Mapping[str, str] = self.record.get("parts", {})
+        found = dict.fromkeys((*grouping.values(), OTHER), 0.0)
+        for metric, value in self.values.items():
+            if metric.startswith(STAGE):
+                part = part_of(metric.removeprefix(STAGE), grouping)
+                found[part] = found.get(part, 0.0) + value
+        found[OTHER] = found.pop(OTHER)
+        return {part: ms for part, ms in found.items() if ms or part == OTHER}
 
     def phases(self) -> list[Run]:
         """The run once per phase, with only the figures of that phase."""
@@ -214,7 +230,7 @@ def readable(store: Store, keys: Collection[str] | None = None) -> list[Run]:
     return sorted(runs, key=stored)
 
 
-def load(store: Store, labels: Mapping[str, str]) -> list[Run]:
+def load_runs(store: Store, labels: Mapping[str, str]) -> list[Run]:
     """Load the runs whose keys are in `labels`, in its order.
 
     Raises SteerbenchError if one is not in the store, or has a schema that cannot be read.

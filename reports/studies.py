@@ -16,14 +16,13 @@ import numpy as np
 
 from bench.clock import OTHER
 from bench.experiments import observed_order
-from bench.study import part_of
 from reports.figures import frontier_plot
 from reports.images import Part, Picture
 from reports.runs import Run
 from reports.tables import Table, amount, decimal, megabytes, share, spread
 
 ON_FRONTIER = "— (frontier)"
-STAGE, WORK, DENSE = "stage_ms.", "work.", ".dense"
+WORK, DENSE = "work.", ".dense"
 
 
 @dataclass(frozen=True)
@@ -72,16 +71,6 @@ class Measured:
     def tail(self) -> float:
         """How much longer the slowest frames take: 99th percentile over the median."""
         return self.figure("frame_ms.p99") / self.figure("frame_ms.p50")
-
-    @property
-    def parts(self) -> dict[str, float]:
-        """The ms of each part of a frame, as the method groups its stages."""
-        found: dict[str, float] = {}
-        for metric, value in self.run.values.items():
-            if metric.startswith(STAGE):
-                part = part_of(metric.removeprefix(STAGE), self.run.record["parts"])
-                found[part] = found.get(part, 0.0) + value
-        return found
 
     @property
     def work(self) -> dict[str, float]:
@@ -208,7 +197,7 @@ def parity(found: Sequence[Measured]) -> list[Part]:
                 *_compared(line),
                 decimal(line.tail, 2),
                 decimal(line.figure("worst_to_first"), 4),
-                decimal(line.parts.get("network"), 2),
+                decimal(line.run.parts.get("network"), 2),
                 megabytes(line.figure("size_bytes.total")),
             )
             for line in lines
@@ -239,15 +228,12 @@ def skips(found: Sequence[Measured]) -> list[Part]:
 
 def breakdown(found: Sequence[Measured]) -> list[Part]:
     """The ms of a frame that each of its parts takes itself, and where the host waits for a GPU."""
-    there = dict.fromkeys(part for line in found for part in line.parts)
-    named = dict.fromkeys(part for line in found for part in line.run.record["parts"].values())
-    parts = [*(part for part in named if part in there)]
-    parts += [part for part in there if part not in (*parts, OTHER)]
-    parts.append(OTHER)
+    there = dict.fromkeys(part for line in found for part in line.run.parts)
+    parts = [*(part for part in there if part != OTHER), OTHER]
     cells = tuple(
         (
             line.line.label,
-            *(decimal(line.parts.get(part, 0.0), 1) for part in parts),
+            *(decimal(line.run.parts.get(part, 0.0), 1) for part in parts),
             decimal(line.ms, 1),
             spread(line.fastest, line.slowest),
             decimal(line.tail, 2),

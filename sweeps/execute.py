@@ -33,7 +33,7 @@ from bench.errors import SteerbenchError, Unavailable, explained
 from bench.results import content_key
 from bench.sharing import whole
 from bench.study import study_of
-from reports.runs import load
+from reports.runs import load_runs
 from reports.tables import decimal
 from sweeps.configured import build, trained
 from sweeps.measurement import Job, JobFailed, obtain, reason, stored
@@ -214,7 +214,7 @@ def _printed() -> Iterator[None]:
 
 def say(job: Job, run: str, more: str = "") -> None:
     """Print the figures of a job's run in one line, and `more` after them."""
-    (loaded,) = load(job.store, {run: job.name})
+    (loaded,) = load_runs(job.store, {run: job.name})
     psnr, ms = decimal(loaded.values.get("psnr"), 2), decimal(loaded.values["frame_ms"], 1)
     print(f"{job.name}: {psnr} dB, {ms} ms a frame{more}", file=sys.stderr)
 

@@ -23,7 +23,7 @@ from bench.results import Store, content_key
 from bench.sharing import whole
 from bench.trajectories import resized
 from bench.types import Log, Method
-from reports.runs import Run, load, readable
+from reports.runs import Run, load_runs, readable
 from reports.trackers import tracker
 from sweeps.configured import build, checked_settings, scene_digest, scene_folder, scene_of
 from sweeps.overrides import target_of
@@ -279,7 +279,7 @@ def send(config: DictConfig, run: str, label: str) -> None:
     outputs = Path(config.outputs)
     log = ConsoleLog(outputs)
     try:
-        tracker(config.tracker)(load(Store(outputs), {run: label})[0], outputs)
+        tracker(config.tracker)(load_runs(Store(outputs), {run: label})[0], outputs)
         log.info(f"sent to {config.tracker}: {run}")
     except Exception as error:  # third-party library: any exception
         log.info(f"not sent to {config.tracker}: {run}: {reason(error)}")

@@ -190,6 +190,16 @@ def choices(group: str, words: Sequence[str] = ()) -> dict[str, Path]:
     return dict(sorted(found.items()))
 
 
+def described(group: str, words: Sequence[str] = ()) -> dict[str, str]:
+    """Every choice of `group`, including folders named in `words`, with its description: the first
+    comment that is not a Hydra directive (`# @package`)."""
+    comments = {}
+    for name, path in choices(group, words).items():
+        lines = [line[1:].strip() for line in path.read_text().splitlines() if line[:1] == "#"]
+        comments[name] = next((line for line in lines if not line.startswith("@")), "")
+    return comments
+
+
 def target_of(node: Mapping[str, Any] | DictConfig) -> Any:
     """The class or function that `_target_` names; SteerbenchError if it cannot be imported."""
     try:

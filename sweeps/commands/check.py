@@ -14,7 +14,7 @@ from bench.errors import SteerbenchError, explained
 from bench.results import Store
 from bench.sharing import whole
 from reports.regression import LIMITS, Figures, Limit, change_table, changes
-from reports.runs import Run, load, readable
+from reports.runs import Run, load_runs, readable
 from sweeps.measurement import PLACES
 from sweeps.terminal import console, show
 
@@ -58,7 +58,7 @@ def _compare(options: argparse.Namespace) -> int:
     """Print what the second of two runs of the store is, less the first; 1 if it is worse."""
     store = Store(options.outputs)
     keys = [store.whole_key(key) for key in (options.old, options.new)]
-    old, new = (Figures.of(load(store, {key: key})[0]) for key in keys)
+    old, new = (Figures.of(load_runs(store, {key: key})[0]) for key in keys)
     rows = list(changes([old], [new]))
     show(change_table(" to ".join(keys), rows))
     return int(any(row.verdict for row in rows))

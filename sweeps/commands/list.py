@@ -11,7 +11,7 @@ from typing import Any
 
 from bench.errors import SteerbenchError, Unavailable
 from reports.tables import Table
-from sweeps.overrides import choices, engine_kinds, plug_ins
+from sweeps.overrides import choices, described, engine_kinds, plug_ins
 from sweeps.terminal import console, show
 
 GROUPS = ("method", "engine", "scene", "trajectory", "protocol", "budget", "+experiment")
@@ -47,16 +47,6 @@ def main(options: argparse.Namespace) -> int:
 def _show(title: str, columns: tuple[str, str], lines: Sequence[tuple[str, str]]) -> None:
     if lines:
         show(Table(title, columns, tuple(lines)))
-
-
-def described(group: str, words: Sequence[str] = ()) -> dict[str, str]:
-    """Every choice of `group`, including folders named in `words`, with its description: the first
-    comment that is not a Hydra directive (`# @package`)."""
-    comments = {}
-    for name, path in choices(group, words).items():
-        lines = [line[1:].strip() for line in path.read_text().splitlines() if line[:1] == "#"]
-        comments[name] = next((line for line in lines if not line.startswith("@")), "")
-    return comments
 
 
 def _brings(folder: Path | str, words: Sequence[str]) -> str:

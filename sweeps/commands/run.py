@@ -6,9 +6,11 @@ import os
 import re
 import sys
 from collections.abc import Collection, Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass, field
 from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
@@ -25,22 +27,27 @@ if TYPE_CHECKING:
     from sweeps.measurement import Job
 
 
+@dataclass
+class Sweep:
+    """The sweep of a call of `main`: the `folder` where jobs record how they ended, None without a
+    sweep, and the jobs that wait to be measured in turns, with their numbers."""
+
+    folder: Path | None = None
+    waiting: list[tuple[int, Job]] = field(default_factory=list)
+
+
+_sweep: ContextVar[Sweep] = ContextVar("sweep")
+"""Of the present call of `main`: Hydra makes the object that is told of a sweep by itself."""
+
+
 class SweepCallback(Callback):
-    """Records that a sweep starts; run.yaml lists it among Hydra's callbacks.
-
-    Hydra creates the object and never hands it out, so the record is kept on the class: the
-    `folder` where jobs record how they ended; None without a sweep. `waiting` are the jobs of a
-    sweep that is measured in turns, with their numbers.
-    """
-
-    folder: ClassVar[Path | None] = None
-    waiting: ClassVar[list[tuple[int, Job]]] = []
+    """Notes that a sweep starts; run.yaml lists it among Hydra's callbacks."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Record the folder of the sweep, before its launcher is made."""
+        """Note the folder of the sweep, before its launcher is made."""
         from sweeps.execute import join_cluster
 
-        SweepCallback.folder = Path(config.hydra.sweep.dir)
+        _sweep.get().folder = Path(config.hydra.sweep.dir)
         join_cluster(config)
 
 
@@ -58,7 +65,6 @@ def main(argv: Sequence[str]) -> int:
     sys.argv = [sys.argv[0], *flags, *(word for word in argv if word not in flags)]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its errors instead of printing them
     _hide_subcommand_from_completion()
-    SweepCallback.folder, SweepCallback.waiting = None, []
     errors: list[Exception] = []
 
     def job(config: DictConfig) -> None:
@@ -74,13 +80,16 @@ def main(argv: Sequence[str]) -> int:
         except Exception as error:
             errors.append(error)  # bypasses Hydra, which would print it in its own way
 
+    token = _sweep.set(sweep := Sweep())
     try:
         hydra.main(str(CONFIGS), "run", version_base="1.3")(job)()
     except Exception as error:
         errors.append(explain(error, argv) if of_hydra(error) else error)
-    if SweepCallback.folder is not None:
-        errors += _in_turns(SweepCallback.waiting, SweepCallback.folder)
-        _finish(SweepCallback.folder)
+    finally:
+        _sweep.reset(token)
+    if sweep.folder is not None:
+        errors += _in_turns(sweep.waiting, sweep.folder)
+        _finish(sweep.folder)
     if errors:
         raise errors[0]
     return 0
@@ -91,14 +100,14 @@ def main(argv: Sequence[str]) -> int:
 
 def _alone(config: DictConfig, command: Sequence[str]) -> None:
     """Obtain the run that `config` describes, print its tables, write the page it asks for."""
-    from reports.runs import load
+    from reports.runs import load_runs
     from sweeps.measurement import Job, obtain
     from sweeps.terminal import say_missing, show_run, write_page
 
     job = Job(config, command)
     (key,), measured = obtain([job])
     labels = {key: HydraConfig.get().runtime.choices["method"]}
-    (run,) = load(job.store, labels)
+    (run,) = load_runs(job.store, labels)
     what = run.facts[["method", "scene", "trajectory", "resolution", "budget", "protocol"]]
     show_run(run, f"{', '.join(what)}, seed {run.facts['seed']}")
     if not measured:
@@ -122,7 +131,7 @@ def _one_of_many(config: DictConfig, command: Sequence[str]) -> None:
         if launcher != "basic":
             expected = "false with a launcher, because one process renders all frames"
             raise unexpected("in_turns", expected, f"true with hydra/launcher={launcher}")
-        SweepCallback.waiting.append((number, Job(config, command, name, turns="sweep")))
+        _sweep.get().waiting.append((number, Job(config, command, name, turns="sweep")))
     elif errors := attempt([(number, Job(config, command, name))], total, folder):
         raise errors[0]
 
@@ -170,7 +179,7 @@ def _finish(folder: Path) -> None:
     """Print one table of all jobs that have ended, and write the pages that they requested."""
     from bench.results import Store
     from reports.comparison import comparison
-    from reports.runs import load, over_common_frames
+    from reports.runs import load_runs, over_common_frames
     from sweeps.execute import read
     from sweeps.terminal import say_missing, show, write_page
 
@@ -186,7 +195,7 @@ def _finish(folder: Path) -> None:
         return
     store = Store(Path(ended[0].outputs))
     names, failed = labels(ended)
-    runs = over_common_frames(load(store, names))
+    runs = over_common_frames(load_runs(store, names))
     show(comparison(runs, failed))
     say_missing(runs)
     for report in dict.fromkeys(job.report for job in ended):

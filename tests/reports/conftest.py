@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from bench.results import COLUMNS, Store
 from reports.paper_tables import PaperTable, Place
-from reports.runs import Repeated, Run, load
+from reports.runs import Repeated, Run, load_runs
 from sweeps.tables import chosen
 
 TABLES = {table.name: table for table in chosen()}
@@ -109,7 +109,7 @@ def of_scene(run: Run, scene: str, by: float = 0.0, **facts: object) -> Run:
 @pytest.fixture
 def run(store: Store, stored_run: str) -> Run:
     """A run of six scored frames, three of them pictured."""
-    (found,) = load(store, {stored_run: "run"})
+    (found,) = load_runs(store, {stored_run: "run"})
     return found
 
 

@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 from bench.results import Store
 from bench.types import Scene, SteerbenchError, Unavailable
 from reports.claims import gap
-from reports.runs import load
+from reports.runs import load_runs
 from sweeps import configured, execute
 from sweeps.commands import paper
 from sweeps.commands.paper import gather, newest
@@ -202,7 +202,7 @@ def test_a_failure_stands_beside_what_was_measured_before(scenes, tmp_path, else
 @pytest.fixture
 def psnr(store: Store, stored_run: str, monkeypatch: pytest.MonkeyPatch, elsewhere: None):
     """Gathers lines of Table 5 from the PSNR of each line, scene and seed that was measured."""
-    (source,) = load(store, {stored_run: "run"})
+    (source,) = load_runs(store, {stored_run: "run"})
     monkeypatch.setattr(paper, "of_scene", lambda run, config: True)
 
     def lines(found: Mapping[tuple[int, str, int], float], scenes: str, seeds: str):

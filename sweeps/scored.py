@@ -1,0 +1,119 @@
+"""Scores pictures of any program against true ones, under a named protocol."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from bench import pictures as given
+from bench.console import ConsoleLog
+from bench.errors import SteerbenchError, unknown
+from bench.protocol import EvaluationProtocol
+from bench.provenance import digest, libraries
+from bench.results import REPORTED, Store
+from bench.types import Camera
+from reports.runs import Run, load_runs
+from sweeps.configured import build, checked_settings, scene_of
+from sweeps.measurement import send
+from sweeps.overrides import composed
+
+NOTHING = "-"  # in place of facts of a row that do not apply to given pictures
+
+
+def score(
+    pictures: str | Path,
+    truth: str | Path | None = None,
+    *settings: str,
+    name: str | None = None,
+    match: given.Match = "name",
+    sequence: bool = False,
+    times: str | Path | None = None,
+) -> Run:
+    """Score a folder of pictures as `steerbench score` does: against the folder `truth` or, without
+    it, the split of the scene in `settings`, which are those of `steerbench run`.
+
+    Rows show `name`, or else that of the folder. Pictures are matched to true ones by "name" or by
+    "order". Those of a `sequence` are consecutive frames: their flicker is scored, too. `times` is
+    a CSV file with a column `frame_ms`, see `bench.pictures.reported_times`: rows then have them,
+    and the device "reported". Raises SteerbenchError if a setting is wrong, or a picture missing,
+    damaged or of another size.
+    """
+    folder, config = Path(pictures), composed(settings)
+    plain = checked_settings(config)
+    if config.report:
+        raise SteerbenchError("report: a page compares times, which given pictures do not have")
+    log, store = ConsoleLog(Path(plain.outputs)), Store(Path(plain.outputs))
+    protocol: EvaluationProtocol = build(config, "protocol")
+    weights = Path(plain.weights_dir) if plain.weights_dir else None
+    surface = None
+    if truth is None:
+        pairs, place, surface = _against_scene(folder, config, protocol, match)
+    else:
+        if named := [word for word in settings if word.startswith("scene")]:
+            raise SteerbenchError(f"--truth and {named[0]}: expected one of them")
+        pairs = given.pairs_with_folder(folder, Path(truth), match)
+        place = {"scene": Path(truth).resolve().name, "split": NOTHING}
+    facts = {"method": name or folder.resolve().name, **place, "trajectory": "pictures", "seed": 0}
+    facts |= dict.fromkeys(("budget", "device", "backend", "engine", "precision"), NOTHING)
+    reported = given.reported_times(Path(times), pairs) if times else []
+    facts |= {"device": REPORTED} if times else {}
+    example = f"{pairs[0].picture.name} is scored against {pairs[0].name}"  # for the user to check
+    log.info(f"{len(pairs)} pictures, matched by {match}: {example}")
+    lpips, missing = protocol.load_lpips(weights, log)
+    measurement = given.score(
+        pairs,
+        protocol,
+        lpips,
+        facts,
+        log,
+        sequence=sequence,
+        kept=plain.pictures,
+        surface=surface,
+        times=reported,
+    )
+    record: Any = measurement.record
+    parts = {
+        "score": digest(given.score),
+        "libraries": libraries(given.score),
+        **{part: record[part] for part in ("pictures", "truths")},
+        "protocol": asdict(protocol),
+        "lpips": protocol.find_lpips(weights, log),
+        "facts": facts,
+        "sequence": sequence,
+        "kept": plain.pictures,
+        **({"times": reported} if times else {}),
+    }
+    words = {"--truth": truth, "--name": name, "--match": match, "--times": times}
+    typed = [str(x) for pair in words.items() if pair[1] is not None for x in pair]
+    typed += ["--sequence"] if sequence else []
+    more = {
+        "command": shlex.join(["steerbench", "score", str(folder), *typed, *settings]),
+        "missing": {**record["missing"], **missing},
+        "scene": {"name": facts["scene"], "digest": record["truths"]},
+        "budget": {"name": NOTHING},
+    }
+    key, label = store.key(parts), str(facts["method"])
+    if store.find(key) is None:
+        store.save(parts, replace(measurement, record={**record, **more}))
+    send(config, key, label)
+    (run,) = load_runs(store, {key: label})
+    return run
+
+
+def _against_scene(
+    folder: Path, config: DictConfig, protocol: EvaluationProtocol, match: given.Match
+) -> tuple[Sequence[given.Pair], dict[str, Any], Callable[[Camera], Tensor] | None]:
+    """Pairs of the pictures with those of the scene's split, the facts for their rows, and what
+    renders the depth of its surface."""
+    OmegaConf.update(config, "scene.background", protocol.background)
+    scene, split = scene_of(config), config.split
+    if split not in scene.splits:
+        raise unknown("split", split, scene.splits)
+    pairs = given.pairs_with_split(folder, scene.splits[split], match)
+    return pairs, {"scene": scene.name, "split": split}, scene.surface
