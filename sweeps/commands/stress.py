@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterable, Iterator
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -17,13 +18,14 @@ from methods import checks
 from reports.tables import Table
 from sweeps.commands.kernels import errors
 from sweeps.terminal import print_rows, show
-from sweeps.variants import Row
 
 COLUMNS = (
     *("subject", "case", "what must hold", "by", "on", "precision"),
     *("worst", "at most", "status"),
 )
 NEAREST = 5  # cases that are also shown by themselves
+
+Row = dict[str, Any]
 
 
 def main(options: argparse.Namespace) -> int:

@@ -113,7 +113,7 @@ def test_the_worker_of_the_document_is_drawn_along_a_path(steerbench, documented
         assert (picture[:, 40:] == 128).all()
 
 
-def test_accuracy_turns_the_knobs_that_it_declares_and_trains_once(steerbench, write, monkeypatch):
+def test_accuracy_turns_the_knobs_that_it_declares_and_trains_once(steerbench, write):
     write("""
     def fit(self, job):
         with open("trainings", "a") as file:
@@ -121,8 +121,7 @@ def test_accuracy_turns_the_knobs_that_it_declares_and_trains_once(steerbench, w
 
     Grey.fit, Grey.load = fit, lambda self, job: None
     """)
-    monkeypatch.setattr("methods.checks.found", lambda name: [])  # no kernels
-    done = steerbench("accuracy", *WHITE, *EXTERNAL, "--repeats", "1").ok()
+    done = steerbench("accuracy", *WHITE, *EXTERNAL, "protocol.rounds=2").ok()
     assert "level 0.25" in done.out
     assert "level 1.0" in done.out
     assert Path("trainings").read_text() == "one "

@@ -85,7 +85,7 @@ def test_a_filter_or_a_setting_that_fits_nothing_is_an_error(steerbench, asked, 
 
 def test_what_a_kernel_brings_has_a_line_for_each_that_a_method_calls(steerbench, tmp_path):
     small = ("scene.width=16", "scene.train=4", "scene.test=2", "budget.steps=2")
-    few = ("budget.samples=64", "--frames", "2", "--repeats", "1", f"outputs={tmp_path}")
+    few = ("budget.samples=64", "budget.frames=2", "--repeats", "1", f"outputs={tmp_path}")
     found = steerbench("kernels", "--worth", "method=ngp", *small, *few).ok().json
     rows = {row["kernel"]: row for row in found}
     assert set(rows) == {"adam", "composite", "encode", "march", "mlp", "spherical"}
