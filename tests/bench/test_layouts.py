@@ -57,7 +57,7 @@ def test_the_layout_of_nerfbaselines_comes_back_with_its_path(scene, path, tmp_p
     assert all(torch.equal(a, b) for a, b in zip(images, wanted, strict=True))
     assert (found.unit_length, found.origin.tolist()) == (scene.unit_length, scene.origin.tolist())
     about = json.loads((tmp_path / "out/nb-info.json").read_text())
-    assert (about["id"], about["scene"]) == ("steerbench", "totem")
+    assert (about["id"], about["scene"]) == ("steerbench", scene.name)
     steps = follow(scene, str(tmp_path / "out/path.json")).steps
     for step, other in zip(steps, path.steps, strict=True):
         torch.testing.assert_close(step.camera.c2w, other.camera.c2w, atol=2e-6, rtol=0)

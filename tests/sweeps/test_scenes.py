@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.bench.test_published import publish
+from tests.bench.test_datasets import publish
 
 
 def test_a_damaged_file_is_named_and_fails(steerbench, tmp_path, monkeypatch):

@@ -88,7 +88,8 @@ def test_the_pictures_of_a_scene_are_its_own_truth(steerbench):
     # Its alpha is composited, and that rounded to 8 bit: at most half a level off.
     assert rows["value"]["psnr"] >= 20 * math.log10(255 / 0.5)
     assert "3 pictures with an alpha channel were put on white" in outcome.err
-    assert (rows["scene"].iloc[0], rows["split"].iloc[0], rows["n"].iloc[0]) == ("totem", "test", 3)
+    first = rows.iloc[0]
+    assert (first["scene"], first["split"], first["n"]) == ("totem-24x24-2train-3test", "test", 3)
 
 
 def test_reported_times_are_in_the_rows_and_marked(steerbench, scored):

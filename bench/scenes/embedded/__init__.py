@@ -27,6 +27,7 @@ from bench.types import Camera, Log, Scene, SteerbenchError, Unavailable
 
 ANGLE_X = 0.69  # horizontal field of view in radians
 DISTANCE = 4.3  # of most cameras from the centre of the scene, in the model's units
+WIDTH, TRAIN, TEST = 400, 60, 24  # of what a scene has that is called like its model alone
 
 
 @dataclass(frozen=True)
@@ -48,10 +49,10 @@ VIEWS = {"mill": Views(3.0, 26.0, middle=14.0, swing=6.0, distance=4.7)}
 def load(
     name: str,  # one of `MODELS`
     *,
-    width: int = 400,
+    width: int = WIDTH,
     height: int | None = None,  # None: square pictures
-    train: int = 60,
-    test: int = 24,
+    train: int = TRAIN,
+    test: int = TEST,
     seed: int = 0,  # of the training poses
     downscale: int = 1,
     background: str = "white",
@@ -63,8 +64,9 @@ def load(
 
     `train` pictures come from all around, 10 degrees below to 80 degrees above the horizon; `test`
     pictures from a smooth orbit, 1 degree of azimuth apart (360 close it). `VIEWS` has the heights
-    of scenes that need others. For `downscale`, `background` and `bounds` see `blender.load`.
-    Raises SteerbenchError when an option is out of range or `root` cannot be written.
+    of scenes that need others. For `downscale`, `background` and `bounds` see `blender.load`. Sizes
+    other than the defaults, and a seed, stand in the scene's name, for it is another scene. Raises
+    SteerbenchError when an option is out of range or `root` cannot be written.
     """
     sizes = {"width": width, "height": width if height is None else height, "train": train}
     numbers = {**sizes, "test": test, "seed": seed}
@@ -76,7 +78,12 @@ def load(
     if not folder.is_dir():
         write(folder, settings, log)
     scene = blender.load(
-        folder, downscale=downscale, background=background, bounds=bounds, name=name, log=log
+        folder,
+        downscale=downscale,
+        background=background,
+        bounds=bounds,
+        name=_title(**settings),
+        log=log,
     )
 
     def exact(camera: Camera) -> Tensor:
@@ -88,6 +95,14 @@ def load(
             return render(model, moved, torch.zeros(3), samples=1).depth / scene.unit_length
 
     return replace(scene, exact=exact, surface=surface if isinstance(model, Solids) else None)
+
+
+def _title(name: str, width: int, height: int, train: int, test: int, seed: int) -> str:
+    """The name of a scene of these settings in result rows."""
+    sizes = f"-{width}x{height}" if (width, height) != (WIDTH, WIDTH) else ""
+    sizes += f"-{train}train" if train != TRAIN else ""
+    sizes += f"-{test}test" if test != TEST else ""
+    return name + sizes + (f"-seed{seed}" if seed else "")
 
 
 def find(name: str) -> Model:

@@ -34,9 +34,16 @@ def test_a_scene_is_written_once_in_the_layout_of_nerf_synthetic(tmp_path, log):
     assert files == pictures | {"transforms_train.json", "transforms_test.json"}
     record = json.loads((folder / "transforms_train.json").read_text())
     assert record["scene"] == {"name": "void", "seed": 0, **SMALL}
+    names = {first.name}
     for change in ({"width": 25}, {"height": 19}, {"train": 5}, {"test": 3}, {"seed": 1}):
-        embedded.load("void", **options | change, log=log)
-    assert len(list(tmp_path.iterdir())) == 6
+        names.add(embedded.load("void", **options | change, log=log).name)
+    assert len(list(tmp_path.iterdir())) == len(names) == 6
+
+
+def test_a_scene_of_other_sizes_than_usual_has_them_in_its_name(tmp_path, log):
+    scene = embedded.load("void", **SMALL, seed=3, root=tmp_path, log=log)
+    assert scene.name == "void-24x18-4train-2test-seed3"
+    assert embedded._title("void", 400, 400, 60, 24, seed=0) == "void"
 
 
 def test_who_finishes_second_accepts_the_scene_of_the_first(tmp_path, log, monkeypatch):
