@@ -110,7 +110,7 @@ def test_all_machine_code_of_a_cpu_is_kept_as_methods_kernels_cpu_keeps_it():
     assert own == set()
 
 
-@pytest.mark.parametrize(("package", "floors"), [("bench", 10), ("sweeps", 6)])
+@pytest.mark.parametrize(("package", "floors"), [("bench", 11), ("sweeps", 6)])
 def test_a_package_has_few_floors_and_no_circle(package, floors):
     """A file's floor is one above the highest it imports; a folder is as one file."""
     below: dict[str, set[str]] = {}
