@@ -312,9 +312,6 @@ def _draw(take: _Take, task: Task, index: int, first: Tensor | None, *, scored: 
     """
     method, step, protocol = take.method, task.trajectory.steps[index], task.protocol
     before = task.trajectory.preceding[index]
-    if protocol.memory == "cold":
-        method.reset()
-        before = 0
     waited = scored and protocol.waits
     with (
         device_waits() if waited else nullcontext() as waits,

@@ -20,8 +20,7 @@ from torch import Tensor
 from bench.types import Log, SteerbenchError, Unavailable, check_shape
 from bench.weights import load_features
 
-LPIPS_SIDE = {"lpips_alex": 31, "lpips_vgg": 16, "lpips_squeeze": 17}
-SMALLEST_SIDE = {"psnr": 1, "ssim": 11, **LPIPS_SIDE, "flip": 1}
+SMALLEST_SIDE = {"psnr": 1, "ssim": 11, "lpips_alex": 31, "lpips_vgg": 16, "flip": 1}
 """Smallest side in pixels: SSIM needs room for its window, LPIPS for one feature at its deepest."""
 
 
@@ -67,28 +66,24 @@ def flicker(
     return (error - previous_error).square().mean().sqrt().item()
 
 
-def ssim(image: Tensor, reference: Tensor, window: str = "gaussian") -> float:
-    """Structural similarity, k1 = .01, k2 = .03, per channel, then the mean.
+def ssim(image: Tensor, reference: Tensor) -> float:
+    """Structural similarity (Wang et al. 2004), k1 = .01, k2 = .03, per channel, then the mean.
 
-    `window` is "gaussian" (11 x 11, sigma 1.5, population covariance; Wang et al. 2004) or
-    "uniform" (7 x 7, sample covariance; the default of scikit-image, used by NSVF and KiloNeRF).
-    The mean is taken over the valid region, where the window lies inside the picture. Raises
-    SteerbenchError if a side is shorter than 11 pixels.
+    The window is Gaussian, 11 x 11 with sigma 1.5, with population covariance. The mean is taken
+    over the valid region, where the window lies inside the picture. Raises SteerbenchError if a
+    side is shorter than 11 pixels.
     """
     check_pair(image, reference)
     check_size("ssim", image.shape[1], image.shape[0])
-    variants: dict[str, dict[str, object]] = {
-        "gaussian": {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False},
-        "uniform": {"win_size": 7},
-    }
     pair = (picture.double().cpu().numpy() for picture in (image, reference))
-    return float(structural_similarity(*pair, data_range=1.0, channel_axis=-1, **variants[window]))
+    window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    return float(structural_similarity(*pair, data_range=1.0, channel_axis=-1, **window))
 
 
 class Lpips:
     """LPIPS v0.1 (Zhang et al. 2018) with a named backbone; a lower value is more similar.
 
-    The linear layers come with the `lpips` package, the backbone ("alex", "vgg" or "squeeze") from
+    The linear layers come with the `lpips` package, the backbone ("alex" or "vgg") from
     `bench.weights`, which searches `weights_dir` first. Runs in float32 on the device of the
     pictures, which are mapped to [-1, 1] as published. Raises Unavailable if the weights cannot be
     found or downloaded, or do not fit the network.

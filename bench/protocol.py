@@ -26,14 +26,8 @@ from bench.types import (
 from bench.waits import device_waits
 from bench.weights import locate
 
-CHOICES = {
-    "rounding": ("8bit", "none"),
-    "ssim": ("gaussian", "uniform"),
-    "background": tuple(BACKGROUNDS),
-    "memory": ("steady", "cold"),
-    "flicker": ("split", "exact"),
-}
-"""The values of the protocol's options; "8bit" clips and rounds the prediction."""
+CHOICES = {"background": tuple(BACKGROUNDS), "flicker": ("split", "exact")}
+"""The values of the protocol's options."""
 
 COLUMNS = ("flip", *video_metrics.NEEDS)  # further metrics that a protocol can name
 
@@ -43,8 +37,7 @@ class EvaluationProtocol:
     """How pictures are scored and how frames are timed; the defaults are `steerbench-1`.
 
     A protocol that differs from the defaults needs a name of its own, so that its rows are never
-    mixed with those of another. A method keeps its preceding frames along the trajectory ("steady")
-    or is reset before every frame ("cold"). The flicker needs true pictures of consecutive frames:
+    mixed with those of another. The flicker needs true pictures of consecutive frames:
     those with a ground truth have one ("split"), or the scene renders it for the other frames
     ("exact"), which takes about half a second at 400 x 400. So do the further `columns`. Of several
     `rounds`, the first is scored, and the others give times and work. Methods that are measured in
@@ -52,13 +45,10 @@ class EvaluationProtocol:
     """
 
     name: str = "steerbench-1"
-    rounding: str = "8bit"
-    ssim: str = "gaussian"  # the window, see `bench.metrics.ssim`
     lpips: tuple[str, ...] = ("alex", "vgg")  # backbones, each with a metric `lpips_<net>`
     lpips_every: int = 1  # scored frames of which the last one has them; they take most time
     background: str = "white"  # onto which pictures with an opacity channel are composited
     warmup: int = 3  # frames before the timed sequence, spread over the trajectory
-    memory: str = "steady"
     flicker: str = "split"
     stages: bool = True  # whether to time the stages of a frame: a GPU is waited for at each
     rounds: int = 1  # through the trajectory
@@ -150,7 +140,7 @@ class EvaluationProtocol:
 
     def rounded(self, rgb: Tensor) -> Tensor:
         """A prediction [H, W, 3], rounded as for scoring."""
-        return metrics.quantise(rgb.float()) if self.rounding == "8bit" else rgb.float()
+        return metrics.quantise(rgb.float())
 
     def score(
         self, rgb: Tensor, reference: Tensor, background: Tensor, lpips: Mapping[str, metrics.Lpips]
@@ -162,7 +152,7 @@ class EvaluationProtocol:
         """
         image = self.rounded(rgb)
         truth = composite(reference.to(rgb.device), background)
-        scores = {"psnr": metrics.psnr(image, truth), "ssim": metrics.ssim(image, truth, self.ssim)}
+        scores = {"psnr": metrics.psnr(image, truth), "ssim": metrics.ssim(image, truth)}
         for net in self.lpips:
             scores[f"lpips_{net}"] = lpips[net](image, truth) if net in lpips else math.nan
         return scores | (

@@ -22,7 +22,6 @@ ADDRESS = "https://download.pytorch.org/models/"
 BACKBONES = {
     "alex": ("alexnet-owt-7be5be79.pth", "alexnet_features.pth"),
     "vgg": ("vgg16-397923af.pth", "vgg16_features.pth"),
-    "squeeze": ("squeezenet1_1-b8a52dc0.pth", "squeezenet1_1_features.pth"),
 }
 """File names of a backbone: torchvision's own, and one with only its `features.*`."""
 

@@ -105,7 +105,7 @@ def test_downloaded_weights_are_kept_if_right(tmp_path, publisher, weights, quie
 
 
 def test_an_unknown_network_and_a_missing_folder_are_errors_not_gaps(tmp_path, quiet_log):
-    with pytest.raises(SteerbenchError, match="expected one of alex, vgg, squeeze, got 'resnet'"):
+    with pytest.raises(SteerbenchError, match="expected one of alex, vgg, got 'resnet'"):
         locate("resnet", None, quiet_log)
     with pytest.raises(SteerbenchError, match=r"weights_dir: expected a folder, got .*nowhere"):
         locate("alex", tmp_path / "nowhere", quiet_log)

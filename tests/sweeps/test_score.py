@@ -66,7 +66,7 @@ def test_the_rows_stand_in_the_store_beside_those_of_runs(steerbench, folders, m
 
 
 def test_the_same_pictures_are_the_same_run_and_others_are_another(scored):
-    other = ["protocol.name=other", "protocol.ssim=uniform"]
+    other = ["protocol.name=other", "protocol.warmup=1"]
     cases = ([], [], ["--name", "better"], other, ["pictures=0"])
     keys = [scored("theirs", *words) for words in cases]
     assert keys[0] == keys[1]
