@@ -24,7 +24,7 @@ from reports.paper_tables import (
     PaperTable,
     Place,
     comparisons,
-    conditions,
+    measured_where,
     point,
     section,
 )
@@ -60,7 +60,7 @@ def write_paper_page(
     title = PAGE["title"] if of_paper else ", ".join(table.title for table in tables)
     published = any(line.published for table in tables for line in table.lines.values())
     reading = [PAGE["distances"].strip()] if published else []
-    facts = conditions(runs).items() if runs else ()
+    facts = measured_where(runs).items() if runs else ()
     said = {name: value for name, value in facts if " / " not in value}  # once for all tables
     parts: list[Part] = [
         f"# {title}",
@@ -147,15 +147,17 @@ def _images(
 
 
 def _chosen(
-    wanted: Mapping[str, Sequence[str]], tables: Sequence[PaperTable], measured: Measured
+    wanted: Mapping[str, Sequence[Any]], tables: Sequence[PaperTable], measured: Measured
 ) -> list[Repeated]:
-    """The measured lines in `wanted`: by their label here, a table and the keys of its lines, of
-    which the first that was measured counts."""
+    """The measured lines in `wanted`: by their label here, a table and a key; for one that was not
+    measured, the one that stands for it."""
     known = {table.name: table for table in tables}
     chosen = []
-    for label, (name, *keys) in wanted.items():
-        lines = [known[name].measured(str(key), measured) for key in keys if name in known]
-        chosen += [replace(line, label=label) for line in lines if line and line.runs][:1]
+    for label, (name, key) in wanted.items():
+        if table := known.get(name):
+            keys = filter(None, (str(key), table.instead.get(str(key))))
+            lines = [table.measured(each, measured) for each in keys]
+            chosen += [replace(line, label=label) for line in lines if line and line.runs][:1]
     return chosen
 
 

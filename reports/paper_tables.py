@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from reports.claims import Claim, Comparison, apart, compare, gap, told
-from reports.comparison import COMMON, marked, shown_as, written
+from reports.comparison import COMMON, conditions, marked, shown_as, written
 from reports.runs import Repeated, Run, missing_figures
 from reports.tables import ABSENT, Table
 
@@ -177,18 +177,17 @@ def comparisons(table: PaperTable, measured: Measured) -> list[Comparison]:
     return found
 
 
-def conditions(runs: Sequence[Run]) -> dict[str, str]:
-    """Under which conditions, and where, `runs` were measured: by fact, all values of it."""
-    facts = {name: [str(run.facts[name]) for run in runs] for name in (*COMMON, "seed", "commit")}
-    machines = [run.record["machine"] for run in runs]
-    facts["machine"] = [f"{each['cpu']} with {each['threads']} threads" for each in machines]
-    return {name: " / ".join(dict.fromkeys(values)) for name, values in facts.items()}
+def measured_where(runs: Sequence[Run]) -> dict[str, str]:
+    """Under which conditions, and on which machines, `runs` were measured."""
+    machines = (run.record["machine"] for run in runs)
+    named = dict.fromkeys(f"{each['cpu']} with {each['threads']} threads" for each in machines)
+    return {**conditions(runs, (*COMMON, "seed", "commit")), "machine": " / ".join(named)}
 
 
 def section(table: PaperTable, measured: Measured, said: Collection[str] = ()) -> list[str | Table]:
     """A table as parts of a page: the lines of its blocks, and those of each scene.
 
-    The page has `said` some of the `conditions` already.
+    The page has `said` some of where they were measured already.
     """
     heading = table.title if table.number is None else f"{table.called}: {table.title}"
     parts: list[str | Table] = []
@@ -207,8 +206,8 @@ def _block(block: Shown, said: Collection[str]) -> list[str | Table]:
     All figures are shown where lines are methods, or where there are no distances.
     """
     runs = [run for _, line in block.lines.values() for run in line.runs]
-    facts = {name: value for name, value in conditions(runs).items() if name not in said}
-    where = ", ".join(f"{name} {value}" for name, value in facts.items()) if runs else ""
+    facts = {name: value for name, value in measured_where(runs).items() if name not in said}
+    where = ", ".join(map(" ".join, facts.items())) if runs else ""
     published = any(line.published for line, _ in block.lines.values())
     parts: list[str | Table] = [where and f"Measured: {where}."]
     if not published or any(METHOD in line.job for line, _ in block.lines.values()):
@@ -225,14 +224,9 @@ def figure_table(block: Shown) -> Table:
     Among measured figures under the same conditions, the best of a column is bold and, of at least
     three, the second best is italic.
     """
-    metrics, lines = block.table.metrics, [line for _, line in block.lines.values()]
-    columns = [
-        [text or ABSENT for text in marked(lines, metric, ("**%s**", "*%s*"))] for metric in metrics
-    ]
-    heads = ("measured", *(shown_as(metric).heading for metric in metrics))
-    cells = tuple(zip(map(_name, lines), *columns, strict=True))
-    sources = tuple(line.keys for line in lines)
-    return Table(block.title or block.table.title, heads, cells, sources=sources)
+    lines = [line for _, line in block.lines.values()]
+    columns = {x: marked(lines, x, ("**%s**", "*%s*")) for x in block.table.metrics}
+    return _of_columns(block.title or block.table.title, "measured", lines, columns)
 
 
 def distance_table(block: Shown) -> Table:
@@ -249,18 +243,12 @@ def distance_table(block: Shown) -> Table:
         return here if paper == ABSENT else f"{here} ({paper})"
 
     columns = {
-        metric: [written(reference, metric) or ABSENT, *distances]
+        metric: [written(reference, metric), *distances]
         for metric in block.table.metrics
         if {*(distances := [cell(*line, metric) for line in lines.values()])} != {ABSENT}
     }
     every = [reference, *(runs for _, runs in lines.values())]
-    heads = ("here (paper)", *(shown_as(metric).heading for metric in columns))
-    cells = tuple(zip(map(_name, every), *columns.values(), strict=True))
-    return Table("Distances", heads, cells, sources=tuple(line.keys for line in every))
-
-
-def _name(line: Repeated) -> str:
-    return ": ".join((line.label, *line.gaps))
+    return _of_columns("Distances", "here (paper)", every, columns)
 
 
 def _scenes(metrics: Sequence[str], lines: Sequence[Repeated]) -> Table:
@@ -271,8 +259,16 @@ def _scenes(metrics: Sequence[str], lines: Sequence[Repeated]) -> Table:
         for line in lines
         if scene in line.by_scene
     ]
-    cells = tuple(
-        (each.label, *(written(each, metric) or ABSENT for metric in metrics)) for each in shown
-    )
-    heads = ("measured", *(shown_as(metric).heading for metric in metrics))
-    return Table("Each scene", heads, cells, sources=tuple(each.keys for each in shown))
+    columns = {metric: [written(each, metric) for each in shown] for metric in metrics}
+    return _of_columns("Each scene", "measured", shown, columns)
+
+
+def _of_columns(
+    title: str, head: str, lines: Sequence[Repeated], columns: Mapping[str, Sequence[str | None]]
+) -> Table:
+    """A table of `lines`, labelled and with their gaps, and the cells of `columns` by metric."""
+    names = (": ".join((line.label, *line.gaps)) for line in lines)
+    cells = ([cell or ABSENT for cell in column] for column in columns.values())
+    heads = (head, *(shown_as(metric).heading for metric in columns))
+    rows = tuple(zip(names, *cells, strict=True))
+    return Table(title, heads, rows, sources=tuple(line.keys for line in lines))
