@@ -103,18 +103,20 @@ def _plot(
         draw = partial(getattr(figures, plot["draw"]), some)
         drawn = Picture(plot["file"], plot["title"], draw)
     else:
-        some = [curve for table in tables if table.curve for curve in _curves(table, measured)]
+        curves = {x.called: found for x in tables if x.curve and (found := _curves(x, measured))}
+        some = [curve for of_table in curves.values() for curve in of_table]
         views = {line.runs[0].views for curve in some for line in curve.points.values()}
         fields = _chosen({"": plot["ceiling"]}, tables, measured)
         ceiling = next((line for line in fields if line.runs[0].views in views), None)
-        draw = partial(figures.quality_over_training, some, ceiling)
+        draw = partial(figures.quality_over_training, curves, ceiling)
         drawn = Picture(plot["file"], plot["title"], draw)
     if some:
         yield from (f"## {plot['title']}", drawn, plot["caption"].strip())
 
 
-def _curves(table: PaperTable, measured: Measured) -> Iterator[figures.Curve]:
+def _curves(table: PaperTable, measured: Measured) -> list[figures.Curve]:
     """The measured lines of `table` over the course of their training."""
+    curves = []
     for key, line in table.lines.items():
         of_shares = {x: measured.get(Place(table.name, CURVES, point(key, x))) for x in SHARES}
         of_shares[1.0] = table.measured(key, measured)
@@ -126,7 +128,8 @@ def _curves(table: PaperTable, measured: Measured) -> Iterator[figures.Curve]:
             runs = [run for run in mark.runs if run.facts["seed"] in common]
             points[_steps(runs[0]) * share] = replace(mark, runs=runs)
         if points:
-            yield figures.Curve(table.called, line.label, points)
+            curves.append(figures.Curve(line.label, points))
+    return curves
 
 
 def _steps(run: Run) -> Any:

@@ -145,13 +145,13 @@ def test_a_curve_has_a_point_for_every_measured_share(of_method, of_budget, run,
     trained = replace(run, record={**run.record, "budget": budget, "made_of": made_of})
     halves = {key: {0.5: [trained], 1.0: [trained]} for key in table.lines}
     halves["joint"][0.25] = [trained]
-    curves = list(_curves(table, on_curves(table, halves)))
+    curves = _curves(table, on_curves(table, halves))
     assert [(curve.label, list(curve.points)) for curve in curves] == [
         ("with joint training", [20, 40, 80]),
         ("without joint training", [40, 80]),
     ]
     ceiling = Repeated("field", [changed(run, {"psnr": 99.0})])
-    figures.quality_over_training(curves, ceiling, tmp_path / "curves.png")
+    figures.quality_over_training({"Table 5": curves}, ceiling, tmp_path / "curves.png")
     (axes,) = drawn[0].axes
     *lines, field, release = axes.lines
     assert set(field.get_ydata()) == {99.0}
@@ -173,8 +173,8 @@ def test_all_points_of_a_curve_are_of_the_same_seeds(run):
 def test_several_seeds_have_bars_on_a_curve_and_one_has_none(run, tmp_path, drawn):
     seeds = [shifted(run, by, seed=seed) for seed, by in enumerate((0.0, 1.0, 2.0))]
     points = {10.0: Repeated("a", seeds), 20.0: Repeated("b", [run])}
-    curve = figures.Curve("Table 9", "L = 2", points)
-    figures.quality_over_training([curve], None, tmp_path / "curves.png")
+    curves = {"Table 9": [figures.Curve("L = 2", points)]}
+    figures.quality_over_training(curves, None, tmp_path / "curves.png")
     (axes,) = drawn[0].axes
     low, high = axes.collections[0].get_segments()[0][:, 1]
     assert high - low == pytest.approx(2 * points[10.0].half("psnr"))
