@@ -12,7 +12,7 @@ from reports import figures
 from reports.images import Picture
 from reports.outliers import Outlier
 from reports.paper_page import PAGE, _curves, write_paper_page
-from reports.paper_tables import CURVES, Block, Line, PaperTable, Place, point
+from reports.paper_tables import CURVES, Line, PaperTable, Place, point
 from reports.runs import Repeated, Run
 from sweeps.tables import chosen
 from tests.reports.conftest import TABLES, changed, measured_of, shifted
@@ -73,7 +73,7 @@ def test_a_method_has_one_mark_at_its_first_measured_line_and_an_added_one_too(
 def test_findings_come_first_all_comparisons_last(run, tmp_path):
     table, seeds = TABLES["table6"], range(3)
     measured = {
-        Place("table6", table.blocks[0].data_set, key): Repeated(
+        Place("table6", table.data_sets[0], key): Repeated(
             line.label,
             [shifted(run, 0.1 * place + 0.01 * seed * place, seed=seed) for seed in seeds],
         )
@@ -91,7 +91,7 @@ def test_findings_come_first_all_comparisons_last(run, tmp_path):
 
 def test_a_page_of_nothing_still_says_what_is_missing(tmp_path):
     lines = [Repeated("with joint training", [], ["not measured yet"])]
-    measured = {Place("table5", TABLES["table5"].blocks[0].data_set, "joint"): lines[0]}
+    measured = {Place("table5", TABLES["table5"].data_sets[0], "joint"): lines[0]}
     text = write_paper_page([*TABLES.values()], measured, [], tmp_path).read_text()
     assert "| with joint training: not measured yet | – (+1.07) |" in text
     assert "comparisons" not in text
@@ -100,7 +100,7 @@ def test_a_page_of_nothing_still_says_what_is_missing(tmp_path):
 
 
 def test_a_page_of_ones_own_table_has_its_title(run, tmp_path):
-    table = PaperTable("mine", "My table", ["psnr"], [Block({"a": Line("here", {})})])
+    table = PaperTable("mine", "My table", ["psnr"], {"a": Line("here", {})})
     text = write_paper_page([table], measured_of(table, {"a": run}), [], tmp_path).read_text()
     assert text.startswith("# My table\n")
     assert "paper" not in text
@@ -127,7 +127,7 @@ def on_curves(
     table: PaperTable, runs: Mapping[str, Mapping[float, Sequence[Run]]]
 ) -> dict[Place, Repeated]:
     """These runs of each line after each share of its training, in the order of the shares."""
-    data_set = table.blocks[0].data_set
+    data_set = table.data_sets[0]
     return {
         Place(table.name, data_set, key)
         if share == 1
