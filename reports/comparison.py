@@ -117,7 +117,12 @@ def ranks(lines: Sequence[Repeated], metric: str, write: Write | None = None) ->
     return places
 
 
+def conditions(runs: Sequence[Run], names: Sequence[str] = COMMON) -> dict[str, str]:
+    """The facts `names` of `runs`, each with all of its values."""
+    facts = {name: dict.fromkeys(str(run.facts[name]) for run in runs) for name in names}
+    return {name: " / ".join(values) for name, values in facts.items()}
+
+
 def conditions_of(runs: Sequence[Run]) -> str:
-    """Scene, resolution, trajectory and so on of `runs`, as text; lists all values of a fact."""
-    values = {name: dict.fromkeys(str(run.facts[name]) for run in runs) for name in COMMON}
-    return ", ".join(f"{name} {' / '.join(several)}" for name, several in values.items())
+    """Scene, resolution, trajectory and so on of `runs`, as text."""
+    return ", ".join(map(" ".join, conditions(runs).items()))

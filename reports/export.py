@@ -47,7 +47,7 @@ def latex(tables: Sequence[PaperTable], measured: Measured) -> str:
 
 def _latex(table: PaperTable, measured: Measured) -> str:
     blocks = table.shown(measured)
-    runs = [run for block in blocks for _, line in block.lines.values() for run in line.runs]
+    runs = [run for block in blocks for line in block.measured for run in line.runs]
     caption = f"{_escaped(table.title)}. " + (f"{_escaped(conditions_of(runs))}." if runs else "")
     heads = ["", *(_escaped(shown_as(metric).heading) for metric in table.metrics)]
     parts = ([heads], *map(_rows, blocks))
@@ -69,12 +69,14 @@ def _latex(table: PaperTable, measured: Measured) -> str:
 
 def _rows(block: Shown) -> list[list[str]]:
     """The cells of a block; labels of a further one also have its data set."""
-    metrics, lines = block.table.metrics, [line for _, line in block.lines.values()]
-    columns = [marked(lines, metric, MARKS, partial(_written, metric)) for metric in metrics]
+    columns = [
+        marked(block.measured, metric, MARKS, partial(_written, metric))
+        for metric in block.table.metrics
+    ]
     where = f" ({block.title})" if block.title else ""
     return [
         [_escaped(line.label + where), *((text or "--").replace("±", r"$\pm$") for text in row)]
-        for line, *row in zip(lines, *columns, strict=True)
+        for line, *row in zip(block.measured, *columns, strict=True)
     ]
 
 
@@ -94,7 +96,7 @@ def csv(tables: Sequence[PaperTable], measured: Measured) -> str:
             "measured": found.mean(metric),
             "half_interval": found.half(metric),
             "runs": len(found.runs),
-            "published": line.published.get(metric),
+            "published": block.published(metric).get(key),
         }
         for table in tables
         for block in table.shown(measured)

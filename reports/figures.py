@@ -95,7 +95,7 @@ def quality_against(lines: Sequence[Repeated], metric: str, path: Path) -> None:
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
     _label(axes, label)
-    points = {}
+    points = []
     for number, line in enumerate(lines):
         across, up = line.mean(metric), line.mean("psnr")
         if across is None or up is None:
@@ -104,7 +104,7 @@ def quality_against(lines: Sequence[Repeated], metric: str, path: Path) -> None:
         style = {**_style(number), "xerr": bars[0] and bars[0] / unit, "yerr": bars[1]}
         drawn = axes.errorbar(across / unit, up, **style, markersize=8)
         drawn[0].set_gid(MARK.format(number))
-        points[line.label] = (across / unit, up)
+        points.append((line.label, (across / unit, up)))
     axes.set_xscale("log")
     axes.margins(0.1)
     low, high = axes.get_xlim()
@@ -117,12 +117,12 @@ def quality_against(lines: Sequence[Repeated], metric: str, path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
-def _name(axes: Axes, points: Mapping[str, tuple[float, float]]) -> None:
+def _name(axes: Axes, points: Sequence[tuple[str, tuple[float, float]]]) -> None:
     """Write each name beside its point, where it covers no other name and no point."""
     axes.get_figure().draw_without_rendering()  # type: ignore[union-attr]
-    on_page = [axes.transData.transform(point) for point in points.values()]
+    on_page = [axes.transData.transform(point) for _, point in points]
     taken = [Bbox.from_extents(*(place - 6), *(place + 6)) for place in on_page]
-    for name, point in points.items():
+    for name, point in points:
         text = axes.annotate(name, point, (0, 0), textcoords="offset points", size=9)
         text.set_in_layout(False)
         for across, up in PLACES:
@@ -153,30 +153,30 @@ def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
 
 @dataclass(frozen=True)
 class Curve:
-    """A line in the panel titled `panel`: what was measured, by the number of training steps."""
+    """A line of `quality_over_training`: what was measured, by the number of training steps."""
 
-    panel: str
     label: str
     points: Mapping[float, Repeated]
 
 
-def quality_over_training(curves: Sequence[Curve], ceiling: Repeated | None, path: Path) -> None:
-    """Write a PNG: PSNR over training steps (log scale), one panel for each `panel` of `curves`.
+def quality_over_training(
+    curves: Mapping[str, Sequence[Curve]], ceiling: Repeated | None, path: Path
+) -> None:
+    """Write a PNG: PSNR over training steps (log scale), a panel for each title in `curves`.
 
     Bars show the intervals over several seeds. The axis ends with the steps of the release. The
     PSNR of `ceiling` is a dashed line.
     """
-    titles = list(dict.fromkeys(curve.panel for curve in curves))
-    across = min(len(titles), 2)
-    down = -(-len(titles) // across)
+    across = min(len(curves), 2)
+    down = -(-len(curves) // across)
     figure = Figure(figsize=(4 * across, 2.8 * down), layout="constrained")
     panels = figure.subplots(down, across, squeeze=False, sharey=True).ravel()
-    for axes in panels[len(titles) :]:
+    for axes in panels[len(curves) :]:
         axes.set_axis_off()
-    for axes, title in zip(panels, titles, strict=False):
+    for axes, (title, of_panel) in zip(panels, curves.items(), strict=False):
         _label(axes, "steps of stage 2, log scale")
         axes.set_title(title, fontsize="medium")
-        for number, curve in enumerate(curve for curve in curves if curve.panel == title):
+        for number, curve in enumerate(of_panel):
             bars = np.nan_to_num([line.half("psnr") for line in curve.points.values()])
             psnr = [line.mean("psnr") for line in curve.points.values()]
             style = {**_style(number), "capsize": 3, "label": curve.label, "linestyle": "-"}

@@ -24,7 +24,7 @@ from reports.paper_tables import (
     PaperTable,
     Place,
     comparisons,
-    conditions,
+    measured_where,
     point,
     section,
 )
@@ -60,7 +60,7 @@ def write_paper_page(
     title = PAGE["title"] if of_paper else ", ".join(table.title for table in tables)
     published = any(line.published for table in tables for line in table.lines.values())
     reading = [PAGE["distances"].strip()] if published else []
-    facts = conditions(runs).items() if runs else ()
+    facts = measured_where(runs).items() if runs else ()
     said = {name: value for name, value in facts if " / " not in value}  # once for all tables
     parts: list[Part] = [
         f"# {title}",
@@ -103,18 +103,20 @@ def _plot(
         draw = partial(getattr(figures, plot["draw"]), some)
         drawn = Picture(plot["file"], plot["title"], draw)
     else:
-        some = [curve for table in tables if table.curve for curve in _curves(table, measured)]
+        curves = {x.called: found for x in tables if x.curve and (found := _curves(x, measured))}
+        some = [curve for of_table in curves.values() for curve in of_table]
         views = {line.runs[0].views for curve in some for line in curve.points.values()}
         fields = _chosen({"": plot["ceiling"]}, tables, measured)
         ceiling = next((line for line in fields if line.runs[0].views in views), None)
-        draw = partial(figures.quality_over_training, some, ceiling)
+        draw = partial(figures.quality_over_training, curves, ceiling)
         drawn = Picture(plot["file"], plot["title"], draw)
     if some:
         yield from (f"## {plot['title']}", drawn, plot["caption"].strip())
 
 
-def _curves(table: PaperTable, measured: Measured) -> Iterator[figures.Curve]:
+def _curves(table: PaperTable, measured: Measured) -> list[figures.Curve]:
     """The measured lines of `table` over the course of their training."""
+    curves = []
     for key, line in table.lines.items():
         of_shares = {x: measured.get(Place(table.name, CURVES, point(key, x))) for x in SHARES}
         of_shares[1.0] = table.measured(key, measured)
@@ -126,7 +128,8 @@ def _curves(table: PaperTable, measured: Measured) -> Iterator[figures.Curve]:
             runs = [run for run in mark.runs if run.facts["seed"] in common]
             points[_steps(runs[0]) * share] = replace(mark, runs=runs)
         if points:
-            yield figures.Curve(table.called, line.label, points)
+            curves.append(figures.Curve(line.label, points))
+    return curves
 
 
 def _steps(run: Run) -> Any:
@@ -147,15 +150,17 @@ def _images(
 
 
 def _chosen(
-    wanted: Mapping[str, Sequence[str]], tables: Sequence[PaperTable], measured: Measured
+    wanted: Mapping[str, Sequence[Any]], tables: Sequence[PaperTable], measured: Measured
 ) -> list[Repeated]:
-    """The measured lines in `wanted`: by their label here, a table and the keys of its lines, of
-    which the first that was measured counts."""
+    """The measured lines in `wanted`: by their label here, a table and a key; for one that was not
+    measured, the one that stands for it."""
     known = {table.name: table for table in tables}
     chosen = []
-    for label, (name, *keys) in wanted.items():
-        lines = [known[name].measured(str(key), measured) for key in keys if name in known]
-        chosen += [replace(line, label=label) for line in lines if line and line.runs][:1]
+    for label, (name, key) in wanted.items():
+        if table := known.get(name):
+            keys = filter(None, (str(key), table.instead.get(str(key))))
+            lines = [table.measured(each, measured) for each in keys]
+            chosen += [replace(line, label=label) for line in lines if line and line.runs][:1]
     return chosen
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from reports.claims import Claim, Comparison, apart, compare, gap, told
-from reports.comparison import COMMON, marked, shown_as, written
+from reports.comparison import COMMON, conditions, marked, shown_as, written
 from reports.runs import Repeated, Run, missing_figures
 from reports.tables import ABSENT, Table
 
@@ -38,7 +38,8 @@ def point(line: str, share: float) -> str:
 
 @dataclass(frozen=True)
 class Line:
-    """A line of a table: `job` has its settings, beside those of all lines; the paper's figures.
+    """A line of a table: `job` has its settings, beside those of all lines; the paper's figures, by
+    data set and metric.
 
     Without a `method` it is one of the experiment's method, which is measured with every seed; so
     are others with `every_seed`. Units are bytes, ms and dB, as in our rows. Claims have the words
@@ -47,41 +48,34 @@ class Line:
 
     label: str
     job: Mapping[str, str]
-    published: Mapping[str, float] = field(default_factory=dict)
+    published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     every_seed: bool = False
     called: str = ""
     added: bool = False
 
 
 @dataclass(frozen=True)
-class Block:
-    """The `lines` of a table by key, with the paper's figures on a `data_set`, "" if it has none.
-
-    `published_on` has scenes, size and machine of these figures.
-    """
-
-    lines: Mapping[str, Line]
-    data_set: str = ""
-    published_on: str = ""
-
-
-@dataclass(frozen=True)
 class PaperTable:
-    """A table, measured by the experiment `name`; `metrics` are its columns.
+    """A table, measured by the experiment `name`; `metrics` are its columns, `lines` have keys.
 
-    It has a `number` in the paper, or is one of ours. The first of `blocks` has all lines. `notes`
-    are what a reader should know before comparing, `claims` what the paper concludes; in what a
-    claim says, {KEY} is what this line is called. Distances are those to the line `reference`, by
-    default the first. For a line that was not measured stands the one that `instead` has for it.
-    The metrics `scenes` are also shown for every scene of a data set. Where a table compares times,
-    its lines are measured `in_turns`, frame by frame. With `curve`, the lines of the first block
+    It has a `number` in the paper, or is one of ours. It is compared with the paper's figures on
+    `data_sets`, "" if there are none: all lines with those on the first, the lines `beside` (none:
+    all) with those on others. `published_on` has scenes, size and machine of these figures, by data
+    set. `notes` are what a reader should know before comparing, `claims` what the paper concludes;
+    in what a claim says, {KEY} is what this line is called. Distances are those to the line
+    `reference`, by default the first. For a line that was not measured stands the one that
+    `instead` has for it. The metrics `scenes` are also shown for every scene of a data set. Where a
+    table compares times, its lines are measured `in_turns`, frame by frame. With `curve`, the lines
     are also shown as curves over the training.
     """
 
     name: str
     title: str
     metrics: Sequence[str]
-    blocks: Sequence[Block]
+    lines: Mapping[str, Line]
+    data_sets: Sequence[str] = ("",)
+    published_on: Mapping[str, str] = field(default_factory=dict)
+    beside: Sequence[str] = ()
     number: int | None = None
     notes: Sequence[str] = ()
     claims: Sequence[Claim] = ()
@@ -97,33 +91,31 @@ class PaperTable:
         return self.title if self.number is None else f"Table {self.number}"
 
     @property
-    def lines(self) -> Mapping[str, Line]:
-        """All lines, by key."""
-        return self.blocks[0].lines
+    def blocks(self) -> dict[str, Mapping[str, Line]]:
+        """The lines that are compared with the figures on each data set, by key."""
+        first, *further = self.data_sets
+        some = {key: self.lines[key] for key in self.beside or self.lines}
+        return {first: self.lines, **dict.fromkeys(further, some)}
 
     def measured(self, key: str, known: Measured) -> Repeated | None:
         """What was measured of a line of the first block; None if it was not planned."""
-        return known.get(Place(self.name, self.blocks[0].data_set, key))
+        return known.get(Place(self.name, self.data_sets[0], key))
 
     def shown(self, measured: Measured) -> list[Shown]:
         """The first block, and those further ones of which any line is in `measured`."""
-        first, *further = self.blocks
-        there = {(place.table, place.block) for place in measured}
-        asked = [block for block in further if (self.name, block.data_set) in there]
-        return [
-            self._shown(first, "", self.notes, measured),
-            *(self._shown(block, block.data_set, (), measured) for block in asked),
-        ]
+        first, *further = self.data_sets
+        there = {place.block for place in measured if place.table == self.name}
+        return [self._shown(x, measured) for x in (first, *(x for x in further if x in there))]
 
-    def _shown(self, block: Block, title: str, notes: Sequence[str], measured: Measured) -> Shown:
+    def _shown(self, data_set: str, measured: Measured) -> Shown:
         """With the line that `instead` has for one that was not measured, and a note about it."""
         lines = {}
-        for key, line in block.lines.items():
-            place = Place(self.name, block.data_set, key)
+        for key, line in self.blocks[data_set].items():
+            place = Place(self.name, data_set, key)
             lines[key] = line, measured.get(place, Repeated(line.label, ()))
         called = {key: line.called or line.label for key, line in self.lines.items()}
         there = {key for key, (_, found) in lines.items() if found.runs}
-        notes, standing = list(notes), {}
+        notes, standing = list(self.notes), {}
         for missing, other in self.instead.items():
             if missing in lines.keys() - there and other in there:
                 line, found = lines.pop(missing)
@@ -131,8 +123,7 @@ class PaperTable:
                 lines[other] = replace(stand_in, published=line.published), runs
                 standing[missing], called[missing] = other, called[other]
                 why = ": ".join(found.gaps) or "not measured"
-                if not title:
-                    notes.append(f'"{stand_in.label}" stands for "{line.label}" ({why}).')
+                notes.append(f'"{stand_in.label}" stands for "{line.label}" ({why}).')
         claims = [
             replace(
                 claim,
@@ -141,54 +132,62 @@ class PaperTable:
             )
             for claim in self.claims
         ]
-        return Shown(self, title, block.published_on, lines, notes, claims)
+        return Shown(self, data_set, lines, claims, notes)
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What a page shows of a block: each line with what was measured, by key.
-
-    The first block of a table has no `title`, further ones that of their data set.
-    """
+    """A block of a table as a page shows it: each line with what was measured, by key."""
 
     table: PaperTable
-    title: str
-    published_on: str
+    data_set: str
     lines: Mapping[str, tuple[Line, Repeated]]
-    notes: Sequence[str]
     claims: Sequence[Claim]
+    notes: Sequence[str]
+
+    @property
+    def title(self) -> str:
+        """The data set; of the first block, which has the title of the table, ""."""
+        return "" if self.data_set == self.table.data_sets[0] else self.data_set
+
+    @property
+    def measured(self) -> list[Repeated]:
+        """What was measured of its lines."""
+        return [found for _, found in self.lines.values()]
+
+    def published(self, metric: str) -> dict[str, float]:
+        """The paper's figures, by key, of the lines that have one."""
+        figures = {
+            key: line.published.get(self.data_set, {}) for key, (line, _) in self.lines.items()
+        }
+        return {key: of[metric] for key, of in figures.items() if metric in of}
 
 
 def comparisons(table: PaperTable, measured: Measured) -> list[Comparison]:
     """What the paper concludes from a table, compared with what was measured here."""
-    found = []
-    for block in table.shown(measured):
-        known = {key: runs for key, (_, runs) in block.lines.items()}
-        for claim in block.claims:
-            figures = {
-                key: line.published[claim.metric]
-                for key, (line, _) in block.lines.items()
-                if claim.metric in line.published
-            }
-            found += [
-                replace(each, table=table.called, data_set=block.title)
-                for each in compare(claim, known, figures)
-            ]
-    return found
+    return [
+        replace(each, table=table.called, data_set=block.title)
+        for block in table.shown(measured)
+        for claim in block.claims
+        for each in compare(
+            claim,
+            dict(zip(block.lines, block.measured, strict=True)),
+            block.published(claim.metric),
+        )
+    ]
 
 
-def conditions(runs: Sequence[Run]) -> dict[str, str]:
-    """Under which conditions, and where, `runs` were measured: by fact, all values of it."""
-    facts = {name: [str(run.facts[name]) for run in runs] for name in (*COMMON, "seed", "commit")}
-    machines = [run.record["machine"] for run in runs]
-    facts["machine"] = [f"{each['cpu']} with {each['threads']} threads" for each in machines]
-    return {name: " / ".join(dict.fromkeys(values)) for name, values in facts.items()}
+def measured_where(runs: Sequence[Run]) -> dict[str, str]:
+    """Under which conditions, and on which machines, `runs` were measured."""
+    machines = (run.record["machine"] for run in runs)
+    named = dict.fromkeys(f"{each['cpu']} with {each['threads']} threads" for each in machines)
+    return {**conditions(runs, (*COMMON, "seed", "commit")), "machine": " / ".join(named)}
 
 
 def section(table: PaperTable, measured: Measured, said: Collection[str] = ()) -> list[str | Table]:
     """A table as parts of a page: the lines of its blocks, and those of each scene.
 
-    The page has `said` some of the `conditions` already.
+    The page has `said` some of where they were measured already.
     """
     heading = table.title if table.number is None else f"{table.called}: {table.title}"
     parts: list[str | Table] = []
@@ -204,18 +203,19 @@ def section(table: PaperTable, measured: Measured, said: Collection[str] = ()) -
 def _block(block: Shown, said: Collection[str]) -> list[str | Table]:
     """What was measured, under which conditions; distances, here and in the paper; notes.
 
-    All figures are shown where lines are methods, or where there are no distances.
+    All figures are shown where lines are methods, or where there are no distances. Notes are those
+    of the table below its first block, and those on figures that could not be measured.
     """
-    runs = [run for _, line in block.lines.values() for run in line.runs]
-    facts = {name: value for name, value in conditions(runs).items() if name not in said}
-    where = ", ".join(f"{name} {value}" for name, value in facts.items()) if runs else ""
-    published = any(line.published for line, _ in block.lines.values())
+    table, runs = block.table, [run for line in block.measured for run in line.runs]
+    facts = {name: value for name, value in measured_where(runs).items() if name not in said}
+    where = ", ".join(map(" ".join, facts.items())) if runs else ""
+    published = any(line.published.get(block.data_set) for line, _ in block.lines.values())
     parts: list[str | Table] = [where and f"Measured: {where}."]
     if not published or any(METHOD in line.job for line, _ in block.lines.values()):
         parts.append(figure_table(block))
     if published:
-        parts += [f"Paper: {block.published_on}.", distance_table(block)]
-    notes = dict.fromkeys((*block.notes, *missing_figures(runs)))
+        parts += [f"Paper: {table.published_on[block.data_set]}.", distance_table(block)]
+    notes = dict.fromkeys((*(() if block.title else block.notes), *missing_figures(runs)))
     return [part for part in (*parts, "\n".join(f"- {note}" for note in notes)) if part]
 
 
@@ -225,42 +225,30 @@ def figure_table(block: Shown) -> Table:
     Among measured figures under the same conditions, the best of a column is bold and, of at least
     three, the second best is italic.
     """
-    metrics, lines = block.table.metrics, [line for _, line in block.lines.values()]
-    columns = [
-        [text or ABSENT for text in marked(lines, metric, ("**%s**", "*%s*"))] for metric in metrics
-    ]
-    heads = ("measured", *(shown_as(metric).heading for metric in metrics))
-    cells = tuple(zip(map(_name, lines), *columns, strict=True))
-    sources = tuple(line.keys for line in lines)
-    return Table(block.title or block.table.title, heads, cells, sources=sources)
+    marks = ("**%s**", "*%s*")
+    columns = {metric: marked(block.measured, metric, marks) for metric in block.table.metrics}
+    title = block.title or block.table.title
+    return _of_columns(title, "measured", block.measured, columns)
 
 
 def distance_table(block: Shown) -> Table:
     """The figures of the table's reference, then how far each line is from it, here and in the
     paper, by metric."""
-    lines = dict(block.lines)
-    key = block.table.reference
-    published, reference = lines.pop(key if key in lines else next(iter(lines)))
-
-    def cell(line: Line, runs: Repeated, metric: str) -> str:
-        here = told(metric, gap(metric, reference, runs).by)
-        figures = (each.published.get(metric, math.nan) for each in (published, line))
-        paper = told(metric, apart(metric, *figures))
-        return here if paper == ABSENT else f"{here} ({paper})"
-
-    columns = {
-        metric: [written(reference, metric) or ABSENT, *distances]
-        for metric in block.table.metrics
-        if {*(distances := [cell(*line, metric) for line in lines.values()])} != {ABSENT}
-    }
-    every = [reference, *(runs for _, runs in lines.values())]
-    heads = ("here (paper)", *(shown_as(metric).heading for metric in columns))
-    cells = tuple(zip(map(_name, every), *columns.values(), strict=True))
-    return Table("Distances", heads, cells, sources=tuple(line.keys for line in every))
-
-
-def _name(line: Repeated) -> str:
-    return ": ".join((line.label, *line.gaps))
+    runs = dict(zip(block.lines, block.measured, strict=True))
+    first = block.table.reference if block.table.reference in runs else next(iter(runs))
+    reference = runs.pop(first)
+    columns = {}
+    for metric in block.table.metrics:
+        published = block.published(metric)
+        cells = []
+        for key, line in runs.items():
+            here = told(metric, gap(metric, reference, line).by)
+            figures = (published.get(x, math.nan) for x in (first, key))
+            paper = told(metric, apart(metric, *figures))
+            cells.append(here if paper == ABSENT else f"{here} ({paper})")
+        if {*cells} != {ABSENT}:
+            columns[metric] = [written(reference, metric), *cells]
+    return _of_columns("Distances", "here (paper)", [reference, *runs.values()], columns)
 
 
 def _scenes(metrics: Sequence[str], lines: Sequence[Repeated]) -> Table:
@@ -271,8 +259,16 @@ def _scenes(metrics: Sequence[str], lines: Sequence[Repeated]) -> Table:
         for line in lines
         if scene in line.by_scene
     ]
-    cells = tuple(
-        (each.label, *(written(each, metric) or ABSENT for metric in metrics)) for each in shown
-    )
-    heads = ("measured", *(shown_as(metric).heading for metric in metrics))
-    return Table("Each scene", heads, cells, sources=tuple(each.keys for each in shown))
+    columns = {metric: [written(each, metric) for each in shown] for metric in metrics}
+    return _of_columns("Each scene", "measured", shown, columns)
+
+
+def _of_columns(
+    title: str, head: str, lines: Sequence[Repeated], columns: Mapping[str, Sequence[str | None]]
+) -> Table:
+    """A table of `lines`, labelled and with their gaps, and the cells of `columns` by metric."""
+    names = (": ".join((line.label, *line.gaps)) for line in lines)
+    cells = ([cell or ABSENT for cell in column] for column in columns.values())
+    heads = (head, *(shown_as(metric).heading for metric in columns))
+    rows = tuple(zip(names, *cells, strict=True))
+    return Table(title, heads, rows, sources=tuple(line.keys for line in lines))

@@ -64,7 +64,7 @@ class Figures:
         values = {x: of for x, of in run.values.items() if x in limits and not math.isnan(of)}
         steady, frames = run.steady, {}
         for metric in values:
-            if metric not in steady or metric == "peak_bytes":  # older runs have that column
+            if metric not in steady:
                 continue
             averaged = steady.dropna(subset=[metric]) if metric in QUALITY else steady
             names = averaged["frame"].astype(str) + ": " + averaged["name"].fillna("")

@@ -130,7 +130,7 @@ class Run:
         machine, record, row = self.record["machine"], self.record, self.facts
         memory = f"{machine['memory_bytes'] / 2**30:.0f} GiB"
         computed = {name: row[name] for name in ("device", "backend", "engine", "precision")}
-        seen = record.get("neighbours")  # older runs and scores have none
+        seen = record.get("neighbours")  # none where nothing was timed here
         return {
             "run": self.key,
             "scene": f"{row['scene']}, digest {record['scene']['digest'][:16]}",
@@ -140,7 +140,7 @@ class Run:
             "seed": str(row["seed"]),
             "commit": row["commit"],
             "computed on": _listed(computed),
-            "times": record.get("times", "not recorded"),  # older runs have none
+            "times": record.get("times", "not recorded"),
             "peak memory": record["peak_bytes"],
             "machine": f"{machine['cpu']}, {machine['threads']} threads, {memory}",
             "beside it": str(Neighbours(**seen)) if seen else "not recorded",
@@ -209,11 +209,6 @@ class Repeated:
 
 def readable(store: Store, keys: Collection[str] | None = None) -> list[Run]:
     """Every readable run, or those in `keys`, labelled with its key, in the order of storing."""
-
-    def stored(run: Run) -> float:
-        """When, in seconds since the epoch; older runs only tell it by their folders."""
-        return run.record.get("stored") or (store.folder / run.key).stat().st_mtime
-
     rows = store.rows(report=lambda unreadable: None, keys=keys)
     runs = [
         Run(
@@ -227,7 +222,7 @@ def readable(store: Store, keys: Collection[str] | None = None) -> list[Run]:
         for key, of_run in rows.groupby("run")
         if (folder := store.find(str(key)))
     ]
-    return sorted(runs, key=stored)
+    return sorted(runs, key=lambda run: run.record["stored"])
 
 
 def load_runs(store: Store, labels: Mapping[str, str]) -> list[Run]:

@@ -139,13 +139,13 @@ class _Wanted(NamedTuple):
 
 def _wanted(table: PaperTable) -> Iterator[_Wanted]:
     """The lines of a table's blocks, then the points of its curves, which are not timed."""
-    for block in table.blocks:
-        for key, line in block.lines.items():
-            yield _Wanted(block.data_set, key, line, block.data_set, table.in_turns)
+    for data_set, lines in table.blocks.items():
+        for key, line in lines.items():
+            yield _Wanted(data_set, key, line, data_set, table.in_turns)
     for (key, line), share in product(table.lines.items(), SHARES if table.curve else ()):
         job = {**line.job, AFTER: str(share), **OF_CURVES}
         mark = replace(line, label=f"{line.label}, after {share}", job=job)
-        yield _Wanted(CURVES, point(key, share), mark, table.blocks[0].data_set, False)
+        yield _Wanted(CURVES, point(key, share), mark, table.data_sets[0], False)
 
 
 def scenes_of(words: Sequence[str], data: DataSet | None = None) -> list[str]:

@@ -17,15 +17,12 @@ from bench.errors import SteerbenchError, unexpected, unknown
 from bench.study import Axis
 from reports.claims import Claim
 from reports.comparison import shown_as
-from reports.paper_tables import METHOD, Block, Line, PaperTable
+from reports.paper_tables import METHOD, Line, PaperTable
 from sweeps.configured import check_settings
 from sweeps.data_sets import FIRST
 from sweeps.overrides import choices, swept
 
 SEED = "seed"  # in a grid, it makes no lines: they are means over their seeds
-
-OF_LINES = ("lines", "label", "axis", "published_on", "beside")
-"""What a table declares of its lines; all else are attributes of a `PaperTable`."""
 
 
 def chosen(
@@ -50,12 +47,10 @@ def chosen(
     if methods and not any(compared):
         raise SteerbenchError(f"--with: {name} compares no methods; table1 does")
     further = {f"with {x}": Line(x, {METHOD: x}, added=True) for x in methods}
-    for place in range(len(tables)) if methods else ():
-        if compared[place]:
-            first, *others = tables[place].blocks
-            first = replace(first, lines={**first.lines, **further})
-            tables[place] = replace(tables[place], blocks=[first, *others])
-    return tables
+    return [
+        replace(table, lines={**table.lines, **further}) if compares else table
+        for table, compares in zip(tables, compared, strict=True)
+    ]
 
 
 def grid(name: str, words: Sequence[str] = ()) -> dict[str, list[str]]:
@@ -93,50 +88,63 @@ def _grid(experiment: Any) -> dict[str, list[str]]:
 
 
 def _table(name: str, experiment: Any, data_sets: Sequence[str]) -> PaperTable:
-    """What an experiment declares below `table`."""
+    """What an experiment declares below `table`, with the figures on those of `data_sets` that
+    there are any of."""
     where, declared = f"experiment {name}: table", experiment.get("table")
     if not isinstance(declared, dict):
         raise unexpected(where, "a section with title and metrics", declared)
-    own = {key: of for key, of in declared.items() if key not in OF_LINES}
+    own = {**declared, "published_on": _by_data_set(declared.get("published_on", {}))}
     own["reference"] = str(own.get("reference", ""))  # a key may look like a number
     own["instead"] = {str(key): str(of) for key, of in own.get("instead", {}).items()}
-    check_settings(PaperTable, own, f"{where}.", ("name", "blocks"))
+    own["beside"] = [*map(str, own.get("beside", ()))]
+    label, said, _ = own.pop("label", None), own.pop("lines", {}), own.pop("axis", None)
+    check_settings(PaperTable, own, f"{where}.", ("name", "lines", "data_sets"))
     for metric in own["metrics"]:
         shown_as(metric)  # refuses a name that is no metric
-    axes = {key: values for key, values in _grid(experiment).items() if key != SEED}
-    lines = _lines(declared, axes, f"{where}.lines")
+    said = {str(key): of or {} for key, of in said.items()}
+    if any("published" in of for of in said.values()) and not own["published_on"]:
+        raise unexpected(f"{where}.published_on", "what `published` was measured on", "nothing")
+    own["lines"] = lines = {}
+    for key, job in _jobs(said, label, _grid(experiment), where).items():
+        of = {**job, **said.get(key, {})}
+        published = _by_data_set(of.pop("published", {}))
+        check_settings(Line, of, f"{where}.lines.{key}.", ("published", "added"))
+        figures = {x: _figures(of_one, own["metrics"], where) for x, of_one in published.items()}
+        lines[key] = Line(**of, published=figures)
     own["claims"] = [_claim(of, lines, f"{where}.claims.") for of in own.get("claims", ())]
-    beside = [str(key) for key in declared.get("beside", lines)]
-    named = [own["reference"], *own["instead"], *own["instead"].values(), *beside]
+    named = (own["reference"], *own["instead"], *own["instead"].values(), *own["beside"])
     _refuse_unknown(filter(None, named), lines)
-    return PaperTable(name, blocks=_blocks(declared, lines, beside, data_sets, where), **own)
+    shown = [data_set for data_set in data_sets if data_set in own["published_on"]]
+    return PaperTable(name, data_sets=shown or [""], **own)
 
 
-def _lines(
-    declared: Mapping[str, Any], grid: Mapping[str, Sequence[str]], where: str
-) -> dict[str, Line]:
-    """The lines of a table by key, without figures: those that are declared with a `job`; if none
-    is, one for each job of the grid, whose key is made of its values."""
-    said = {str(key): of or {} for key, of in declared.get("lines", {}).items()}
-    jobs = {key: of["job"] for key, of in said.items() if "job" in of}
-    labels = {key: key for key in jobs}
-    if not jobs:
-        if not grid:
-            raise unexpected(where, "settings in hydra.sweeper.params, or lines with a job", "none")
-        jobs = {
-            ", ".join(job): dict(zip(grid, job, strict=True)) for job in product(*grid.values())
-        }
-        label = declared.get("label") or ", ".join(f"{name}={{}}" for name in grid)
-        labels = {key: label.format(*job.values()) for key, job in jobs.items()}
+def _jobs(
+    said: Mapping[str, Any], label: str | None, grid: Mapping[str, Sequence[str]], where: str
+) -> dict[str, dict[str, Any]]:
+    """The job and the label of each line by key: of lines for which a `job` is `said`; if for none,
+    of each job of the grid, whose key is made of its values."""
+    jobs = {key: {"label": key, "job": of["job"]} for key, of in said.items() if "job" in of}
+    axes = {name: values for name, values in grid.items() if name != SEED}
+    if not jobs and not axes:
+        raise unexpected(where, "settings in hydra.sweeper.params, or lines with a job", "neither")
+    label = label or ", ".join(f"{name}={{}}" for name in axes)
+    for values in () if jobs else product(*axes.values()):
+        job = dict(zip(axes, values, strict=True))
+        jobs[", ".join(values)] = {"label": label.format(*values), "job": job}
     _refuse_unknown(said, jobs)
-    lines = {}
-    for key, job in jobs.items():
-        job = {name: str(value) for name, value in job.items()}
-        of = {"label": labels[key], **said.get(key, {}), "job": job}
-        of.pop("published", None)
-        check_settings(Line, of, f"{where}.{key}.", ("published", "added"))
-        lines[key] = Line(**of)
-    return lines
+    return jobs
+
+
+def _figures(
+    published: Sequence[float | None], metrics: Sequence[str], where: str
+) -> dict[str, float]:
+    """The figures of a line by metric, from a list with None for those that are not there."""
+    if len(published) != len(metrics):
+        expected = f"{len(metrics)} figures, one for each of metrics"
+        raise unexpected(f"{where}.lines.published", expected, len(published))
+    pairs = zip(metrics, published, strict=True)
+    figures = {metric: figure for metric, figure in pairs if figure is not None}
+    return {**figures, "frame_ms": 1000 / figures["fps"]} if "fps" in figures else figures
 
 
 def _claim(declared: Mapping[str, Any], lines: Mapping[str, Line], where: str) -> Claim:
@@ -148,49 +156,6 @@ def _claim(declared: Mapping[str, Any], lines: Mapping[str, Line], where: str) -
     said = (key for _, key, _, _ in Formatter().parse(own.get("says", "")))
     _refuse_unknown([*keys, *filter(None, said)], lines)
     return Claim(lines=keys, alike="alike" in declared, **own)
-
-
-def _blocks(
-    declared: Mapping[str, Any],
-    lines: Mapping[str, Line],
-    beside: Sequence[str],
-    data_sets: Sequence[str],
-    where: str,
-) -> list[Block]:
-    """A block for each of `data_sets` that there are figures of, of the first with all lines."""
-    figures = {
-        str(key): _by_data_set(of["published"])
-        for key, of in declared.get("lines", {}).items()
-        if of and "published" in of
-    }
-    published_on = _by_data_set(declared.get("published_on", {}))
-    if figures and not published_on:
-        raise unexpected(f"{where}.published_on", "what `published` was measured on", "nothing")
-    blocks: list[Block] = []
-    for data_set in [name for name in data_sets if name in published_on] or [""]:
-        shown = {
-            key: replace(
-                lines[key],
-                published=_figures(figures.get(key, {}).get(data_set), declared["metrics"], where),
-            )
-            for key in (beside if blocks else lines)
-        }
-        blocks.append(Block(shown, data_set, published_on.get(data_set, "")))
-    return blocks
-
-
-def _figures(
-    published: Sequence[float | None] | None, metrics: Sequence[str], where: str
-) -> dict[str, float]:
-    """Figures in the order of `metrics` by metric; those that are not there are None."""
-    if published and len(published) != len(metrics):
-        expected = f"{len(metrics)} figures, one for each of metrics"
-        raise unexpected(f"{where}.lines.published", expected, len(published))
-    pairs = zip(metrics, published or (), strict=False)
-    figures = {metric: figure for metric, figure in pairs if figure is not None}
-    if "fps" in figures:
-        figures["frame_ms"] = 1000 / figures["fps"]
-    return figures
 
 
 def _by_data_set(declared: Any) -> Mapping[str, Any]:

@@ -67,9 +67,8 @@ def rows_with_cold(rows: pd.DataFrame) -> pd.DataFrame:
 
 def measured_of(table: PaperTable, runs: Mapping[str, Run]) -> dict[Place, Repeated]:
     """A run of each of these lines, by key, of the first block of `table`."""
-    data_set = table.blocks[0].data_set
     return {
-        Place(table.name, data_set, key): Repeated(table.lines[key].label, [run])
+        Place(table.name, table.data_sets[0], key): Repeated(table.lines[key].label, [run])
         for key, run in runs.items()
     }
 

@@ -9,21 +9,22 @@ import pandas as pd
 import pytest
 
 from reports import export
-from reports.paper_tables import Block, Line, PaperTable, Place
+from reports.paper_tables import Line, PaperTable, Place
 from reports.runs import Repeated, Run
 from tests.reports.conftest import changed, measured_of
 
 LINES = {
-    "t19": Line("T = 2^19", {"method": "a"}, {"psnr": 33.0}),
+    "t19": Line("T = 2^19", {"method": "a"}, {"First": {"psnr": 33.0}}),
     "k3": Line("K = 3", {"method": "b"}),
     "mine": Line("mine_1", {"method": "c"}),
-    "none": Line("not yet", {"method": "d"}, {"psnr": 30.0}),
+    "none": Line("not yet", {"method": "d"}, {"First": {"psnr": 30.0}}),
 }
 TABLE = PaperTable(
     name="table9",
     title="Quality & size",
     metrics=["psnr", "ssim", "size_bytes.total"],
-    blocks=[Block(LINES, "First", "Chair")],
+    lines=LINES,
+    data_sets=["First"],
     number=9,
 )
 
@@ -77,7 +78,7 @@ def test_a_metric_that_the_paper_lacks_is_written_as_on_our_pages(measured):
 
 
 def test_a_rule_stands_before_what_is_of_a_further_data_set(measured):
-    table = replace(TABLE, blocks=[*TABLE.blocks, Block({"k3": LINES["k3"]}, "Second")])
+    table = replace(TABLE, data_sets=["First", "Second"], beside=["k3"])
     of_first = measured[Place("table9", "First", "k3")]
     text = export.latex([table], {**measured, Place("table9", "Second", "k3"): of_first})
     first, second = text.split("\\midrule\n")[1:]

@@ -12,7 +12,7 @@ from reports import figures
 from reports.images import Picture
 from reports.outliers import Outlier
 from reports.paper_page import PAGE, _curves, write_paper_page
-from reports.paper_tables import CURVES, Block, Line, PaperTable, Place, point
+from reports.paper_tables import CURVES, Line, PaperTable, Place, point
 from reports.runs import Repeated, Run
 from sweeps.tables import chosen
 from tests.reports.conftest import TABLES, changed, measured_of, shifted
@@ -27,7 +27,7 @@ def test_every_line_that_is_shown_in_a_figure_is_one_of_the_tables():
     lines = {(table.name, key) for table in TABLES.values() for key in table.lines}
     shown = [entry["lines"] for entry in (*PAGE["plots"], *PAGE["images"]) if "lines" in entry]
     shown += [{"": plot["ceiling"]} for plot in PAGE["plots"] if "ceiling" in plot]
-    named = [(table, str(key)) for x in shown for table, *keys in x.values() for key in keys]
+    named = [(table, str(key)) for x in shown for table, key in x.values()]
     assert len(named) > len(shown) > 4
     assert {*named} <= lines
 
@@ -73,7 +73,7 @@ def test_a_method_has_one_mark_at_its_first_measured_line_and_an_added_one_too(
 def test_findings_come_first_all_comparisons_last(run, tmp_path):
     table, seeds = TABLES["table6"], range(3)
     measured = {
-        Place("table6", table.blocks[0].data_set, key): Repeated(
+        Place("table6", table.data_sets[0], key): Repeated(
             line.label,
             [shifted(run, 0.1 * place + 0.01 * seed * place, seed=seed) for seed in seeds],
         )
@@ -91,7 +91,7 @@ def test_findings_come_first_all_comparisons_last(run, tmp_path):
 
 def test_a_page_of_nothing_still_says_what_is_missing(tmp_path):
     lines = [Repeated("with joint training", [], ["not measured yet"])]
-    measured = {Place("table5", TABLES["table5"].blocks[0].data_set, "joint"): lines[0]}
+    measured = {Place("table5", TABLES["table5"].data_sets[0], "joint"): lines[0]}
     text = write_paper_page([*TABLES.values()], measured, [], tmp_path).read_text()
     assert "| with joint training: not measured yet | – (+1.07) |" in text
     assert "comparisons" not in text
@@ -100,7 +100,7 @@ def test_a_page_of_nothing_still_says_what_is_missing(tmp_path):
 
 
 def test_a_page_of_ones_own_table_has_its_title(run, tmp_path):
-    table = PaperTable("mine", "My table", ["psnr"], [Block({"a": Line("here", {})})])
+    table = PaperTable("mine", "My table", ["psnr"], {"a": Line("here", {})})
     text = write_paper_page([table], measured_of(table, {"a": run}), [], tmp_path).read_text()
     assert text.startswith("# My table\n")
     assert "paper" not in text
@@ -127,7 +127,7 @@ def on_curves(
     table: PaperTable, runs: Mapping[str, Mapping[float, Sequence[Run]]]
 ) -> dict[Place, Repeated]:
     """These runs of each line after each share of its training, in the order of the shares."""
-    data_set = table.blocks[0].data_set
+    data_set = table.data_sets[0]
     return {
         Place(table.name, data_set, key)
         if share == 1
@@ -145,13 +145,13 @@ def test_a_curve_has_a_point_for_every_measured_share(of_method, of_budget, run,
     trained = replace(run, record={**run.record, "budget": budget, "made_of": made_of})
     halves = {key: {0.5: [trained], 1.0: [trained]} for key in table.lines}
     halves["joint"][0.25] = [trained]
-    curves = list(_curves(table, on_curves(table, halves)))
+    curves = _curves(table, on_curves(table, halves))
     assert [(curve.label, list(curve.points)) for curve in curves] == [
         ("with joint training", [20, 40, 80]),
         ("without joint training", [40, 80]),
     ]
     ceiling = Repeated("field", [changed(run, {"psnr": 99.0})])
-    figures.quality_over_training(curves, ceiling, tmp_path / "curves.png")
+    figures.quality_over_training({"Table 5": curves}, ceiling, tmp_path / "curves.png")
     (axes,) = drawn[0].axes
     *lines, field, release = axes.lines
     assert set(field.get_ydata()) == {99.0}
@@ -173,8 +173,8 @@ def test_all_points_of_a_curve_are_of_the_same_seeds(run):
 def test_several_seeds_have_bars_on_a_curve_and_one_has_none(run, tmp_path, drawn):
     seeds = [shifted(run, by, seed=seed) for seed, by in enumerate((0.0, 1.0, 2.0))]
     points = {10.0: Repeated("a", seeds), 20.0: Repeated("b", [run])}
-    curve = figures.Curve("Table 9", "L = 2", points)
-    figures.quality_over_training([curve], None, tmp_path / "curves.png")
+    curves = {"Table 9": [figures.Curve("L = 2", points)]}
+    figures.quality_over_training(curves, None, tmp_path / "curves.png")
     (axes,) = drawn[0].axes
     low, high = axes.collections[0].get_segments()[0][:, 1]
     assert high - low == pytest.approx(2 * points[10.0].half("psnr"))

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import pytest
 
 from reports.claims import UNKNOWN, Claim
 from reports.paper_tables import (
-    Block,
     Line,
     Measured,
     PaperTable,
@@ -27,15 +25,17 @@ from tests.reports.conftest import TABLES, changed, elsewhere, measured_of
 
 FIRST, SECOND = "NeRF-Synthetic", "Tanks & Temples"
 LINES = {
-    "a": Line("here", {"method": "a"}, {"psnr": 31.0, "frame_ms": 9.98}),
-    "b": Line("elsewhere", {"method": "b"}, {"size_bytes.total": 5e6}),
+    "a": Line("here", {"method": "a"}, {FIRST: {"psnr": 31.0, "frame_ms": 9.98}}),
+    "b": Line("elsewhere", {"method": "b"}, {FIRST: {"size_bytes.total": 5e6}}),
 }
 METRICS = ["psnr", "frame_ms", "size_bytes.total", "stage_ms.other"]
 TABLE = PaperTable(
     "table9",
     "What is shown",
     METRICS,
-    [Block(LINES, FIRST, "Chair")],
+    LINES,
+    [FIRST],
+    {FIRST: "Chair", SECOND: "Barn"},
     number=9,
     notes=["Mind this."],
 )
@@ -48,26 +48,24 @@ def run(run: Run) -> Run:
     return changed(replace(run, rows=run.rows[run.rows["metric"].isin(figures)]), figures)
 
 
-def with_lines(lines: Mapping[str, Line], **others: object) -> PaperTable:
-    return replace(TABLE, blocks=[Block(lines, FIRST, "Chair")], **others)
-
-
 def block(table: PaperTable, measured: Measured) -> Shown:
     (only,) = table.shown(measured)
     return only
 
 
 def test_both_halves_make_claims_each_with_its_own_figures(run):
-    halves = [Block(LINES, FIRST, "Chair"), Block(LINES, SECOND, "Barn")]
-    for half, published in zip(halves, ((30.0, 31.0), (28.0, 28.5)), strict=True):
-        figures = zip(LINES.items(), published, strict=True)
-        lines = {key: replace(line, published={"psnr": x}) for (key, line), x in figures}
-        halves[halves.index(half)] = replace(half, lines=lines)
-    table = replace(TABLE, blocks=halves, claims=[Claim("psnr", ["a", "b"], 0.1)])
+    published = (
+        {FIRST: {"psnr": 30.0}, SECOND: {"psnr": 28.0}},
+        {FIRST: {"psnr": 31.0}, SECOND: {"psnr": 28.5}},
+    )
+    figures = zip(LINES.items(), published, strict=True)
+    lines = {key: replace(line, published=of) for (key, line), of in figures}
+    claims = [Claim("psnr", ["a", "b"], 0.1)]
+    table = replace(TABLE, lines=lines, data_sets=[FIRST, SECOND], claims=claims)
     measured = {
-        Place("table9", half.data_set, key): Repeated(line.label, [run])
-        for half in halves
-        for key, line in half.lines.items()
+        Place("table9", data_set, key): Repeated(line.label, [run])
+        for data_set in (FIRST, SECOND)
+        for key, line in lines.items()
     }
     found = comparisons(table, measured)
     assert [(x.table, x.data_set, x.smaller, x.larger) for x in found] == [
@@ -97,10 +95,11 @@ def test_what_stands_for_a_line_that_was_not_measured_has_its_figures_and_says_w
 
 
 def test_a_section_shows_each_block_and_distances_in_each(run, tmp_path):
-    lines = {"a": Line("here", {}, {"psnr": 31.0}), "b": Line("elsewhere", {}, {"psnr": 32.0})}
-    halves = [Block(lines, FIRST, "Chair"), Block(lines, SECOND, "Barn")]
-    table = replace(TABLE, blocks=halves)
-    measured = {Place("table9", x.data_set, "a"): Repeated("here", [run]) for x in halves}
+    published = ({x: {"psnr": psnr} for x in (FIRST, SECOND)} for psnr in (31.0, 32.0))
+    pairs = zip(LINES.items(), published, strict=True)
+    lines = {key: Line(line.label, {}, of) for (key, line), of in pairs}
+    table = replace(TABLE, lines=lines, data_sets=[FIRST, SECOND])
+    measured = {Place("table9", x, "a"): Repeated("here", [run]) for x in (FIRST, SECOND)}
     first, second = markdown(section(table, measured), tmp_path).split(f"### {SECOND}")
     for text, where in ((first, "Chair"), (second, "Barn")):
         assert f"Paper: {where}." in text
@@ -116,7 +115,7 @@ def test_a_section_shows_each_block_and_distances_in_each(run, tmp_path):
 
 def test_a_table_without_published_figures_shows_what_was_measured(run, tmp_path):
     lines = {key: Line(line.label, {}) for key, line in LINES.items()}
-    table = PaperTable("mine", "My table", METRICS, [Block(lines)])
+    table = PaperTable("mine", "My table", METRICS, lines)
     measured = {Place("mine", "", "a"): Repeated("here", [run])}
     text = markdown(section(table, measured), tmp_path)
     assert text.startswith("## My table")
@@ -133,7 +132,8 @@ def test_a_cell_has_the_distance_to_the_reference_here_and_in_the_paper(run):
         for key, each in (("a", run), ("b", other))
     }
     published = {"psnr": 30.0, "frame_ms": 1.2 * 9.98, "size_bytes.total": 5e6}
-    table = with_lines({**LINES, "b": replace(LINES["b"], published=published)}, reference="a")
+    lines = {**LINES, "b": replace(LINES["b"], published={FIRST: published})}
+    table = replace(TABLE, lines=lines, reference="a")
     first, line = distance_table(block(table, measured)).lines
     assert first == ("here", "30.46", "12.0", "8.00")
     assert line == ("elsewhere", "-1.46 (-1.00)", "×0.50 (×1.20)", "×1.00")
@@ -155,23 +155,13 @@ def test_a_cell_of_figures_is_measured_or_absent(run):
     assert shown.lines[1] == ("elsewhere", *[ABSENT] * 4)
 
 
-def test_the_second_of_two_has_no_mark_beside_two_of_another_machine(run):
-    table = with_lines({name: Line(name, {"method": name}) for name in "abcd"})
-    runs = {name: changed(run, {"psnr": psnr}) for psnr, name in enumerate("abcd", 1)}
-    runs |= {name: elsewhere(runs[name]) for name in "cd"}
+def test_the_best_is_bold_and_the_second_of_three_italic_on_each_machine(run):
+    table = replace(TABLE, lines={name: Line(name, {"method": name}) for name in "abcde"})
+    runs = {name: changed(run, {"psnr": psnr}) for psnr, name in enumerate("abcde", 1)}
+    runs |= {name: elsewhere(runs[name]) for name in "cde"}
     shown = figure_table(block(table, measured_of(table, runs)))
-    assert [line[1] for line in shown.lines] == ["1.00", "**2.00**", "3.00", "**4.00**"]
-
-
-def test_the_best_is_bold_and_the_second_of_three_italic(run):
-    table = with_lines({name: Line(name, {"method": name}) for name in "abc"})
-    psnr = {"a": 1.0, "b": 3.0, "c": 2.0}
-    runs = {name: changed(run, {"psnr": value}) for name, value in psnr.items()}
-    cells = [line[1] for line in figure_table(block(table, measured_of(table, runs))).lines]
-    assert cells == ["1.00", "**3.00**", "*2.00*"]
-    runs.pop("c")
-    two = figure_table(block(table, measured_of(table, runs)))
-    assert [line[1] for line in two.lines] == ["1.00", "**3.00**", ABSENT]
+    cells = [line[1] for line in shown.lines]
+    assert cells == ["1.00", "**2.00**", "3.00", "*4.00*", "**5.00**"]
 
 
 def test_a_section_says_on_what_and_what_to_mind(run, tmp_path):

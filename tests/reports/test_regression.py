@@ -133,10 +133,10 @@ def test_a_baseline_can_have_limits_of_its_own():
 def test_frames_are_those_that_the_headline_is_the_mean_of(run):
     missing = [math.nan] * (len(run.frames) - 2)
     scored = {"psnr": [30.0, 30.0, *missing], "ssim": [0.9, math.nan, *missing]}
-    table = run.frames.assign(**scored, peak_bytes=1.0)
+    table = run.frames.assign(**scored)
     figures = Figures.of(replace(run, read_frames=lambda: table))
     assert len(figures.frames["psnr"]) == 2  # the others have no truth
     assert len(figures.frames["ssim"]) == 1  # like LPIPS, which may be left out of a frame
     assert list(figures.frames["frame_ms"].values()) == table["frame_ms"].tolist()
     assert "peak_bytes" in figures.values
-    assert "peak_bytes" not in figures.frames  # its headline was the largest of older runs
+    assert "peak_bytes" not in figures.frames

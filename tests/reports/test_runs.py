@@ -10,7 +10,7 @@ import pytest
 
 from bench.results import COLD, STEADY
 from bench.rows import phase_rows
-from reports.paper_tables import Block, Line, PaperTable, Place, section
+from reports.paper_tables import Line, PaperTable, Place, section
 from reports.publish import markdown
 from reports.runs import Repeated, Run, over_common_frames, over_scenes
 from tests.reports.conftest import elsewhere, of_scene, run_of
@@ -103,7 +103,7 @@ def test_other_scenes_and_other_machines_are_other_conditions(run):
 
 @pytest.mark.parametrize("scenes", ["ab", "a"])
 def test_each_scene_has_its_line_where_there_are_several(run, scenes, tmp_path):
-    table = PaperTable("table9", "t", ["psnr"], [Block({"x": Line("x", {})})], scenes=["psnr"])
+    table = PaperTable("table9", "t", ["psnr"], {"x": Line("x", {})}, scenes=["psnr"])
     by_scene = {name: [of_scene(run, name, place)] for place, name in enumerate(scenes)}
     mean = over_scenes([of_one for (of_one,) in by_scene.values()])
     measured = {Place("table9", "", "x"): Repeated("x", [mean], by_scene=by_scene)}

@@ -209,7 +209,7 @@ def test_a_scene_is_compared_with_the_figures_of_its_data_set(monkeypatch):
     first, second = of_block.values()
     assert {scene for scene, _ in first} == {"totem"}
     assert {scene for scene, _ in second} == {"wires"}
-    assert {line for _, line in second} == set(tables["table1"].blocks[1].lines)
+    assert {line for _, line in second} == set(tables["table1"].beside)
     assert len(second) == 4
     assert {job.scene for job in plan(replace(tables["table5"], curve=False), words)} == {"totem"}
 
