@@ -134,7 +134,7 @@ def accuracy(found: Sequence[Measured]) -> list[Part]:
         plot = partial(frontier_plot, list(map(_point, rated)))
         shows = f"{method}: error of a frame against its time, one point a setting"
         parts.append(_accuracy_table(method, rated))
-        if any(math.isfinite(line.figure("psnr")) for line in rated):
+        if sum(math.isfinite(line.figure("psnr")) for line in rated) > 1:
             parts.append(Picture(f"frontier-{method}", shows, plot))
     return parts
 

@@ -82,7 +82,7 @@ def load(
         downscale=downscale,
         background=background,
         bounds=bounds,
-        name=_title(**settings),
+        name=_title(name, **checked),
         log=log,
     )
 
