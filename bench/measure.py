@@ -119,7 +119,7 @@ class _Take:
         scene = task.scene
         self.scoring = Scoring(task.protocol, lpips, scene.background, shown, scene.surface)
         self.rows: list[dict[str, Any]] = []  # of the first round
-        self.apart: list[Apart] = []  # of its steady frames with a ground truth
+        self.apart: list[ToFirst] = []  # of its steady frames with a ground truth
         self.waits: list[dict[Line, int]] = []  # of its steady frames, if the protocol counts them
 
     def metered(self, *, warm: bool = False) -> AbstractContextManager[object]:
@@ -171,14 +171,14 @@ class _Take:
 
 
 @dataclass(frozen=True)
-class Apart:
+class ToFirst:
     """How far a picture is from that of the first method measured in turns, rounded alike."""
 
     mse: float
     worst: float  # largest difference of any channel, on a scale of 1
 
     @classmethod
-    def of(cls, picture: Tensor, first: Tensor) -> Apart:
+    def of(cls, picture: Tensor, first: Tensor) -> ToFirst:
         """Both [H, W, 3]."""
         difference = picture.double() - first.double()
         return cls(difference.square().mean().item(), difference.abs().max().item())
@@ -241,7 +241,7 @@ def _of_rounds(means: Sequence[float]) -> list[dict[str, Any]]:
     return [single("frame_ms.fastest", min(means)), single("frame_ms.slowest", max(means))]
 
 
-def _of_first(apart: Sequence[Apart]) -> list[dict[str, Any]]:
+def _of_first(apart: Sequence[ToFirst]) -> list[dict[str, Any]]:
     """Rows of how far the pictures are from those of the first method in turns: the PSNR from the
     MSE over all frames, inf if they are equal, and the largest difference of a channel."""
     if not apart:
@@ -335,7 +335,7 @@ def _draw(take: _Take, task: Task, index: int, first: Tensor | None, *, scored: 
     if protocol.compared and phase == STEADY and step.truth is not None:
         shown = protocol.rounded(frame.rgb).cpu()
         take.apart.append(
-            Apart.of(shown, shown if first is None else protocol.rounded(first).cpu())
+            ToFirst.of(shown, shown if first is None else protocol.rounded(first).cpu())
         )
     scores = take.scoring.score(
         index,

@@ -17,10 +17,12 @@ MAY_IMPORT = {
     "sweeps": {"bench", "reports", "sweeps"},
 }
 REACHES = {
-    "sweeps/commands/accuracy.py": "methods.checks",
+    "sweeps/commands/compile.py": "methods.checks",
+    "sweeps/commands/experiments.py": "methods.checks",
     "sweeps/commands/kernels.py": ("methods.checks", "methods.kernels."),
     "sweeps/commands/list.py": "methods.kernels.",
     "sweeps/commands/stress.py": "methods.checks",
+    "sweeps/commands/worth.py": "methods.kernels.",
 }
 """What measures and lists parts of methods reaches them directly; methods only through
 `_target_`."""

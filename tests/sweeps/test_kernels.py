@@ -13,7 +13,7 @@ from bench.case import Case
 from bench.errors import Unavailable
 from bench.types import Log
 from reports.tables import Table
-from sweeps.commands.kernels import wrong_of
+from sweeps.commands.compile import wrong_of
 from sweeps.processes import lock_file
 
 RIGHT = {
@@ -76,7 +76,7 @@ def test_a_fast_version_has_a_line_with_the_time_of_its_reference(steerbench, as
     [
         ("kernels --filter x", "no kernel has 'x' in its name"),
         ("stress --filter x", "no subject or case has 'x' in it"),
-        ("kernels scene=wires", "settings: expected none without --worth, got scene=wires"),
+        ("experiments scene=wires", "unrecognized arguments: scene=wires"),
     ],
 )
 def test_a_filter_or_a_setting_that_fits_nothing_is_an_error(steerbench, asked, argv, said):
@@ -86,14 +86,14 @@ def test_a_filter_or_a_setting_that_fits_nothing_is_an_error(steerbench, asked, 
 def test_what_a_kernel_brings_has_a_line_for_each_that_a_method_calls(steerbench, tmp_path):
     small = ("scene.width=16", "scene.train=4", "scene.test=2", "budget.steps=2")
     few = ("budget.samples=64", "budget.frames=2", "--repeats", "1", f"outputs={tmp_path}")
-    found = steerbench("kernels", "--worth", "method=ngp", *small, *few).ok().json
+    found = steerbench("worth", "method=ngp", *small, *few).ok().json
     rows = {row["kernel"]: row for row in found}
     assert set(rows) == {"adam", "composite", "encode", "march", "mlp", "spherical"}
     assert rows["adam"]["frame_ms_reference"] is None  # it is called in training alone
     for row in rows.values():
         assert row["method"] == "ngp"
         assert min(row["frame_ms"], row["training_s"], row["training_s_reference"]) > 0
-    outcome = steerbench("kernels", "--worth", "--filter", "ada", "method=ngp", *small, *few)
+    outcome = steerbench("worth", "--filter", "ada", "method=ngp", *small, *few)
     assert [row["kernel"] for row in outcome.json] == ["adam"]
     assert rows["march"]["frame_ms_reference"] > 0
 
@@ -105,8 +105,8 @@ def test_methods_that_need_a_setting_are_left_out_unless_named(steerbench, monke
         asked.append(next(word for word in words if word.startswith("method=")))
         return []
 
-    monkeypatch.setattr("sweeps.commands.kernels._rows_of_worth", rows)
-    steerbench("kernels", "--worth")
+    monkeypatch.setattr("sweeps.commands.worth._of_method", rows)
+    steerbench("worth")
     assert {"method=ngp", "method=steernerf", "method=nsvf"} <= {*asked}
     assert "method=external" not in asked
 

@@ -1,0 +1,42 @@
+"""`steerbench compile`: compile all kernels for this CPU now, not when they are first called.
+
+A kernel is compiled by computing its cases, which covers all types of inputs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+from concurrent.futures import as_completed
+from pathlib import Path
+
+from bench.case import failed
+from bench.console import ConsoleLog
+from methods import checks
+from sweeps.processes import processes
+
+
+def main(options: argparse.Namespace) -> int:
+    """Compile the kernels for this CPU, on all cores; return 1 if one of them is wrong."""
+    names = checks.modules("cases")
+    with (
+        processes(len(os.sched_getaffinity(0))) as pool,
+        ConsoleLog(Path()).progress("compiling kernels", len(names)) as bar,
+    ):
+        wrong = []
+        for ended in as_completed([pool.submit(wrong_of, name) for name in names]):
+            wrong += ended.result()
+            bar.advance()
+    for case in sorted(wrong):
+        print(f"wrong on this machine: {case}; see `steerbench kernels`", file=sys.stderr)
+    return int(bool(wrong))
+
+
+def wrong_of(module: str) -> list[str]:
+    """Compute each quick case of `module` with compiled kernels; return the names of wrong ones."""
+    quick = [case for case in importlib.import_module(module).cases() if case.quick]
+    cells = [(case, cell) for case in quick for cell in case.tolerances if cell[0] == "cpu"]
+    rows = [case.check(cell, "cpu") for case, cell in cells]
+    return [f"{row['subject']}: {row['case']}" for row in rows if failed(row)]
