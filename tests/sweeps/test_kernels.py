@@ -76,7 +76,7 @@ def test_a_fast_version_has_a_line_with_the_time_of_its_reference(steerbench, as
     [
         ("kernels --filter x", "no kernel has 'x' in its name"),
         ("stress --filter x", "no subject or case has 'x' in it"),
-        ("experiments scene=wires", "unrecognized arguments: scene=wires"),
+        ("experiments scene=wires", "unknown argument 'scene=wires'"),
     ],
 )
 def test_a_filter_or_a_setting_that_fits_nothing_is_an_error(steerbench, asked, argv, said):
