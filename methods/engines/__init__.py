@@ -10,7 +10,6 @@ import importlib
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from copy import deepcopy
 from pathlib import Path
 from types import ModuleType
 from typing import ClassVar, Literal
@@ -127,13 +126,6 @@ def keep(path: Path, write: Callable[[Path], None], log: Log) -> None:
             parts = Path(place).glob(f"{path.stem}.*")
             for part in sorted(parts, key=lambda part: part.name == path.name):  # `path` comes last
                 part.replace(path.parent / part.name)
-
-
-def readable(network: Network) -> Network:
-    """A copy of `network` in plain torch, which converters of engines can trace."""
-    copy = deepcopy(network)
-    copy.backend = "reference"
-    return copy
 
 
 def largest(maker: str | None) -> float:

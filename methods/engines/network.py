@@ -31,8 +31,6 @@ class Network(nn.Module, ABC):
     Of an input, only C is always the same.
     """
 
-    backend = "auto"  # of its kernels; engines convert it with "reference", which is plain torch
-
     @abstractmethod
     def products(self, *inputs: Tensor) -> int:
         """Number of multiplications by weights for `inputs`."""

@@ -7,6 +7,7 @@ import logging
 import sys
 import warnings
 from collections.abc import Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +79,7 @@ class OpenVino(Engine):
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # from the tracer, and about argument checks
             model = self._openvino.convert_model(
-                engines.readable(network),
+                deepcopy(network),
                 example_input=samples[0],
                 input=shapes,
                 extension=[self._pixel_shuffle()],

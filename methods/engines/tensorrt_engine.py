@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from copy import deepcopy
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -70,7 +71,7 @@ class TensorRt(Engine):
 
         def write(path: Path) -> None:
             seen = [tuple(x.cpu() for x in inputs) for inputs in samples()]
-            plain: nn.Module = engines.readable(network).cpu()
+            plain: nn.Module = deepcopy(network).cpu()
             if self.precision == "fp16":
                 plain = _Halved(plain)
             exact = path if self.precision != "int8" else path.with_name("exported.onnx")
