@@ -18,13 +18,13 @@ from torch import Tensor
 from bench.cameras import cast, pixel_grid
 from bench.measure import Task, measure
 from bench.metrics import as_bytes, flicker, psnr
-from bench.protocol import EvaluationProtocol
 from bench.scenes import embedded
 from bench.scoring import Scoring
 from bench.trajectories import from_split
 from bench.types import Budget, Camera, SteerbenchError, Unavailable, composite
 from bench.video_metrics import View, flip, jod, tlpips, tpsnr, warping_error
 from tests.bench.test_metrics import noise, waves
+from tests.conftest import QUICK
 
 ROOT = Path(__file__).parents[2]
 WHITE = torch.ones(3)
@@ -59,7 +59,7 @@ def test_tlpips_is_the_difference_of_the_distances_from_frame_to_frame():
 
     expected = abs(lpips(before, now) - lpips(true_before, true))
     assert tlpips(lpips, now, true, before, true_before) == expected > 0
-    protocol = EvaluationProtocol(name="path", lpips=("alex",), columns=("tlpips",))
+    protocol = replace(QUICK, name="path", lpips=("alex",), columns=("tlpips",))
     scoring = Scoring(protocol, {"alex": lpips}, WHITE, ())
     pairs = ((before, as_bytes(true_before)), (now, as_bytes(true)))
     found = [
@@ -99,7 +99,7 @@ def test_the_jod_is_what_its_own_program_prints(tmp_path):
 
 @has("pycvvdp", "cvvdp")
 def test_a_display_that_nobody_sells_is_refused():
-    protocol = EvaluationProtocol(name="mine", columns=("jod",), lpips=(), display="oled_9000")
+    protocol = replace(QUICK, name="mine", columns=("jod",), display="oled_9000")
     with pytest.raises(SteerbenchError, match=r"protocol\.display: expected .* got 'oled_9000'"):
         protocol.load_lpips(None, None)
 
@@ -112,7 +112,7 @@ def test_a_package_that_is_missing_is_named_before_anything_is_measured(
     monkeypatch, column, package, extra
 ):
     monkeypatch.setitem(sys.modules, package, None)
-    protocol = EvaluationProtocol(name="mine", columns=(column,), lpips=())
+    protocol = replace(QUICK, name="mine", columns=(column,))
     with pytest.raises(Unavailable, match=rf"{column} needs {package}: pip install .*\[{extra}\]"):
         protocol.load_lpips(None, None)
 
@@ -174,7 +174,7 @@ def test_exact_flow_follows_the_true_pictures_of_a_path(tmp_path, quiet_log):
     assert warping_error(now, view, then, earlier) < 0.1 * still
 
 
-PATH = EvaluationProtocol(name="path", lpips=(), columns=("tpsnr", "warp"))
+PATH = replace(QUICK, name="path", columns=("tpsnr", "warp"))
 
 
 def film(protocol, surface=None, cut: int | None = None, depth: bool = True) -> list[dict]:
