@@ -39,7 +39,7 @@ U16 = 2.0**-8
 to neighbours."""
 
 
-class Apart(NamedTuple):
+class Deviation(NamedTuple):
     """An error, and the largest one that is allowed there."""
 
     error: float
@@ -56,7 +56,7 @@ class Case:
     derivation: str  # where the tolerances come from
     tolerances: Mapping[Cell, float | None]  # the largest allowed errors; None: `error` says it
     # The largest error, given backend, device and precision; Unavailable if there are none such.
-    error: Callable[[str, str, str], float | Apart]
+    error: Callable[[str, str, str], float | Deviation]
     timed: int | None = None  # samples, rays or entries a call; None: too few to time
     slow: bool = False  # takes more than a moment, so the tests skip it
 
@@ -71,7 +71,7 @@ class Case:
         error, tolerance = math.inf, self.tolerances[cell]
         try:
             found = self.error(backend, device, precision)
-            error, tolerance = found if isinstance(found, Apart) else (found, tolerance)
+            error, tolerance = found if isinstance(found, Deviation) else (found, tolerance)
             assert tolerance is not None
             status = "ok" if error <= tolerance else "failed"
         except Unavailable as reason:
@@ -115,9 +115,9 @@ class Difference:
     prepare: Prepare
     tolerances: Callable[[], Sequence[Tolerance]]
 
-    def __call__(self, backend: str, device: str, precision: str) -> Apart:
+    def __call__(self, backend: str, device: str, precision: str) -> Deviation:
         if (backend, device) == ("reference", "cpu"):
-            return Apart(0.0, 0.0)
+            return Deviation(0.0, 0.0)
         got = tuple(result.cpu() for result in self.prepare(device)(backend))
         return nearest(got, self.prepare("cpu")("reference"), self.tolerances())
 
@@ -245,10 +245,10 @@ def on_backends(
 
 def nearest(
     results: Sequence[Tensor], reference: Sequence[Tensor], tolerances: Sequence[Tolerance]
-) -> Apart:
+) -> Deviation:
     """The error of that number of all results which is nearest to its tolerance, or exceeds it by
     the largest factor; inf if shapes or non-finite values differ."""
-    worst, nearness = Apart(0.0, 0.0), -1.0
+    worst, nearness = Deviation(0.0, 0.0), -1.0
     for got, want, allowed in zip(results, reference, tolerances, strict=True):
         error = _errors(got, want)
         if not error.numel():
@@ -258,7 +258,7 @@ def nearest(
         share = torch.where(error > 0, error / tolerance, 0)
         at = int(share.argmax())
         if share[at] > nearness:
-            nearness, worst = share[at].item(), Apart(error[at].item(), tolerance[at].item())
+            nearness, worst = share[at].item(), Deviation(error[at].item(), tolerance[at].item())
     return worst
 
 

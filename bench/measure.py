@@ -32,7 +32,7 @@ from bench.scoring import ERROR_RANGE, PICTURES, Scoring, check_frame
 from bench.study import study_of
 from bench.trajectories import Trajectory, spread
 from bench.types import Budget, Log, Method, Scene
-from bench.waits import Line, device_waits
+from bench.waits import CodeLine, device_waits
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class _Take:
         self.scoring = Scoring(task.protocol, lpips, scene.background, shown, scene.surface)
         self.rows: list[dict[str, Any]] = []  # of the first round
         self.apart: list[ToFirst] = []  # of its steady frames with a ground truth
-        self.waits: list[dict[Line, int]] = []  # of its steady frames, if the protocol counts them
+        self.waits: list[dict[CodeLine, int]] = []  # of steady frames, if the protocol counts them
 
     def metered(self, *, warm: bool = False) -> AbstractContextManager[object]:
         """The meter, around a frame whose memory counts; around others, nothing.
@@ -251,9 +251,9 @@ def _of_first(apart: Sequence[ToFirst]) -> list[dict[str, Any]]:
     return [single("psnr_to_first", psnr_of_mse(mse)), single("worst_to_first", worst)]
 
 
-def _waits(of_frames: Sequence[Mapping[Line, int]]) -> list[dict[str, Any]]:
+def _waits(of_frames: Sequence[Mapping[CodeLine, int]]) -> list[dict[str, Any]]:
     """Where the host waits for the GPU in a steady frame, the most frequent first."""
-    total: dict[Line, int] = {}
+    total: dict[CodeLine, int] = {}
     for frame in of_frames:
         for line, count in frame.items():
             total[line] = total.get(line, 0) + count

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -15,14 +15,7 @@ from bench import metrics, video_metrics
 from bench.errors import unexpected
 from bench.provenance import sha256
 from bench.trajectories import Trajectory
-from bench.types import (
-    BACKGROUNDS,
-    Log,
-    Scene,
-    SteerbenchError,
-    Unavailable,
-    composite,
-)
+from bench.types import BACKGROUNDS, Log, Scene, SteerbenchError, Unavailable, composite
 from bench.waits import device_waits
 from bench.weights import locate
 
@@ -34,29 +27,29 @@ COLUMNS = ("flip", *video_metrics.NEEDS)  # further metrics that a protocol can 
 
 @dataclass(frozen=True)
 class EvaluationProtocol:
-    """How pictures are scored and how frames are timed; the defaults are `steerbench-1`.
+    """How pictures are scored and how frames are timed.
 
-    A protocol that differs from the defaults needs a name of its own, so that its rows are never
-    mixed with those of another. The flicker needs true pictures of consecutive frames:
-    those with a ground truth have one ("split"), or the scene renders it for the other frames
-    ("exact"), which takes about half a second at 400 x 400. So do the further `columns`. Of several
-    `rounds`, the first is scored, and the others give times and work. Methods that are measured in
-    turns may be `compared`, picture by picture, with the first of them.
+    Its name is in every row, so that rows of two protocols are never mixed. The flicker needs true
+    pictures of consecutive frames: those with a ground truth have one ("split"), or the scene
+    renders it for the other frames ("exact"), which takes about half a second at 400 x 400. So do
+    the further `columns`. Of several `rounds`, the first is scored, and the others give times and
+    work. Methods that are measured in turns may be `compared`, picture by picture, with the first
+    of them.
     """
 
-    name: str = "steerbench-1"
-    lpips: tuple[str, ...] = ("alex", "vgg")  # backbones, each with a metric `lpips_<net>`
-    lpips_every: int = 1  # scored frames of which the last one has them; they take most time
-    background: str = "white"  # onto which pictures with an opacity channel are composited
-    warmup: int = 3  # frames before the timed sequence, spread over the trajectory
-    flicker: str = "split"
-    stages: bool = True  # whether to time the stages of a frame: a GPU is waited for at each
-    rounds: int = 1  # through the trajectory
-    compared: bool = False  # with the first in turns: `psnr_to_first`, `worst_to_first`
-    waits: bool = False  # whether to note where the host waits for a GPU
-    columns: tuple[str, ...] = ()  # further metrics, of `COLUMNS`
-    fps: float = 30.0  # frames a second at which the path is seen, for the JOD
-    display: str = "standard_4k"  # on which it is seen, a name of `cvvdp`
+    name: str
+    lpips: tuple[str, ...]  # backbones, each with a metric `lpips_<net>`
+    lpips_every: int  # scored frames of which the last one has them; they take most time
+    background: str  # onto which pictures with an opacity channel are composited
+    warmup: int  # frames before the timed sequence, spread over the trajectory
+    flicker: str
+    stages: bool  # whether to time the stages of a frame: a GPU is waited for at each
+    rounds: int  # through the trajectory
+    compared: bool  # with the first in turns: `psnr_to_first`, `worst_to_first`
+    waits: bool  # whether to note where the host waits for a GPU
+    columns: tuple[str, ...]  # further metrics, of `COLUMNS`
+    fps: float  # frames a second at which the path is seen, for the JOD
+    display: str  # on which it is seen, a name of `cvvdp`
 
     def __post_init__(self) -> None:
         for option in ("lpips", "columns"):  # a list, when read from YAML
@@ -72,13 +65,6 @@ class EvaluationProtocol:
             raise unexpected("protocol.columns", f"some of {', '.join(COLUMNS)}", [*self.columns])
         if not 0 < self.fps < math.inf:
             raise unexpected("protocol.fps", "more than 0", self.fps)
-        default = {field.name: field.default for field in fields(self)}
-        changed = [key for key, value in default.items() if getattr(self, key) != value]
-        if changed and self.name == default["name"]:
-            raise SteerbenchError(
-                f"protocol.{changed[0]} differs from what {self.name} says: give the changed "
-                "protocol a name of its own (protocol.name=...)"
-            )
 
     @property
     def metric_names(self) -> tuple[str, ...]:

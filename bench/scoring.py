@@ -80,7 +80,7 @@ class Scoring:
         view = None
         if camera is not None and self.path.warps:
             depth = depth if self._surface is None else self._surface(camera)
-            view = None if depth is None else video_metrics.View(camera, depth.cpu())
+            view = None if depth is None else video_metrics.DepthView(camera, depth.cpu())
         # On a GPU these would count as memory of the method.
         kept = self._protocol.rounded(rgb).cpu(), None if true is None else true.cpu()
         return figures | self.path.add(video_metrics.Shot(*kept, view), cut, rgb.device)

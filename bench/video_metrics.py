@@ -89,14 +89,16 @@ def tlpips(
     return abs(lpips(previous_image, image) - lpips(previous_reference, reference))
 
 
-class View(NamedTuple):
+class DepthView(NamedTuple):
     """Where a frame was seen from, and the z-depth [H, W] of what it shows, +inf where empty."""
 
     camera: Camera
     depth: Tensor
 
 
-def warping_error(image: Tensor, view: View, earlier_image: Tensor, earlier: View) -> float:
+def warping_error(
+    image: Tensor, view: DepthView, earlier_image: Tensor, earlier: DepthView
+) -> float:
     """Mean squared error of `image` and the earlier one, warped to it: E_warp of Lai et al. 2018.
 
     The depths give the flow of a still scene, and what was hidden: a pixel counts if all four
@@ -157,7 +159,7 @@ class Shot(NamedTuple):
 
     image: Tensor
     truth: Tensor | None
-    view: View | None
+    view: DepthView | None
 
 
 class PathScoring:

@@ -20,7 +20,7 @@ TORCH = str(Path(torch.__file__).parent)
 ROOT = f"{Path(__file__).parent.parent}/"
 
 
-class Line(NamedTuple):
+class CodeLine(NamedTuple):
     path: str
     number: int
 
@@ -35,7 +35,7 @@ class Line(NamedTuple):
 
 
 @contextmanager
-def device_waits() -> Iterator[Counter[Line]]:
+def device_waits() -> Iterator[Counter[CodeLine]]:
     """Count how often the host waits for the GPU inside the context, by the line that caused it.
 
     Torch reports the waits (`torch.cuda.set_sync_debug_mode`), except explicit synchronisation as
@@ -43,13 +43,13 @@ def device_waits() -> Iterator[Counter[Line]]:
     """
     if not torch.cuda.is_available():
         raise Unavailable("to count how often the host waits for the device, a GPU is needed")
-    waits: Counter[Line] = Counter()
+    waits: Counter[CodeLine] = Counter()
 
     def note(message, category, filename, lineno, file=None, line=None):
         if "synchronizing CUDA operation" in str(message):
             # The innermost line outside torch, from the line outwards that the warning names.
-            warned = Line(filename, lineno)
-            lines = (Line(f.f_code.co_filename, n) for f, n in traceback.walk_stack(None))
+            warned = CodeLine(filename, lineno)
+            lines = (CodeLine(f.f_code.co_filename, n) for f, n in traceback.walk_stack(None))
             outwards = dropwhile(lambda line: line != warned, lines)
             waits[next((x for x in outwards if not x.path.startswith(TORCH)), warned)] += 1
         else:

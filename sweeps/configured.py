@@ -21,13 +21,16 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable, unexpected, unknown
+from bench.protocol import EvaluationProtocol
 from bench.scenes.assemble import hold_out
 from bench.types import DEVICE, Log, Method, Scene
 from reports.trackers import tracker
-from sweeps.overrides import VALIDATION, target_of
+from sweeps.overrides import CONFIGS, VALIDATION, target_of
 
 STANDS_FOR = {"Path": str, "tuple": list, "Sequence": list, "Mapping": dict, "float": float | int}
 """By the name of a type in a signature: the type that a configuration holds instead."""
+
+STANDARD = "steerbench-1"  # the protocol of a run, if no other is asked for
 
 USUAL_THREADS = torch.get_num_threads()  # number of threads that torch uses by default
 
@@ -86,6 +89,19 @@ def trained(config: DictConfig, log: Log) -> Method:
     method, budget = (build(config, name) for name in ("method", "budget"))
     method.fit(scene_of(config), budget, log)
     return method
+
+
+def protocol_of(config: DictConfig) -> EvaluationProtocol:
+    """The protocol that `config` describes; raises if it is called like the standard one, but
+    differs from it."""
+    node, standard = config.protocol, OmegaConf.load(CONFIGS / "protocol" / f"{STANDARD}.yaml")
+    changed = [name for name, value in standard.items() if node.get(name) != value]
+    if changed and node.get("name") == STANDARD:
+        raise SteerbenchError(
+            f"protocol.{changed[0]} differs from what {STANDARD} says: give the changed protocol a "
+            "name of its own (protocol.name=...)"
+        )
+    return build(config, "protocol")
 
 
 def scene_of(config: DictConfig) -> Scene:

@@ -25,7 +25,14 @@ from bench.trajectories import resized
 from bench.types import Log, Method
 from reports.runs import Run, load_runs, readable
 from reports.trackers import tracker
-from sweeps.configured import build, checked_settings, scene_digest, scene_folder, scene_of
+from sweeps.configured import (
+    build,
+    checked_settings,
+    protocol_of,
+    scene_digest,
+    scene_folder,
+    scene_of,
+)
 from sweeps.overrides import target_of
 from sweeps.processes import device_lock
 
@@ -209,7 +216,8 @@ def _needed(job: Job, jobs: Sequence[Job]) -> bool:
 def _prepared(job: Job, log: Log) -> _Ready:
     config, settings = job.config, checked_settings(job.config)
     torch.manual_seed(settings.seed)
-    method, budget, protocol = (build(config, name) for name in ("method", "budget", "protocol"))
+    method, budget = (build(config, name) for name in ("method", "budget"))
+    protocol = protocol_of(config)
     scene = scene_of(config)
     trajectory = build(config, "trajectory", scene)
     if settings.frame_size:

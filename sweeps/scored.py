@@ -19,7 +19,7 @@ from bench.provenance import digest, libraries
 from bench.results import REPORTED, Store
 from bench.types import Camera
 from reports.runs import Run, load_runs
-from sweeps.configured import build, checked_settings, scene_of
+from sweeps.configured import checked_settings, protocol_of, scene_of
 from sweeps.measurement import send
 from sweeps.overrides import composed
 
@@ -49,7 +49,7 @@ def score(
     if config.report:
         raise SteerbenchError("report: a page compares times, which given pictures do not have")
     log, store = ConsoleLog(Path(plain.outputs)), Store(Path(plain.outputs))
-    protocol: EvaluationProtocol = build(config, "protocol")
+    protocol = protocol_of(config)
     weights = Path(plain.weights_dir) if plain.weights_dir else None
     surface = None
     if truth is None:

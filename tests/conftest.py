@@ -20,6 +20,8 @@ import pytest
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
 from torch import Tensor
 
 from bench import neighbours
@@ -27,13 +29,16 @@ from bench.console import ConsoleLog
 from bench.measure import Task, measure
 from bench.metrics import _lpips_package
 from bench.nerfbaselines import VERSION
-from bench.protocol import EvaluationProtocol
 from bench.results import Store
 from bench.trajectories import from_split
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene, Split, composite
 from bench.weights import BACKBONES
+from sweeps.overrides import CONFIGS
 from tests.pretended_gpu import PretendedGpu, pretended_gpu
 from tests.web import Web, served
+
+STEERBENCH_1 = instantiate(OmegaConf.load(CONFIGS / "protocol" / "steerbench-1.yaml"))
+QUICK = replace(STEERBENCH_1, name="quick", lpips=())  # without weights, which a test may lack
 
 hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True)
 hypothesis.settings.register_profile("fuzz", max_examples=10_000, deadline=5000)  # ms; no hang
@@ -250,9 +255,8 @@ def nerfbaselines(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.fixture
 def store(tmp_path: Path, offset_method, tiny_scene, quiet_log) -> Store:
     """A store with one run, key `stored_run`, six frames, three of them pictured."""
-    protocol = EvaluationProtocol(name="quick", lpips=())
     budget = Budget("none", steps=1, samples=1)
-    task = Task(tiny_scene, from_split(tiny_scene), protocol, budget, seed=5)
+    task = Task(tiny_scene, from_split(tiny_scene), QUICK, budget, seed=5)
     (measurement,) = measure([offset_method], task, quiet_log)
     record = {
         **measurement.record,

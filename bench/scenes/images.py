@@ -48,7 +48,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Picture:
+class ScaledView:
     """A view at 1 / `downscale` of its resolution, not decoded: its pinhole, its file's hash."""
 
     view: View
@@ -64,7 +64,7 @@ class Pictures(Sequence[Tensor]):
     file is damaged, or has changed since it was described.
     """
 
-    def __init__(self, described: Sequence[Picture], log: Log) -> None:
+    def __init__(self, described: Sequence[ScaledView], log: Log) -> None:
         self.described, self._log = described, log
         self._decoded: dict[int, Tensor] = {}
 
@@ -106,8 +106,8 @@ def image_size(path: Path) -> tuple[int, int]:
         return image.size
 
 
-def describe(view: View, downscale: int) -> Picture:
-    """Describe a view as a `Picture`; raises if it is none, of another size, or too small."""
+def describe(view: View, downscale: int) -> ScaledView:
+    """Describe a view as a `ScaledView`; raises if it is none, of another size, or too small."""
     content, camera = contents(view.path), view.camera
     with opened(io.BytesIO(content), view.path) as image:
         check_mode(image, view.path)
@@ -117,10 +117,10 @@ def describe(view: View, downscale: int) -> Picture:
     if view.lens:
         camera = undistorted_camera(camera, view.lens, view.path)
     camera = shrunk_camera(camera, downscale, view.path)
-    return Picture(view, downscale, camera, hashlib.sha256(content).hexdigest())
+    return ScaledView(view, downscale, camera, hashlib.sha256(content).hexdigest())
 
 
-def decode(picture: Picture) -> Tensor:
+def decode(picture: ScaledView) -> Tensor:
     """Decode the pixels of a picture, as `Pictures` returns them."""
     view, content = picture.view, contents(picture.view.path)
     if hashlib.sha256(content).hexdigest() != picture.sha256:

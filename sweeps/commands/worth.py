@@ -25,7 +25,7 @@ from bench.measure import Task, measure
 from bench.types import Camera, Frame, Method, NullProbe, Probe, Scene
 from methods.kernels.dispatch import forced, kernel_calls
 from reports.tables import Table, decimal
-from sweeps.configured import build, checked_settings, scene_of
+from sweeps.configured import build, checked_settings, protocol_of, scene_of
 from sweeps.overrides import choices, composed, swept
 from sweeps.processes import device_lock
 from sweeps.terminal import print_rows, show
@@ -82,7 +82,7 @@ def _of_method(words: Sequence[str], options: argparse.Namespace) -> list[Row]:
     log = ConsoleLog(Path(settings.outputs))
     scene, budget = scene_of(config), build(config, "budget")
     path = build(config, "trajectory", scene)
-    protocol = replace(build(config, "protocol"), rounds=1 + options.repeats)
+    protocol = replace(protocol_of(config), rounds=1 + options.repeats)
     task = Task(scene, path, protocol, budget, settings.seed, pictures=0)
     with device_lock(settings.device, log), tempfile.TemporaryDirectory() as folder:
         quiet = ConsoleLog(Path(folder), quiet=True)

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from bench.metrics import SMALLEST_SIDE, Lpips, flicker, psnr, quantise, ssim
-from bench.protocol import EvaluationProtocol
 from bench.scoring import Scoring
 from bench.types import SteerbenchError, Unavailable
+from tests.conftest import STEERBENCH_1
 
 
 def noise(height: int, width: int, seed: int = 0, device: str = "cpu") -> Tensor:
@@ -179,7 +179,7 @@ def test_lpips_refuses_the_weights_of_another_network(lpips_weights, quiet_log, 
 def test_scoring_leaves_nothing_on_a_gpu(gpu, lpips_weights, quiet_log):
     """What lay there would count as memory of the method that is measured."""
     lpips = Lpips("alex", lpips_weights, quiet_log)
-    scoring = Scoring(EvaluationProtocol(), {}, torch.ones(3), ())
+    scoring = Scoring(STEERBENCH_1, {}, torch.ones(3), ())
     pictures = [torch.rand(40, 40, 3).to("cuda") for _ in range(2)]
     assert math.isfinite(lpips(*pictures))
     truth = torch.zeros(40, 40, 3, dtype=torch.uint8)

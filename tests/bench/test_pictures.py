@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,10 +12,9 @@ from PIL import Image
 from torch import Tensor
 
 from bench import pictures
-from bench.protocol import EvaluationProtocol
 from bench.types import Split, SteerbenchError
+from tests.conftest import QUICK
 
-QUICK = EvaluationProtocol(name="quick", lpips=())
 FACTS = {"method": "theirs", "scene": "a"}
 
 
@@ -53,7 +53,7 @@ def test_alpha_is_put_on_the_background_of_the_protocol(tmp_path, quiet_log, bac
     clear = torch.zeros(16, 20, 4, dtype=torch.uint8)
     plain = torch.full((16, 20, 3), level, dtype=torch.uint8)
     ours, true = write(tmp_path / "ours", {"a.png": clear}), write(tmp_path / "b", {"a.png": plain})
-    protocol = EvaluationProtocol(name="mine", lpips=(), background=background)
+    protocol = replace(QUICK, name="mine", background=background)
     for pair in (ours, true), (true, ours):
         found = pictures.score(pictures.pairs_with_folder(*pair), protocol, {}, FACTS, quiet_log)
         assert found.frames["psnr"][0] == math.inf

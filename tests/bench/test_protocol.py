@@ -4,30 +4,17 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import replace
-from pathlib import Path
 
-import hydra
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from bench.cameras import scale_camera
 from bench.metrics import psnr, quantise
-from bench.protocol import EvaluationProtocol
 from bench.trajectories import from_split
 from bench.types import SteerbenchError, composite
+from tests.conftest import QUICK, STEERBENCH_1
 
-CONFIGS = Path(__file__).parents[2] / "sweeps" / "configs" / "protocol"
 WHITE = torch.ones(3)
-QUICK = EvaluationProtocol(name="quick", lpips=())
-
-
-def test_the_configuration_of_steerbench_1_is_the_default_and_a_change_may_not_keep_its_name():
-    config = OmegaConf.load(CONFIGS / "steerbench-1.yaml")
-    assert hydra.utils.instantiate(config) == EvaluationProtocol()
-    with pytest.raises(SteerbenchError, match=r"protocol\.warmup differs from what steerbench-1"):
-        EvaluationProtocol(warmup=1)
-    assert EvaluationProtocol(name="cool", warmup=1).warmup == 1
 
 
 @pytest.mark.parametrize(
@@ -36,7 +23,7 @@ def test_the_configuration_of_steerbench_1_is_the_default_and_a_change_may_not_k
 )
 def test_an_unknown_choice_names_the_option_and_what_is_allowed(option, value):
     with pytest.raises(SteerbenchError, match=f"protocol.{option}: expected .* got '?{value}"):
-        EvaluationProtocol(**{"name": "mine", option: value})
+        replace(QUICK, **{option: value})
 
 
 def test_a_picture_is_composited_with_its_straight_alpha(device):
@@ -64,9 +51,9 @@ def test_backbones_that_cannot_be_had_are_named(monkeypatch, tmp_path, log, web,
     monkeypatch.delenv("STEERBENCH_WEIGHTS", raising=False)
     (tmp_path / "alexnet_features.pth").symlink_to(lpips_weights / "alexnet_features.pth")
     weights = (tmp_path / "alexnet_features.pth").read_bytes()
-    found = EvaluationProtocol().find_lpips(tmp_path, log)
+    found = STEERBENCH_1.find_lpips(tmp_path, log)
     assert found == {"alex": hashlib.sha256(weights).hexdigest(), "vgg": None}
-    loaded, missing = EvaluationProtocol().load_lpips(tmp_path, log)
+    loaded, missing = STEERBENCH_1.load_lpips(tmp_path, log)
     assert (list(loaded), list(missing)) == (["alex"], ["lpips_vgg"])
     assert "404" in missing["lpips_vgg"]
     assert [message.split(":")[0] for message in log.messages] == ["lpips_vgg"]
@@ -82,7 +69,7 @@ def test_what_cannot_be_scored_is_refused(tiny_scene):
     shrunk = replace(trajectory, steps=(*trajectory.steps, small))
     QUICK.check(tiny_scene, shrunk)
     with pytest.raises(SteerbenchError, match=r"lpips_alex needs .* 31 x 31 pixels, got 20 x 16"):
-        EvaluationProtocol().check(tiny_scene, shrunk)
+        STEERBENCH_1.check(tiny_scene, shrunk)
     exact = replace(QUICK, name="exact", flicker="exact")
     with pytest.raises(SteerbenchError, match=r"protocol\.flicker=exact: scene .* has no exact"):
         exact.check(tiny_scene, trajectory)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from bench.metrics import flicker, quantise
-from bench.protocol import EvaluationProtocol
 from bench.scoring import Scoring
 from bench.types import composite
+from tests.conftest import QUICK
 
 WHITE = torch.ones(3)
-QUICK = EvaluationProtocol(name="quick", lpips=())
 
 
 def scored(images, cut: int | None = None, **options) -> list[dict]:
@@ -48,7 +48,7 @@ def test_a_cut_a_frame_without_truth_or_of_another_size_leaves_no_pair(tiny_scen
 
 
 def test_the_last_of_so_many_frames_is_scored_with_lpips_and_too_few_frames_say_so():
-    protocol = EvaluationProtocol(name="some", lpips=("alex",), lpips_every=2)
+    protocol = replace(QUICK, name="some", lpips=("alex",), lpips_every=2)
     scoring = Scoring(protocol, {"alex": lambda *_: 0.5}, WHITE, shown=())
     picture = torch.zeros(16, 16, 3)
     found, said = [], []

@@ -18,13 +18,13 @@ from torch import Tensor
 from bench.cameras import cast, pixel_grid
 from bench.measure import Task, measure
 from bench.metrics import as_bytes, flicker, psnr
-from bench.protocol import EvaluationProtocol
 from bench.scenes import embedded
 from bench.scoring import Scoring
 from bench.trajectories import from_split
 from bench.types import Budget, Camera, SteerbenchError, Unavailable, composite
-from bench.video_metrics import View, flip, jod, tlpips, tpsnr, warping_error
+from bench.video_metrics import DepthView, flip, jod, tlpips, tpsnr, warping_error
 from tests.bench.test_metrics import noise, waves
+from tests.conftest import QUICK
 
 ROOT = Path(__file__).parents[2]
 WHITE = torch.ones(3)
@@ -59,7 +59,7 @@ def test_tlpips_is_the_difference_of_the_distances_from_frame_to_frame():
 
     expected = abs(lpips(before, now) - lpips(true_before, true))
     assert tlpips(lpips, now, true, before, true_before) == expected > 0
-    protocol = EvaluationProtocol(name="path", lpips=("alex",), columns=("tlpips",))
+    protocol = replace(QUICK, name="path", lpips=("alex",), columns=("tlpips",))
     scoring = Scoring(protocol, {"alex": lpips}, WHITE, ())
     pairs = ((before, as_bytes(true_before)), (now, as_bytes(true)))
     found = [
@@ -99,7 +99,7 @@ def test_the_jod_is_what_its_own_program_prints(tmp_path):
 
 @has("pycvvdp", "cvvdp")
 def test_a_display_that_nobody_sells_is_refused():
-    protocol = EvaluationProtocol(name="mine", columns=("jod",), lpips=(), display="oled_9000")
+    protocol = replace(QUICK, name="mine", columns=("jod",), display="oled_9000")
     with pytest.raises(SteerbenchError, match=r"protocol\.display: expected .* got 'oled_9000'"):
         protocol.load_lpips(None, None)
 
@@ -112,12 +112,12 @@ def test_a_package_that_is_missing_is_named_before_anything_is_measured(
     monkeypatch, column, package, extra
 ):
     monkeypatch.setitem(sys.modules, package, None)
-    protocol = EvaluationProtocol(name="mine", columns=(column,), lpips=())
+    protocol = replace(QUICK, name="mine", columns=(column,))
     with pytest.raises(Unavailable, match=rf"{column} needs {package}: pip install .*\[{extra}\]"):
         protocol.load_lpips(None, None)
 
 
-def wall(shift: int, offset: float = 0.0) -> tuple[Tensor, View]:
+def wall(shift: int, offset: float = 0.0) -> tuple[Tensor, DepthView]:
     """A picture, `offset` brighter, of a painted wall 2 units away, `shift` pixels to the left."""
     pose = torch.eye(4)[:3].clone()
     pose[0, 3] = -shift * 2 / 40
@@ -125,7 +125,7 @@ def wall(shift: int, offset: float = 0.0) -> tuple[Tensor, View]:
     rays = cast(camera, pixel_grid(24, 16))
     x, y, _ = (rays.origins + 2 * rays.directions).T
     rgb = 0.5 + 0.3 * torch.stack((x, y, torch.sin(9 * x)), dim=-1) + offset
-    return rgb.view(16, 24, 3), View(camera, torch.full((16, 24), 2.0))
+    return rgb.view(16, 24, 3), DepthView(camera, torch.full((16, 24), 2.0))
 
 
 def test_a_still_scene_has_no_warping_error_and_a_blink_that_of_its_square():
@@ -140,12 +140,12 @@ def test_what_was_hidden_or_is_empty_or_out_of_the_picture_does_not_count():
     hidden[4:9, 5:12] = 1.5  # something in front of the wall
     painted = then.clone()
     painted[4:9, 5:12] = 9.0
-    assert warping_error(now, view, painted, View(earlier.camera, hidden)) < 1e-12
+    assert warping_error(now, view, painted, DepthView(earlier.camera, hidden)) < 1e-12
     empty = view.depth.clone()
     empty[:, :6] = math.inf
     spoilt = now.clone()
     spoilt[:, :6] = 9.0
-    assert warping_error(spoilt, View(view.camera, empty), then, earlier) < 1e-12
+    assert warping_error(spoilt, DepthView(view.camera, empty), then, earlier) < 1e-12
     assert math.isnan(warping_error(now, view, *wall(24)))
 
 
@@ -167,14 +167,17 @@ def test_exact_flow_follows_the_true_pictures_of_a_path(tmp_path, quiet_log):
     scene = embedded.load("totem", width=160, train=2, test=8, root=tmp_path, log=quiet_log)
     test = scene.splits["test"]
     (then, earlier), (now, view) = (
-        (composite(test.images[k], WHITE), View(test.cameras[k], scene.surface(test.cameras[k])))
+        (
+            composite(test.images[k], WHITE),
+            DepthView(test.cameras[k], scene.surface(test.cameras[k])),
+        )
         for k in (0, 7)
     )
     still = (now - then).square()[view.depth < math.inf].mean()
     assert warping_error(now, view, then, earlier) < 0.1 * still
 
 
-PATH = EvaluationProtocol(name="path", lpips=(), columns=("tpsnr", "warp"))
+PATH = replace(QUICK, name="path", columns=("tpsnr", "warp"))
 
 
 def film(protocol, surface=None, cut: int | None = None, depth: bool = True) -> list[dict]:

@@ -16,7 +16,6 @@ from bench.cameras import scale_camera
 from bench.case import Difference
 from bench.console import ConsoleLog
 from bench.measure import Task, measure
-from bench.protocol import EvaluationProtocol
 from bench.trajectories import from_split
 from bench.types import Budget, Method, NullProbe, Scene, Split
 from bench.waits import device_waits
@@ -51,6 +50,7 @@ from methods.steernerf.stage2 import JointTraining
 from methods.steernerf.unet import UNet
 from methods.students.fields import FieldLessons, StudentField
 from methods.training import loop
+from tests.conftest import QUICK
 from tests.methods.conftest import Work
 from tests.methods.models import (
     small_joint,
@@ -193,7 +193,7 @@ def test_its_rows_are_those_of_the_cpu(scene: Scene, tmp_path: Path) -> None:
     def rows(device: str) -> pd.DataFrame:
         """All but times and peak memory."""
         method = METHODS["ngp"](device=device, backend="reference")
-        protocol = EvaluationProtocol(name="quick", lpips=(), warmup=0)
+        protocol = replace(QUICK, warmup=0)
         task = Task(scene, from_split(scene), protocol, BUDGET, seed=0)
         found = measure([method], task, ConsoleLog(tmp_path / device, quiet=True))[0].rows
         timed = found["metric"].str.startswith(("frame_ms", "fps", "stage_ms", "train_s", "peak"))

@@ -11,7 +11,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from bench.errors import SteerbenchError
-from sweeps.configured import build
+from sweeps.configured import build, protocol_of
 from sweeps.overrides import composed, target_of
 
 
@@ -102,3 +102,10 @@ def test_what_field_and_renderer_cannot_do_is_refused_before_any_training(overri
     config = composed(["method=steernerf", *overrides])
     with pytest.raises(SteerbenchError, match=rf"^method.*{re.escape(message)}"):
         build(config, "method")
+
+
+def test_a_changed_standard_protocol_needs_a_name_of_its_own():
+    assert protocol_of(composed([])).name == "steerbench-1"
+    with pytest.raises(SteerbenchError, match=r"protocol\.warmup differs from what steerbench-1"):
+        protocol_of(composed(["protocol.warmup=1"]))
+    assert protocol_of(composed(["protocol.warmup=1", "protocol.name=cool"])).warmup == 1

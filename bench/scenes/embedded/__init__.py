@@ -20,7 +20,7 @@ from bench.cameras import look_at, move_camera
 from bench.provenance import digest
 from bench.scenes import blender
 from bench.scenes.embedded.models import MODELS
-from bench.scenes.embedded.raytrace import Model, Solids, render
+from bench.scenes.embedded.raytrace import SceneModel, Solids, render
 from bench.scenes.files import opengl_to_opencv, whole_number
 from bench.threads import in_parallel
 from bench.types import Camera, Log, Scene, SteerbenchError, Unavailable
@@ -31,7 +31,7 @@ WIDTH, TRAIN, TEST = 400, 60, 24  # of what a scene has that is called like its 
 
 
 @dataclass(frozen=True)
-class Views:
+class Viewpoints:
     """Where the cameras of a scene are; heights are in degrees above the horizon."""
 
     lowest: float = -10.0  # of the training poses
@@ -41,8 +41,8 @@ class Views:
     distance: float = DISTANCE
 
 
-MOST = Views()
-VIEWS = {"mill": Views(3.0, 26.0, middle=14.0, swing=6.0, distance=4.7)}
+MOST = Viewpoints()
+VIEWS = {"mill": Viewpoints(3.0, 26.0, middle=14.0, swing=6.0, distance=4.7)}
 """Of scenes that need others than most: nobody sees a building from below its ground."""
 
 
@@ -105,14 +105,14 @@ def _title(name: str, width: int, height: int, train: int, test: int, seed: int)
     return name + sizes + (f"-seed{seed}" if seed else "")
 
 
-def find(name: str) -> Model:
+def find(name: str) -> SceneModel:
     """The model called `name`; raises Unavailable if there is none."""
     if name not in MODELS:
         raise Unavailable(f"scene: expected one of {', '.join(MODELS)}, got {name!r}")
     return MODELS[name]()
 
 
-def picture(model: Model, camera: Camera) -> Tensor:
+def picture(model: SceneModel, camera: Camera) -> Tensor:
     """The exact picture, uint8 [H, W, 4] with straight alpha; `camera` is in the model's units."""
     with torch.inference_mode():  # with less bookkeeping, threads wait less for Python's lock
         frame = render(model, camera, torch.zeros(3), samples=16)
@@ -158,7 +158,7 @@ def _write_pictures(folder: Path, settings: dict, log: Log) -> None:
     in_parallel(draw, jobs, f"render {settings['name']}", log)
 
 
-def train_poses(count: int, seed: int, views: Views = MOST) -> list[Tensor]:
+def train_poses(count: int, seed: int, views: Viewpoints = MOST) -> list[Tensor]:
     """Poses spread evenly over a zone of the sphere by the golden angle; `seed` sets the start."""
     phase, shift = torch.rand(2, generator=torch.Generator().manual_seed(seed)).tolist()
     low, high = (math.sin(math.radians(x)) for x in (views.lowest, views.highest))
@@ -170,7 +170,7 @@ def train_poses(count: int, seed: int, views: Views = MOST) -> list[Tensor]:
     ]
 
 
-def orbit_poses(count: int, views: Views = MOST) -> list[Tensor]:
+def orbit_poses(count: int, views: Viewpoints = MOST) -> list[Tensor]:
     """Poses 1 degree of azimuth apart, centred on the front, that rise and fall twice a turn."""
     azimuths = [math.radians(-90 + k - (count - 1) / 2) for k in range(count)]
     heights = [math.radians(views.middle + views.swing * math.sin(2 * a)) for a in azimuths]

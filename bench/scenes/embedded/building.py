@@ -6,7 +6,7 @@ import math
 
 from bench.scenes.embedded.masonry import placed
 from bench.scenes.embedded.raytrace import Part, rotation
-from bench.scenes.embedded.solids import Box, Cylinder, Pierced, Shape, Triple
+from bench.scenes.embedded.solids import Cuboid, Cylinder, Pierced, Shape, Triple
 from bench.scenes.embedded.textures import Texture
 
 UPRIGHT = (0.0, 0.0, 0.0)
@@ -27,7 +27,7 @@ def put(
 def block(low: Triple, high: Triple, paint: Texture, gloss: float = 0.0) -> Part:
     """A box between two corners."""
     x, y, z = ((b - a) / 2 for a, b in zip(low, high, strict=True))
-    return put(Box((x, y, z)), paint, between(low, high), gloss=gloss)
+    return put(Cuboid((x, y, z)), paint, between(low, high), gloss=gloss)
 
 
 def rod(start: Triple, end: Triple, radius: float, paint: Texture, gloss: float = 0.0) -> Part:
@@ -70,7 +70,7 @@ def slope(
     hole = (length / count - 0.008, eave - 0.012)
     rafters = Pierced((length - 0.01, thick, eave), (count, 1), hole)
     return [
-        Part(Box((length, half, thick)), tile, below(run / 2, thick), (pitch, 0.0, turn)),
+        Part(Cuboid((length, half, thick)), tile, below(run / 2, thick), (pitch, 0.0, turn)),
         put(rafters, timber, below(run - (eave + 0.02) * c, -thick), (pitch - 90.0, 0.0, turn)),
     ]
 

@@ -13,9 +13,9 @@ from bench.scenes.embedded.building import block, put, rail, raised, rod, slope
 from bench.scenes.embedded.masonry import bricks, panes, planks, rough, setts, tiles
 from bench.scenes.embedded.raytrace import Part, Solids
 from bench.scenes.embedded.solids import (
-    Box,
     Carved,
     Common,
+    Cuboid,
     Cylinder,
     Ellipsoid,
     Gable,
@@ -97,7 +97,7 @@ def bands() -> list[Part]:
         sill, lintel = middle - WINDOW[1], middle + WINDOW[1]
         parts.append(course(sill - 0.018, sill, 0.014, STONE))
         parts.append(course(lintel, lintel + 0.02, 0.005, QUOIN))
-    corner, x, y = Box((0.0265, 0.0265, HIGH / 2)), LONG - 0.0185, DEEP - 0.0185
+    corner, x, y = Cuboid((0.0265, 0.0265, HIGH / 2)), LONG - 0.0185, DEEP - 0.0185
     places = [(x, y), (-x, y), (x, -y), (-x, -y)]
     return parts + [put(corner, QUOIN, (*place, HIGH / 2)) for place in places]
 
@@ -115,8 +115,8 @@ def roof() -> list[Part]:
         parts += slope((0.0, 0.0, RIDGE), LONG + 0.07, DEEP + FALL, PITCH, turn, TILE, TIMBER)
     for x in (-0.42, 0.38):
         place, lie = (x, -0.30, RIDGE - 0.30 * SLANT + 0.024), (PITCH, 0.0, 0.0)
-        parts.append(put(Box((0.055, 0.075, 0.012)), IRON, place, lie))
-        parts.append(put(Box((0.045, 0.065, 0.015)), GLASS, place, lie, gloss=0.7))
+        parts.append(put(Cuboid((0.055, 0.075, 0.012)), IRON, place, lie))
+        parts.append(put(Cuboid((0.045, 0.065, 0.015)), GLASS, place, lie, gloss=0.7))
     return parts
 
 
@@ -214,12 +214,12 @@ def wheel() -> list[Part]:
     for x in (0.755, 0.875):
         parts.append(put(rim, TIMBER, (x, y, z), lie))
         for k in range(4):
-            spoke = Box((0.007, 0.010, radius - 0.01))
+            spoke = Cuboid((0.007, 0.010, radius - 0.01))
             parts.append(put(spoke, TIMBER, (x, y, z), (45.0 * k, 0.0, 0.0)))
     for k in range(18):
         a = math.radians(20.0 * k)
         centre = (0.815, y - 0.275 * math.sin(a), z + 0.275 * math.cos(a))
-        parts.append(put(Box((0.055, 0.005, 0.035)), BOARD, centre, (20.0 * k, 0.0, 0.0)))
+        parts.append(put(Cuboid((0.055, 0.005, 0.035)), BOARD, centre, (20.0 * k, 0.0, 0.0)))
     return parts
 
 
@@ -254,12 +254,12 @@ def shed() -> list[Part]:
         parts.append(block((left, -0.308, 0.04), (right, -0.295, 0.26), GREEN))
         parts.append(block((left, -0.314, 0.07), (right, -0.305, 0.09), PAINT))
         parts.append(block((left, -0.314, 0.22), (right, -0.305, 0.24), PAINT))
-        brace = Box((0.072, 0.004, 0.009))
+        brace = Cuboid((0.072, 0.004, 0.009))
         parts.append(put(brace, PAINT, (x, -0.311, 0.155), (0.0, -52.0, 0.0)))
     frame = Pierced((0.09, 0.012, 0.06), (2, 2), (0.039, 0.024))
     for y in (-0.14, 0.14):
         parts.append(put(frame, PAINT, (far, y, 0.17), (0.0, 0.0, 90.0)))
-        parts.append(put(Box((0.005, 0.09, 0.06)), GLASS, (far, y, 0.17), gloss=0.5))
+        parts.append(put(Cuboid((0.005, 0.09, 0.06)), GLASS, (far, y, 0.17), gloss=0.5))
     return parts
 
 
@@ -287,7 +287,7 @@ def stair() -> list[Part]:
 
 def yard() -> list[Part]:
     """Paving with cut corners, a fence, and a ladder and a millstone that lean at the front."""
-    slab = Common(Box((1.0, 0.70, 0.02)), Cylinder(1.06, 0.02))
+    slab = Common(Cuboid((1.0, 0.70, 0.02)), Cylinder(1.06, 0.02))
     ladder = Pierced((0.035, 0.006, 0.33), (1, 14), (0.026, 0.0195))
     stone, tilt = (0.55, -DEEP - 0.06, 0.096), (70.0, 0.0, 0.0)
     return [
@@ -309,5 +309,5 @@ def goods() -> list[Part]:
     for k, (x, y) in enumerate(((0.52, 0.56), (0.61, 0.58), (0.56, 0.50))):
         parts.append(put(Ellipsoid(sack), SACK, (x, y, 0.05), (0.0, 15.0 * k, 40.0 * k)))
     for k, centre in enumerate(((0.74, -0.57, crate), (0.85, -0.49, crate), (0.78, -0.54, 0.13))):
-        parts.append(Part(Box((0.05, 0.05, crate)), BOARD, centre, (0.0, 0.0, 25.0 * k + 10.0)))
+        parts.append(Part(Cuboid((0.05, 0.05, crate)), BOARD, centre, (0.0, 0.0, 25.0 * k + 10.0)))
     return parts

@@ -7,12 +7,12 @@ from collections.abc import Callable
 from itertools import pairwise
 
 from bench.scenes.embedded.mill import mill
-from bench.scenes.embedded.raytrace import Ball, Cloud, Model, Part, Solids
+from bench.scenes.embedded.raytrace import Ball, Media, Part, SceneModel, Solids
 from bench.scenes.embedded.solids import (
-    Box,
     Capsule,
     Carved,
     Common,
+    Cuboid,
     Cylinder,
     Ellipsoid,
     Shifted,
@@ -47,7 +47,7 @@ def totem() -> Solids:
 def pedestal() -> list[Part]:
     """A disc, a marble block with a ball in each of its four niches, and a drum."""
     niches = [(0.42, 0.0, 0.0), (-0.42, 0.0, 0.0), (0.0, 0.42, 0.0), (0.0, -0.42, 0.0)]
-    block = Carved(Box((0.42, 0.42, 0.24)), [Shifted(ball(0.21), niche) for niche in niches])
+    block = Carved(Cuboid((0.42, 0.42, 0.24)), [Shifted(ball(0.21), niche) for niche in niches])
     c, s = math.cos(math.radians(18)), math.sin(math.radians(18))
     patterns = plain(CORAL), spiral(IVORY, TEAL, 8, 4.0), plain(GOLD), mottled(NAVY, TEAL, 14.0)
     balls = [
@@ -93,7 +93,7 @@ def face() -> list[Part]:
 
 def crown() -> list[Part]:
     """A wooden collar, a rounded die, and a ring of pins around a golden ball."""
-    die = Common(Box((0.22, 0.22, 0.20)), ball(0.31))
+    die = Common(Cuboid((0.22, 0.22, 0.20)), ball(0.31))
     pins, tips = [], []
     for k in range(9):
         a = math.radians(40 * k + 10)
@@ -164,9 +164,9 @@ def wheel() -> list[Part]:
     return tyre + [wire((0.0, 0.0, 0.0), point, 0.006, SLATE) for point in rim[::2]]
 
 
-def cloud() -> Cloud:
+def cloud() -> Media:
     """Overlapping homogeneous balls, from thin to nearly opaque."""
-    return Cloud(
+    return Media(
         [
             Ball((0.00, 0.00, -0.45), 0.55, 2.2, (0.93, 0.94, 0.97)),
             Ball((0.42, 0.10, -0.25), 0.42, 3.0, (0.96, 0.80, 0.58)),
@@ -188,6 +188,6 @@ def void() -> Solids:
     return Solids([Part(ball(0.06), plain(CORAL), (0.35, -0.2, 0.15), gloss=0.5)])
 
 
-MODELS: dict[str, Callable[[], Model]] = {
+MODELS: dict[str, Callable[[], SceneModel]] = {
     make.__name__: make for make in (totem, wires, cloud, void, mill)
 }

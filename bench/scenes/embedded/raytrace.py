@@ -63,7 +63,7 @@ class Band:
         return u, v, w
 
 
-class Model(Protocol):
+class SceneModel(Protocol):
     """A model made of parts, through which a band of rays can be traced."""
 
     def boxes(self) -> Tensor:
@@ -74,7 +74,7 @@ class Model(Protocol):
         alpha, which comes between them. A part is never seen outside its span."""
 
 
-def render(model: Model, camera: Camera, background: Tensor, samples: int) -> Frame:
+def render(model: SceneModel, camera: Camera, background: Tensor, samples: int) -> Frame:
     """Render `model`, averaged over `samples` rays per pixel (a power of two).
 
     `camera` is in the model's units; rays that hit nothing show `background` [3]. A pixel's alpha
@@ -322,7 +322,7 @@ class Ball:
 
 
 @dataclass(frozen=True)
-class Cloud:
+class Media:
     """Balls whose densities add where they overlap; their colours are averaged, density-weighted.
 
     Between two crossings of surfaces the density k (per unit of t) and the colour c are constant.

@@ -76,7 +76,7 @@ def ball(radius: float) -> Ellipsoid:
 
 
 @dataclass(frozen=True)
-class Box(Convex):
+class Cuboid(Convex):
     half: Triple  # sizes along x, y, z
 
     def extent(self) -> Triple:
@@ -300,7 +300,7 @@ class Pierced(Shape):
 
     def hit(self, origin: Origin, directions: Directions) -> Tensor:
         """Where a ray enters the solid, or the side of the hole that it is in."""
-        enter, leave = Box(self.half).interval(origin, directions)
+        enter, leave = Cuboid(self.half).interval(origin, directions)
         start = enter.clamp(min=0)
         side = torch.full_like(leave, math.inf)
         inside = torch.ones_like(leave, dtype=torch.bool)
@@ -319,7 +319,7 @@ class Pierced(Shape):
         return torch.where(inside, side, solid).masked_fill_(missed, math.inf)
 
     def distance(self, points: Tensor) -> Tensor:
-        return torch.maximum(Box(self.half).distance(points), -self._from_hole(points).amax(1))
+        return torch.maximum(Cuboid(self.half).distance(points), -self._from_hole(points).amax(1))
 
     def normal(self, points: Tensor) -> Tensor:
         """The normal of the box or of the side of a hole, whichever is nearer."""
@@ -329,7 +329,7 @@ class Pierced(Shape):
         across = (beyond[:, 0] > beyond[:, 1])[:, None]
         upright, level = torch.stack((-x, zero, zero), 1), torch.stack((zero, zero, -z), 1)
         sides = torch.where(across, upright, level).sign()
-        box = Box(self.half)
+        box = Cuboid(self.half)
         on_box = box.distance(points).abs() < beyond.amax(1).abs()
         return torch.where(on_box[:, None], box.normal(points), sides)
 

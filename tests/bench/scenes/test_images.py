@@ -13,8 +13,8 @@ from PIL import Image
 from bench.scenes import images
 from bench.scenes.images import (
     MOST_PIXELS,
-    Picture,
     Pictures,
+    ScaledView,
     View,
     decode_bytes,
     describe,
@@ -111,7 +111,7 @@ def pictures(files: list[Path], log) -> Pictures:
 def test_only_pictures_that_are_asked_for_are_decoded_and_once(files, log, monkeypatch) -> None:
     opened = []
 
-    def decode(picture: Picture) -> torch.Tensor:
+    def decode(picture: ScaledView) -> torch.Tensor:
         opened.append(picture.view.name)
         return images.decode_bytes(picture.view.path.read_bytes(), picture.view.path)
 

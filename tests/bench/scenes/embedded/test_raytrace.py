@@ -13,7 +13,7 @@ from bench.scenes.embedded.models import cloud, mill, totem, wires
 from bench.scenes.embedded.raytrace import (
     LIGHT,
     Ball,
-    Cloud,
+    Media,
     Part,
     ProjectedBoxes,
     Solids,
@@ -79,7 +79,7 @@ def test_silhouettes_of_a_sphere_and_a_thin_wire_have_their_closed_form_areas() 
     "model",
     [
         Solids([sphere(0.1, (9.0, 9.0, 0.0))]),  # beside the picture, and behind the camera
-        Cloud([Ball((0.0, -6.0, 0.0), 0.5, 9.0, (1.0, 1.0, 1.0))]),
+        Media([Ball((0.0, -6.0, 0.0), 0.5, 9.0, (1.0, 1.0, 1.0))]),
     ],
 )
 def test_nothing_seen_is_the_background_at_infinity(model) -> None:
@@ -184,7 +184,7 @@ BLACK = torch.zeros(3)
 
 @pytest.mark.parametrize("density", [0.01, 1.0, 30.0])
 def test_one_ball_through_its_middle(device, density) -> None:
-    model = Cloud([Ball((0.0, 0.0, 0.0), 0.5, density, (0.8, 0.4, 0.2))])
+    model = Media([Ball((0.0, 0.0, 0.0), 0.5, density, (0.8, 0.4, 0.2))])
     frame = render(model, camera_at((0.0, -4.0, 0.0), 1, device), BLACK, samples=1)
     alpha = 1 - math.exp(-density)
     # Mean of an exponential of rate k cut off at 1: 1 / k - 1 / (e^k - 1), from t = 3.5 on.
@@ -196,7 +196,7 @@ def test_one_ball_through_its_middle(device, density) -> None:
     )
 
 
-def quadrature(model: Cloud, camera: Camera, steps: int) -> tuple[torch.Tensor, ...]:
+def quadrature(model: Media, camera: Camera, steps: int) -> tuple[torch.Tensor, ...]:
     """rgb, alpha, and depth times alpha of the pixel centres, by the midpoint rule on [0, 6]."""
     rays = cast(camera)
     width = 6 / steps

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from bench.scenes.embedded.solids import (
-    Box,
     Capsule,
     Carved,
     Common,
+    Cuboid,
     Cylinder,
     Ellipsoid,
     Gable,
@@ -22,16 +22,16 @@ from bench.scenes.embedded.solids import (
 
 SHAPES: dict[str, Shape] = {
     "ellipsoid": Ellipsoid((0.9, 0.4, 0.6)),
-    "box": Box((0.5, 0.8, 0.3)),
+    "box": Cuboid((0.5, 0.8, 0.3)),
     "gable": Gable((0.5, 0.7, 0.6)),
     "cylinder": Cylinder(0.5, 0.7),
     "capsule": Capsule(0.3, 0.5),
-    "common": Common(Box((0.6, 0.6, 0.6)), Ellipsoid((0.8, 0.8, 0.8))),
+    "common": Common(Cuboid((0.6, 0.6, 0.6)), Ellipsoid((0.8, 0.8, 0.8))),
     "common of a shifted": Common(
         Cylinder(0.6, 0.6), Shifted(Ellipsoid((0.7,) * 3), (0.3, 0, 0.2))
     ),
     "carved": Carved(
-        Box((0.6, 0.6, 0.4)),
+        Cuboid((0.6, 0.6, 0.4)),
         [
             Shifted(Ellipsoid((0.3, 0.3, 0.3)), (0.6, 0.0, 0.0)),
             Shifted(Ellipsoid((0.4, 0.3, 0.3)), (0.4, 0.3, 0.3)),
@@ -112,7 +112,7 @@ def test_the_extent_holds_every_hit(shape) -> None:
 def test_a_pierced_box_is_a_box_minus_its_holes() -> None:
     pierced = Pierced((0.9, 0.25, 0.6), (3, 2), (0.22, 0.2))
     middles = [(x, 0.0, z) for x in (-0.6, 0.0, 0.6) for z in (-0.3, 0.3)]
-    body = Carved(Box((0.9, 0.25, 0.6)), [Shifted(Box((0.22, 9, 0.2)), x) for x in middles])
+    body = Carved(Cuboid((0.9, 0.25, 0.6)), [Shifted(Cuboid((0.22, 9, 0.2)), x) for x in middles])
     assert pierced.extent() == body.extent()
     origins, directions = rays(4000)
     inside = body.distance(origins) < 0
@@ -164,7 +164,7 @@ def test_rays_along_an_axis_meet_box_and_cylinder(axis) -> None:
     wall = math.sqrt(0.25 - 0.01)
     aside = list(origin)
     aside[(axis + 1) % 3] = 1.0
-    for shape, reach in ((Box((0.5, 0.6, 0.7)), (0.5, 0.6)), (Cylinder(0.5, 0.7), (wall, wall))):
+    for shape, reach in ((Cuboid((0.5, 0.6, 0.7)), (0.5, 0.6)), (Cylinder(0.5, 0.7), (wall, wall))):
         met = shape.hit(tuple(origin), tuple(directions)).item()
         assert met == pytest.approx(2 - (*reach, 0.7)[axis])
         assert shape.hit(tuple(aside), tuple(directions)).isinf().all()
