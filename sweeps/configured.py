@@ -95,7 +95,7 @@ def protocol_of(config: DictConfig) -> EvaluationProtocol:
     """The protocol that `config` describes; raises if it is called like the standard one, but
     differs from it."""
     node, standard = config.protocol, OmegaConf.load(CONFIGS / "protocol" / f"{STANDARD}.yaml")
-    changed = [name for name, value in standard.items() if node.get(name) != value]
+    changed = [str(name) for name, value in standard.items() if node.get(name) != value]
     if changed and node.get("name") == STANDARD:
         raise SteerbenchError(
             f"protocol.{changed[0]} differs from what {STANDARD} says: give the changed protocol a "
