@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -32,12 +31,6 @@ class FrameRecord:
     def total_ns(self) -> int:
         """Time from the beginning to the end of the frame: the sum of all stages."""
         return sum(self.stages_ns.values())
-
-
-def p99_to_p50(frames: Sequence[FrameRecord]) -> float:
-    """How much longer the slowest frames take: 99th percentile of frame time over the median."""
-    middle, last = np.percentile([frame.total_ns for frame in frames], (50, 99))
-    return float(last / middle)
 
 
 class StageClock:

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench.clock import FrameRecord, StageClock, p99_to_p50
+from bench.clock import FrameRecord, StageClock
 
 
 def clock_reading(times: Iterable[int]) -> StageClock:
@@ -126,8 +126,3 @@ def test_the_device_finishes_its_work_before_every_reading(monkeypatch, stages, 
         pass
     assert events == ["synchronise", "read"] * readings
     assert ("field" in clock.frames[0].stages_ns) == stages
-
-
-def test_the_longest_frames_are_held_against_the_median():
-    records = [FrameRecord({"field": ms * 1_000_000}, {}, {}) for ms in (10, 10, 40)]
-    assert p99_to_p50(records) == pytest.approx(3.94)  # 10 + 0.98 x 30, of 10
