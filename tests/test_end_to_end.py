@@ -97,7 +97,7 @@ SMALLEST = [
     *("scene=totem", "scene.width=24", "scene.train=3", "scene.test=1"),
     *("budget=tiny", "budget.steps=16", "budget.samples=512", "budget.renderer_steps=8"),
     *("budget.frames=1", "protocol.name=quick", "protocol.lpips=[]", "protocol.warmup=0"),
-    *("method.grid.levels=4", "method.grid.log2_table=10", "tables.beyond=false"),
+    *("method.grid.levels=4", "method.grid.log2_table=10"),
     *("method.joint.patch=6", "method.joint.distilled_views=1"),
     *("method.joint.motion.pool=2", "method.joint.motion.uses=3"),
 ]
