@@ -141,7 +141,7 @@ def read_results(file: Path) -> tuple[Measurement, dict[str, Any]]:
         "protocol": protocol,
         "budget": budget,
         "device": IMPORTED,
-        **dict.fromkeys(("resolution", "backend", "engine", "precision"), "-"),
+        **dict.fromkeys(("resolution", "backend", "engine", "precision", "field_precision"), "-"),
         "seed": 0,
     }
     rows = pd.DataFrame([{"phase": STEADY, **row} for row in summary]).assign(

@@ -33,7 +33,8 @@ SCHEMA_VERSION = 3  # of record.json and rows.csv; other folders are reported an
 COLUMNS = [
     *("run", "method", "scene", "split", "trajectory", "resolution", "protocol", "budget"),
     *("phase", "metric", "unit", "value", "n", "lo", "hi"),
-    *("device", "backend", "engine", "precision", "seed", "commit"),
+    *("device", "backend", "engine", "precision", "field_precision"),
+    *("seed", "commit"),
 ]
 """`value` is a mean over `n` frames with its 95 % interval [lo, hi], or a single figure (n = 1,
 no interval). NaN with n = 0 means not available. `phase` says which frames: "steady", "cold" (with

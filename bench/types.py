@@ -212,7 +212,8 @@ class Method(Protocol):
         """Bytes by component, as stored in a file of the model."""
 
     def settings(self) -> dict[str, str]:
-        """The resolved `device`, `backend`, `engine` and `precision`, for the result rows."""
+        """The resolved `device`, `backend`, `engine`, `precision` and `field_precision`, which rows
+        show as docs/protocol.md explains."""
 
 
 class NullProbe:

@@ -129,7 +129,8 @@ class Run:
         """Where the figures come from, except the command and the settings."""
         machine, record, row = self.record["machine"], self.record, self.facts
         memory = f"{machine['memory_bytes'] / 2**30:.0f} GiB"
-        computed = {name: row[name] for name in ("device", "backend", "engine", "precision")}
+        by = "device", "backend", "engine", "precision", "field_precision"
+        computed = {name: row[name] for name in by}
         seen = record.get("neighbours")  # none where nothing was timed here
         return {
             "run": self.key,

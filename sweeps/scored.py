@@ -60,7 +60,8 @@ def score(
         pairs = given.pairs_with_folder(folder, Path(truth), match)
         place = {"scene": Path(truth).resolve().name, "split": NOTHING}
     facts = {"method": name or folder.resolve().name, **place, "trajectory": "pictures", "seed": 0}
-    facts |= dict.fromkeys(("budget", "device", "backend", "engine", "precision"), NOTHING)
+    computed = "device", "backend", "engine", "precision", "field_precision"
+    facts |= dict.fromkeys(("budget", *computed), NOTHING)
     reported = given.reported_times(Path(times), pairs) if times else []
     facts |= {"device": REPORTED} if times else {}
     example = f"{pairs[0].picture.name} is scored against {pairs[0].name}"  # for the user to check

@@ -201,8 +201,9 @@ class OffsetMethod:
         return {
             "device": self._device,
             "backend": "reference",
-            "engine": "torch",
-            "precision": "fp32",
+            "engine": "none",
+            "precision": "none",
+            "field_precision": "fp32",
         }
 
 

@@ -143,4 +143,4 @@ class Diver(Student):
         return self.baked.sizes()
 
     def settings(self) -> dict[str, str]:
-        return super().settings() | {"precision": self.stored}
+        return super().settings() | {"field_precision": "fp32"}

@@ -136,7 +136,8 @@ class External:
         device, precision = self._about["device"], self._about["precision"]
         if device != "cpu" and not (device.startswith("cuda") and torch.cuda.is_available()):
             device = f"worker's {device}"  # nothing here can wait for it
-        shown = {"device": device, "backend": "external", "engine": "none", "precision": precision}
+        shown = {"device": device, "backend": "external", "field_precision": precision}
+        shown |= {"engine": "none", "precision": "none"}
         return {**shown, "environment": content_key(self._environment)[:16]}
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:

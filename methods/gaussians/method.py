@@ -141,4 +141,4 @@ class GaussianSplatting:
         return {"gaussians": plain if self.stored == "fp32" else stored_bytes(self.gaussians)}
 
     def settings(self) -> dict[str, str]:
-        return self.setup.settings(type(self)) | {"precision": self.stored, "engine": "none"}
+        return self.setup.settings(type(self)) | {"field_precision": "fp32"}

@@ -55,13 +55,14 @@ class Setup:
         return cls(grid, training, precision, resolve(backend, place), place, seed)
 
     def settings(self, method: type) -> dict[str, str]:
-        """The settings that a row of `method` shows, as they really are."""
+        """What a row of `method` shows of how it ran, of one without a 2D network."""
         multiplied = self.precision == "fp32" or multiplies_bf16(self.device.type)
         return {
             "device": str(self.device),
             "backend": by_kernel(self.backend, method),
-            "engine": "torch",
-            "precision": self.precision if multiplied else "bf16 in fp32",
+            "engine": "none",
+            "precision": "none",
+            "field_precision": self.precision if multiplied else "bf16 in fp32",
         }
 
     def suited(self, scene: Scene) -> Setup:

@@ -112,4 +112,4 @@ class KiloNerf(FieldStudent):
         super().restore(tensors)
 
     def settings(self) -> dict[str, str]:
-        return super().settings() | {"precision": "fp32"}  # whatever that of the teacher is
+        return super().settings() | {"field_precision": "fp32"}

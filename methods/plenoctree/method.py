@@ -176,7 +176,7 @@ class PlenOctree(Student):
         return self.octree.sizes(2 if self.stored == "fp16" else 4)
 
     def settings(self) -> dict[str, str]:
-        return super().settings() | {"precision": self.stored}
+        return super().settings() | {"field_precision": "fp32"}
 
 
 def opaque_at_end(pixels: Pixels, stop: float) -> Pixels:

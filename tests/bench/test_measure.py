@@ -55,7 +55,8 @@ def test_the_rows_have_every_column_but_what_the_store_adds(run, offset_method, 
     assert set(rows.columns) == set(COLUMNS) - {"run", "commit"}
     what = {"method": "offset", "scene": "tiny", "split": "test", "trajectory": "test"}
     how = {"resolution": "40x32", "protocol": "quick", "budget": "tiny", "seed": 5}
-    by = {"device": device, "backend": "reference", "engine": "torch", "precision": "fp32"}
+    by = {"device": device, "backend": "reference", "field_precision": "fp32"}
+    by |= {"engine": "none", "precision": "none"}
     for column, expected in (what | how | by).items():
         assert set(rows[column]) == {expected}
     assert not rows["metric"].duplicated().any()
@@ -341,7 +342,8 @@ class Brighter:
         return {}
 
     def settings(self) -> dict[str, str]:
-        return {"device": "cpu", "backend": "none", "engine": "none", "precision": "fp32"}
+        by = {"device": "cpu", "backend": "none", "field_precision": "fp32"}
+        return by | {"engine": "none", "precision": "none"}
 
 
 @pytest.fixture

@@ -54,7 +54,8 @@ class Grey:
         return {"level": 4}
 
     def settings(self) -> dict[str, str]:
-        return {"device": "cpu", "backend": "none", "engine": "torch", "precision": "fp32"}
+        by = {"device": "cpu", "backend": "none", "field_precision": "fp32"}
+        return by | {"engine": "none", "precision": "none"}
 
 
 class Gated(Grey):

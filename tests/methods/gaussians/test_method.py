@@ -62,7 +62,6 @@ def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, shared_log: Log) -
     small = fitted(ball_scene, shared_log, stored="int8")
     assert plain.sizes() == {"gaussians": 400 * 59 * 4}
     assert small.sizes()["gaussians"] < plain.sizes()["gaussians"] / 3.5
-    assert small.settings()["precision"] == "int8"
     assert abs(quality(small, ball_scene) - quality(plain, ball_scene)) < 0.5
 
 

@@ -49,8 +49,8 @@ def test_settings_say_in_which_precision_a_field_is_multiplied(
     monkeypatch.setattr("methods.instant_ngp.stage1.multiplies_bf16", known.__getitem__)
     for precision, shown in (("bf16", said), ("fp32", "fp32")):
         method = InstantNgp(grid=GRID, training=QUICK, device="cpu", precision=precision)
-        others = {"device": "cpu", "backend": "cpu", "engine": "torch"}
-        assert method.settings() == {**others, "precision": shown}
+        others = {"device": "cpu", "backend": "cpu", "engine": "none", "precision": "none"}
+        assert method.settings() == {**others, "field_precision": shown}
 
 
 @pytest.mark.parametrize(

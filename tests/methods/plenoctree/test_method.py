@@ -127,7 +127,6 @@ def test_what_is_stored_is_chosen_afterwards(ball_scene: Scene, shared_log: Log)
     )
     assert full.train_s == half.train_s  # the same training
     assert full.sizes()["leaves"] == 2 * half.sizes()["leaves"]
-    assert half.settings()["precision"] == "fp16"
     shown = (mean_quality(method, ball_scene, "test") for method in (half, full))
     assert next(shown) == pytest.approx(next(shown), abs=0.05)
     work = Work()

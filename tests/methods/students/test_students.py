@@ -82,9 +82,15 @@ def test_a_training_is_found_again(name: str, ball_scene: Scene, shared_log: Log
     assert torch.equal(*pictures)
 
 
-def test_a_row_of_kilonerf_names_its_own_precision_not_that_of_the_teacher() -> None:
-    method = SMALL["kilonerf"](teacher=replace(TEACHER, precision="bf16"))
-    assert method.settings()["precision"] == "fp32"
+@names
+def test_a_row_names_what_its_own_products_are_computed_in(name: str) -> None:
+    """`stored` is another matter: it is what they are computed from."""
+    teacher = replace(TEACHER, precision="bf16")
+    as_teacher = name in ("nerf", "nsvf")
+    shown = SMALL[name](teacher=teacher).settings()
+    computed = teacher.settings(object)["field_precision"] if as_teacher else "fp32"
+    assert (shown["engine"], shown["precision"]) == ("none", "none")
+    assert shown["field_precision"] == computed
 
 
 REFUSED: list[tuple[Callable[..., Any], str, Any]] = [
