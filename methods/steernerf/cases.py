@@ -65,7 +65,7 @@ def _network() -> Network:
     """The network of the quickest width, untrained; always the same weights."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        renderer = UNet(CHANNELS, FRAMES, SCALE, width=WIDTH, aligned=False)
+        renderer = UNet(CHANNELS, FRAMES, SCALE, width=WIDTH)
     return renderer.network.requires_grad_(False)
 
 

@@ -24,7 +24,7 @@ from methods.kernels.types import expect
 from methods.steernerf.buffer import Buffer
 from methods.steernerf.options import JointOptions, Model, Rendering
 from methods.steernerf.stage2 import Stage2, train_stage2
-from methods.steernerf.unet import Renderer2d
+from methods.steernerf.unet import UNet
 from methods.steernerf.views import Views
 
 HOW = "method.rendering"
@@ -85,7 +85,7 @@ class SteerNerf:
         training: TrainingOptions,
         model: Model,
         rendering: Rendering,
-        renderer: Callable[..., Renderer2d],
+        renderer: Callable[..., UNet],
         joint: JointOptions,
         engine: Engine | Auto,
         steps: int | None = None,

@@ -28,7 +28,7 @@ from methods.kernels.types import Pixels
 from methods.rendering.batch import render_batch
 from methods.rendering.compaction import indices_where
 from methods.rendering.frame import FeatureFrame, everywhere, render_frame, sees_matter
-from methods.steernerf.buffer import Buffer, Points
+from methods.steernerf.buffer import Buffer, PointCloud, Points
 from methods.steernerf.options import JointOptions
 from methods.steernerf.pipeline import Pipeline, View
 from methods.steernerf.unet import Observation
@@ -159,7 +159,7 @@ class Examples:
             buffer = Buffer(maxlen=self.pipeline.model.frames)
             while cloud := checkpoint.part(example, f"{len(buffer)}."):
                 parts = {name: self._unpacked(x) for name, x in cloud.items()}
-                buffer.append(self.pipeline.kept(**parts))
+                buffer.append(PointCloud(**parts))
             self._pool.append(Example(number, buffer, uses, bool(lasting)))
 
     def _unpacked(self, x: Tensor) -> Any:
@@ -175,12 +175,7 @@ class Patch:
     example: Example
     view: View
     truth: Tensor  # [H, W, 3] the true picture
-    points: Points  # features of preceding frames, reprojected into `view`
-
-    @property
-    def counts(self) -> list[int]:
-        """The number of points of each of these frames."""
-        return [len(cloud.points) for cloud in self.example.buffer][: len(self.points.index)]
+    points: Sequence[Points]  # features of preceding frames, as `view` shows them
 
 
 @dataclass(frozen=True)
@@ -207,7 +202,8 @@ class Patches(Examples):
         top, left = self.place(example, side, (view.low.height, view.low.width))
         cut = view.crop((slice(top, top + side), slice(left, left + side)))
         truth = self._truth(example, top, left, cut.full)
-        return Patch(example, cut, truth, self.pipeline.reproject(example.buffer, cut))
+        points = [cloud.shown_in(cut.full, self.pipeline.backend) for cloud in example.buffer]
+        return Patch(example, cut, truth, points)
 
     @cached_property
     def _side(self) -> int:
@@ -255,8 +251,8 @@ class Patches(Examples):
             for patch in patches:
                 frame, points = self._frame(patch.view.low, *next(of_each)), patch.points
                 if self.learning:
-                    points = self._learned(patch, [next(of_each) for _ in patch.points.index])
-                shown.append(Observation(frame, points, self.pipeline.backend))
+                    points = [self._learned(old, *next(of_each)) for old in points]
+                shown.append(Observation(frame, points))
             observations = self.observations(patches, shown)
         truth = torch.stack([patch.truth for patch in patches])
         return Batch(observations, [patch.view for patch in patches], truth, pixels.alpha)
@@ -271,9 +267,9 @@ class Patches(Examples):
         low = patch.view.low
         yield low, sees_matter(low, self.pipeline.occupancy).flatten()
         if self.learning:
-            masks = _shown(patch.points).split(patch.counts)
-            for cloud, mask in zip(patch.example.buffer, masks, strict=False):
-                yield cloud.camera, mask
+            pixels = patch.view.full.width * patch.view.full.height
+            for cloud, points in zip(patch.example.buffer, patch.points, strict=True):
+                yield cloud.camera, points.pixel < pixels
 
     def _frame(self, low: Camera, seen: Tensor, pixels: Pixels) -> FeatureFrame:
         """The frame of the whole patch, from its rendered `pixels`, those at indices `seen`."""
@@ -282,19 +278,7 @@ class Patches(Examples):
         frame = FeatureFrame.of(low, canvas, self.pipeline.background)
         return replace(frame, depth=frame.depth.detach())
 
-    def _learned(self, patch: Patch, rendered: Sequence[tuple[Tensor, Pixels]]) -> Points:
-        """Preceding features: in each frame, those of the shown points are as `rendered` now."""
-        old, background = patch.points, self.pipeline.background
-        frames = zip(old.values.split(patch.counts), rendered, strict=True)
-        each = [
-            values.index_copy(0, shown, pixels.over(background).values)
-            for values, (shown, pixels) in frames
-        ]
-        return replace(old, values=torch.cat([old.values[:0], *each]))
-
-
-def _shown(points: Points) -> Tensor:
-    """Which of P `points` some pixel shows: [P] bool."""
-    count = len(points.values)
-    shown = torch.zeros(count + 1, dtype=torch.bool, device=points.index.device)
-    return shown.index_fill_(0, points.index.flatten().long() % (count + 1), True)[:count]
+    def _learned(self, old: Points, seen: Tensor, pixels: Pixels) -> Points:
+        """Points whose features, of those at indices `seen`, are as rendered now."""
+        values = pixels.over(self.pipeline.background).values
+        return replace(old, values=old.values.index_copy(0, seen, values))

@@ -17,9 +17,9 @@ from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.types import Occupancy
 from methods.rendering.compaction import compacts
 from methods.rendering.frame import FeatureFrame, everywhere, render_frame
-from methods.steernerf.buffer import Buffer, Cloud, Points, reproject
+from methods.steernerf.buffer import Buffer, PointCloud
 from methods.steernerf.options import Model, Rendering
-from methods.steernerf.unet import WHOLE, Observation, Part, Renderer2d
+from methods.steernerf.unet import WHOLE, Observation, Part, UNet
 
 MARGIN = 8  # pixels at low resolution around matter, which the 2D renderer corrects, too
 QUANTUM = 8  # the sides of what it corrects are multiples: libraries prepare code for every size
@@ -62,10 +62,10 @@ class Pipeline:
     preceding frames are used (`select`), what the 2D renderer is shown (`observe`) and draws
     (`draw`), and what later frames need of this one (`keep`, an object of the class `kept`)."""
 
-    kept: type[Cloud] = Cloud
+    kept: type[PointCloud] = PointCloud
 
     def __init__(
-        self, trained: TrainedField, background: Tensor, renderer: Renderer2d, model: Model
+        self, trained: TrainedField, background: Tensor, renderer: UNet, model: Model
     ) -> None:
         self.field, self.occupancy, self.renderer = trained.field, trained.occupancy, renderer
         self.model, self.backend = model, trained.field.backend
@@ -102,17 +102,17 @@ class Pipeline:
         """Update `buffer` as `render` does, but draw no picture: no later frame reads it."""
         view, probe = self.view(camera), NullProbe()
         preceding = self.select(buffer, view, rendering, probe)
-        buffer.appendleft(Cloud.of(self.features(view, preceding, rendering, probe)))
+        buffer.appendleft(PointCloud.of(self.features(view, preceding, rendering, probe)))
 
     def select(
-        self, buffer: Sequence[Cloud], view: View, rendering: Any, probe: Probe
-    ) -> Sequence[Cloud]:
+        self, buffer: Sequence[PointCloud], view: View, rendering: Any, probe: Probe
+    ) -> Sequence[PointCloud]:
         """The preceding frames to use, newest first: all."""
         probe.count("preceding_frames", len(buffer), self.model.frames)
         return tuple(buffer)
 
     def features(
-        self, view: View, preceding: Sequence[Cloud], rendering: Rendering, probe: Probe
+        self, view: View, preceding: Sequence[PointCloud], rendering: Rendering, probe: Probe
     ) -> FeatureFrame:
         """Render features F and depth D at low resolution (Eq. 2 to 5). With range reduction, rays
         are sampled only near the depth of the newest of the `preceding` frames (Eq. 7, 8)."""
@@ -128,14 +128,10 @@ class Pipeline:
             render = everywhere(self.field, where, probe, how)
             return render_frame(view.low, where, self.background, probe, render)
 
-    def reproject(self, preceding: Sequence[Cloud], view: View) -> Points:
-        """The features of the `preceding` frames that the present view shows (Eq. 9, 10)."""
-        return reproject(preceding, view.full, self.model.channels, self.backend)
-
     def observe(
         self,
         frame: FeatureFrame,
-        preceding: Sequence[Cloud],
+        preceding: Sequence[PointCloud],
         view: View,
         rendering: Any,
         probe: Probe,
@@ -147,16 +143,18 @@ class Pipeline:
         drawn = view.crop(part)
         pixels, every = (seen.full.width * seen.full.height for seen in (drawn, view))
         probe.count("drawn_pixels", pixels, every)
-        return Observation(frame, self.reproject(preceding, drawn), self.backend, part)
+        return Observation(
+            frame, [cloud.shown_in(drawn.full, self.backend) for cloud in preceding], part
+        )
 
     def draw(self, shown: Any, view: View, rendering: Any, probe: Probe) -> Tensor:
         """The picture I [H, W, 3] of what the 2D renderer is `shown` (Eq. 11)."""
         with probe.stage("renderer2d"):
-            return self.renderer([shown], probe, clip=True)[0]
+            return self.renderer([shown], probe)[0].clamp_(0, 1)
 
-    def keep(self, frame: FeatureFrame, view: View, picture: Tensor) -> Cloud:
+    def keep(self, frame: FeatureFrame, view: View, picture: Tensor) -> PointCloud:
         """What later frames need of this one: its features and depths as points (Eq. 6)."""
-        return Cloud.of(frame)
+        return PointCloud.of(frame)
 
     def occupied(self, rendering: Rendering) -> Occupancy:
         """Where rays take samples."""

@@ -23,7 +23,7 @@ from methods.rendering.occupancy import EVERY
 from methods.steernerf.options import JointOptions, Model
 from methods.steernerf.patches import Batch, Patches, distilled_views
 from methods.steernerf.pipeline import Pipeline
-from methods.steernerf.unet import Renderer2d
+from methods.steernerf.unet import UNet
 from methods.training import checkpoint, loop
 from methods.training.muon import Muon
 
@@ -44,7 +44,7 @@ class JointTraining:
     asked: loop.Asked | None = None
 
     def __init__(
-        self, renderer: Renderer2d, patches: Patches, steps: int, trained: TrainedField | None
+        self, renderer: UNet, patches: Patches, steps: int, trained: TrainedField | None
     ) -> None:
         self.renderer = self.outcome = renderer
         self.patches, self.options, self.generator = patches, patches.options, patches.generator
@@ -151,7 +151,7 @@ class Stage2:
     pipeline, of its patches and of the training."""
 
     model: Model  # the settings it is trained for
-    renderer: Callable[..., Renderer2d]  # makes the 2D renderer for K, L and s
+    renderer: Callable[..., UNet]  # makes the 2D renderer for K, L and s
     joint: JointOptions  # how it is trained
     after: float = 1.0  # share of the steps whose weights are used, 1 or one of `MARKS`
 
@@ -176,7 +176,7 @@ class Stage2:
             "stage2_libraries": libraries(type(self), kind),
         }
 
-    def make(self, setup: Setup) -> Renderer2d:
+    def make(self, setup: Setup) -> UNet:
         """Make the untrained 2D renderer of the seed and the device of `setup`."""
         torch.manual_seed(setup.seed)
         made: Any = self.renderer(self.model.channels, self.model.frames, self.model.scale)

@@ -91,5 +91,5 @@ def new_pipeline(model: Model = MODEL) -> Pipeline:
     """A misty field and an untrained U-Net on white; always the same weights."""
     torch.manual_seed(0)
     field = misty_field(channels=model.channels)
-    unet = UNet(model.channels, model.frames, model.scale, width=4, aligned=False)
+    unet = UNet(model.channels, model.frames, model.scale, width=4)
     return Pipeline(trained_field(field), torch.ones(3), unet, model)

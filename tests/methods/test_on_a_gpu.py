@@ -80,7 +80,7 @@ def steernerf(field: str, **others: Any) -> Method:
         "training": STAGE1,
         "model": small_model(),
         "rendering": small_rendering(range=RangeReduction("paper", 0.03, "sum")),
-        "renderer": partial(UNet, width=4, aligned=False),
+        "renderer": partial(UNet, width=4),
         "joint": small_joint(field=field, jitter=True, grid_samples=512, **FEW),
         "engine": TorchEngine(),
     }

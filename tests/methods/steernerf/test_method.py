@@ -27,7 +27,7 @@ from tests.methods.models import (
 from tests.methods.trainings import GRID, QUICK
 
 BUDGET = Budget("test", steps=40, samples=1024, renderer_steps=4)
-RENDERER = partial(UNet, width=4, aligned=False)
+RENDERER = partial(UNet, width=4)
 RANGED = RangeReduction("paper", 0.03, "sum")
 
 
