@@ -62,7 +62,8 @@ class PointCloud:
         """The z-depths [h, w, 2] between which each pixel of the low-resolution camera `low` is
         sampled: D - epsilon and D + epsilon, or 0 and inf where no point lands."""
         pixel, depth = self._reprojected(low, backend)
-        found = depth.new_tensor([0, torch.inf]).repeat(low.width * low.height + 1, 1)
+        found = depth.new_zeros(low.width * low.height + 1, 2)
+        found[:, 1] = torch.inf
         found[pixel] = torch.stack((depth - epsilon, depth + epsilon), dim=-1)  # Eq. 8
         return found[:-1].view(low.height, low.width, 2)
 

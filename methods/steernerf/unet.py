@@ -1,4 +1,4 @@
-"""What a 2D renderer is shown and how it draws, and that of the released code (Section 3.3)."""
+"""The 2D renderer: what it is shown, and the U-Net of the released code (Section 3.3)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from methods.steernerf.buffer import Points
 
 UNWATCHED = NullProbe()
 
-Part = tuple[slice, slice]
+Rectangle = tuple[slice, slice]
 """Rows and columns of a low-resolution frame."""
 
 WHOLE = slice(None), slice(None)
@@ -34,7 +34,7 @@ class Observation:
 
     frame: FeatureFrame  # the present features F, [h, w, K]
     preceding: Sequence[Points]  # of at most L preceding frames, newest first, in the `part`
-    part: Part = WHOLE  # of the frame, to be drawn
+    part: Rectangle = WHOLE  # of the frame, to be drawn
 
 
 class UNet(nn.Module):
@@ -54,7 +54,7 @@ class UNet(nn.Module):
         super().__init__()
         expect(1 <= width <= 4096, "renderer.width", "1 to 4096", width)
         self.frames, self.scale = frames, scale
-        self.network = _Network(channels * (frames + 1), width)
+        self.network = _Layers(channels * (frames + 1), width)
 
     def forward(self, observations: Sequence[Observation], probe: Probe = UNWATCHED) -> Tensor:
         """Draw all observations, whose parts have one size: pictures I [B, H, W, 3]."""
@@ -111,7 +111,7 @@ class UNet(nn.Module):
         return picture
 
 
-class _Network(Network):
+class _Layers(Network):
     """The layers of `ReconstructionNet_v4`, with `width` channels at full resolution."""
 
     def __init__(self, inputs: int, width: int) -> None:
@@ -127,6 +127,9 @@ class _Network(Network):
         self.last = _conv(width, 3)
         for layer in (self.widen_quarter, self.widen_half):
             _kaiming(layer, 1.0)
+        for x in self.parameters():
+            if x.dim() == 4:  # as the inputs lie
+                x.data = x.data.contiguous(memory_format=torch.channels_last)
 
     def forward(self, inputs: Tensor) -> tuple[Tensor]:
         """[B, C, H, W] to [B, 3, H, W]; H and W are multiples of `DIVISOR`."""

@@ -64,7 +64,7 @@ def test_what_is_remembered_without_drawing_is_the_same(monkeypatch: pytest.Monk
     pipeline, drawn = new_pipeline(), []
     rendered, remembered = Buffer(maxlen=2), Buffer(maxlen=2)
     pipeline.render(CAMERA, rendered, USUAL, NullProbe())
-    monkeypatch.setattr(pipeline, "draw", lambda *given: drawn.append(given))
+    monkeypatch.setattr(pipeline, "renderer", lambda *given: drawn.append(given))
     pipeline.remember(CAMERA, remembered, USUAL)
     assert not drawn
     for name in ("points", "values", "alpha"):
