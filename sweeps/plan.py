@@ -123,7 +123,7 @@ def _engine_here(experiment: DictConfig) -> list[str]:
     try:
         build(experiment, "engine")
     except Unavailable:
-        return ["engine=torch", "precision=fp32"]
+        return ["precision=fp32"]
     return []
 
 

@@ -78,13 +78,10 @@ class HashField(nn.Module):
         if self.packed is not None:
             self.packed.copy_(pack(self.table))
 
-    def widen(self, channels: int, generator: torch.Generator | None = None) -> None:
-        """Append features up to `channels`, with random initial weights from `generator`; without a
-        generator, they are 1/2 everywhere until they are trained."""
+    def widen(self, channels: int, generator: torch.Generator) -> None:
+        """Append features up to `channels`, with random initial weights from `generator`."""
         old = self.layers["feature_out"].detach()
-        more = torch.zeros(channels - len(old), HIDDEN_CHANNELS)
-        if generator is not None:
-            more = _xavier_uniform(channels, HIDDEN_CHANNELS, generator).detach()[len(old) :]
+        more = _xavier_uniform(channels, HIDDEN_CHANNELS, generator).detach()[len(old) :]
         self.channels = channels
         self.layers["feature_out"] = nn.Parameter(torch.cat((old, more.to(old))))
 

@@ -31,7 +31,6 @@ def render_batch(
     jitter: Tensor | None = None,
     background: Tensor | None = None,
     guide: Field | None = None,
-    hidden: bool = False,
 ) -> tuple[Pixels, int]:
     """Render R `rays` differentiably; also return the number of samples that were composited.
 
@@ -39,18 +38,13 @@ def render_batch(
     weight nor gradient. A first pass finds them, and they are left out.
 
     Args:
-        how: `window` is ignored; without `jitter`, or with `hidden` samples, `thin` is as well.
+        how: `window` is ignored; without `jitter`, `thin` is as well.
         jitter: [R] phase of the samples of each ray, in [0, 1); None: as in `frame.render_rays`.
         background: [K] or [R, K]; None: pixels are not composited on a background.
         guide: a cheaper field whose densities decide in the first pass which samples are hidden,
             and so have neither weight nor gradient; None: `field` itself.
-        hidden: evaluate hidden samples as well, so that the host need not wait for a GPU to count
-            the others.
     """
-    if hidden:
-        samples = march(rays, occupancy, how.step, jitter=jitter, backend=field.backend)
-    else:
-        samples = visible_samples(field, rays, occupancy, how, jitter=jitter, guide=guide)
+    samples = visible_samples(field, rays, occupancy, how, jitter=jitter, guide=guide)
     directions = field.encode_directions(rays.directions)
     sigma, values = query(field, samples.positions, samples.ray, directions, samples.encoded)
     pixels = composite(sigma, values, samples, stop=how.stop, backend=field.backend)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
-from typing import ClassVar
 
 import torch
 
@@ -22,10 +21,10 @@ from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.encode import HashGrid
 from methods.kernels.types import expect
 from methods.steernerf.buffer import Buffer
-from methods.steernerf.options import JointOptions, Model, Rendering
+from methods.steernerf.options import JointOptions, ModelOptions, Rendering
 from methods.steernerf.stage2 import Stage2, train_stage2
-from methods.steernerf.unet import Renderer2d
-from methods.steernerf.views import Views
+from methods.steernerf.unet import UNet
+from methods.steernerf.views import TrainingViews
 
 HOW = "method.rendering"
 SKIPS = {
@@ -70,22 +69,21 @@ class SteerNerf:
     """SteerNeRF: low-resolution features of a field, preceding frames and a 2D renderer.
 
     `grid`, `training` and `precision` are those of the field of stage 1, which other methods share.
-    Stage 2 trains `renderer`, a factory, and the field for `model`, as `joint` says, in `steps`
-    steps (None: `budget.renderer_steps`), of which `Stage2` uses a share `after`. `engine` then
-    computes the 2D renderer's network. `rendering` may be replaced between frames.
+    Stage 2 trains the U-Net that `renderer` makes, and the field, for `model`, as `joint` says, in
+    `steps` steps (None: `budget.renderer_steps`), of which `Stage2` uses a share `after`. `engine`
+    then computes the network of the U-Net. `rendering` may be replaced between frames.
     """
 
     study = STUDY
-    kind: ClassVar[type[Stage2]] = Stage2
 
     def __init__(
         self,
         *,
         grid: HashGrid,
         training: TrainingOptions,
-        model: Model,
+        model: ModelOptions,
         rendering: Rendering,
-        renderer: Callable[..., Renderer2d],
+        renderer: partial[UNet],
         joint: JointOptions,
         engine: Engine | Auto,
         steps: int | None = None,
@@ -99,7 +97,7 @@ class SteerNerf:
         mode, possible = rendering.range.mode, "off without preceding frames (L = 0)"
         expect(model.frames > 0 or mode == "off", "rendering.range.mode", possible, mode)
         expect(steps is None or steps >= 1, "steps", "1 or more, or none", steps)
-        self.stage2 = self.kind(model, renderer, joint, after)
+        self.stage2 = Stage2(model, renderer, joint, after)
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
         engine.check(self.setup.device)
         with torch.random.fork_rng(devices=[]):  # refuses before hours of training
@@ -118,7 +116,7 @@ class SteerNerf:
             given = self.trained, self.setup, self.stage2, scene, budget, log
             self.pipeline, trained, seconds = train_stage2(*given)
         self.train_s = self.trained.train_s + seconds
-        views = Views(self.pipeline, scene, self.stage2.joint, self.setup.seed, log)
+        views = TrainingViews(self.pipeline, scene, self.stage2.joint, self.setup.seed, log)
         renderer, device = self.pipeline.renderer, self.setup.device
 
         def folder(engine: dict[str, object]) -> Path:

@@ -13,7 +13,7 @@ from methods.rendering.sampling import Sampling, check_step
 
 
 @dataclass(frozen=True)
-class Model:
+class ModelOptions:
     """What a SteerNeRF is trained for: changing any of it requires training again."""
 
     channels: int  # K, number of features of the field; the first three are RGB
@@ -76,23 +76,18 @@ class Rendering:
 
 @dataclass(frozen=True)
 class MotionOptions:
-    """The synthetic motions before a training view."""
+    """The synthetic motions of L frames before a training view."""
 
     degrees: tuple[float, float]  # range of the angular speed, in degrees per frame
-    length: int  # maximum number of frames that precede a view
-    least: int  # minimum number; fewer than L, and sometimes none, teach the cold start
     pool: int  # examples kept at a time
     uses: int  # patches cut from an example before it is replaced
-    longer: float  # probability that it is continued instead, there and back to its view
 
     def __post_init__(self) -> None:
-        least, degrees = self.least, self.degrees
+        degrees = self.degrees
         ordered = len(degrees) == 2 and 0 <= degrees[0] <= degrees[1]
         expect(ordered, "joint.motion.degrees", "a range from 0 on", degrees)
-        expect(0 <= least <= self.length, "joint.motion.least", "0 to joint.motion.length", least)
         expect(self.pool >= 1, "joint.motion.pool", "1 or more", self.pool)
         expect(self.uses >= 1, "joint.motion.uses", "1 or more", self.uses)
-        expect(0 <= self.longer < 1, "joint.motion.longer", "a share of less than 1", self.longer)
 
 
 @dataclass(frozen=True)
@@ -100,7 +95,6 @@ class JointOptions:
     """How stage 2 is trained; rates fall or wave along `methods.training.loop.cosine`."""
 
     field: Literal["joint", "frozen"]  # frozen: as stage 1 left it (the paper's Table 5)
-    features: Literal["random", "constant"]  # initial features beyond RGB; constant: 1/2
     optimiser: Literal["muon", "adam"]  # of the 2D renderer; adam, as in the release
     rate: float  # initial learning rate of the 2D renderer
     field_rate: float  # initial learning rate of the field
@@ -131,14 +125,12 @@ class JointOptions:
         expect(views >= 0, "joint.distilled_views", "0 or more", views)
         expect(0 <= share <= 1, "joint.distilled_share", "a share of 0 to 1", share)
 
-    def rendering(self, model: Model) -> Rendering:
+    def rendering(self, model: ModelOptions) -> Rendering:
         """How frames are rendered in training: everywhere, which serves all later choices."""
         skip = Skips(empty=True, hidden=True, background=True)
         return Rendering(model.step, model.stop, EVERYWHERE, skip)
 
-    def distilled(self, steps: int, frames: int) -> int:
-        """How many distilled views a training of `steps` steps can use. With no preceding `frames`
-        (L = 0), examples are never continued."""
-        longer = self.motion.longer if frames else 0.0
-        examples = self.motion.pool + (1 - longer) * steps * self.batch / self.motion.uses
+    def distilled(self, steps: int) -> int:
+        """How many distilled views a training of `steps` steps can use."""
+        examples = self.motion.pool + steps * self.batch / self.motion.uses
         return min(self.distilled_views, math.ceil(self.distilled_share * examples))

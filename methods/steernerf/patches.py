@@ -2,68 +2,35 @@
 
 Training views are scattered, so the preceding cameras are synthetic: a random smooth motion that
 ends at the view. The pipeline renders these frames with its present weights, as it does when it is
-used. After a number of patches they are rendered again, along another motion.
+used. After a number of patches they are replaced, by those before another view.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate
-from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from bench.cameras import cast, pack_camera, pixel_grid, place_camera, unpack_camera
-from bench.motion import novel_view, preceding, viewing_target
-from bench.provenance import digest
-from bench.sharing import missing
-from bench.types import Budget, Camera, Log, NullProbe, Rays, Scene, Split, composite
-from methods.instant_ngp.stage1 import Setup, TrainedField
+from bench.motion import preceding, viewing_target
+from bench.types import Camera, Rays, Scene, Split, composite
 from methods.kernels.types import Pixels
 from methods.rendering.batch import render_batch
 from methods.rendering.compaction import indices_where
-from methods.rendering.frame import FeatureFrame, everywhere, render_frame, sees_matter
-from methods.steernerf.buffer import Buffer, Points
+from methods.rendering.frame import FeatureFrame, sees_matter
+from methods.steernerf.buffer import Buffer, PointCloud, Points
 from methods.steernerf.options import JointOptions
-from methods.steernerf.pipeline import Pipeline, View
+from methods.steernerf.pipeline import Pipeline, TwoScales
 from methods.steernerf.unet import Observation
 from methods.training import checkpoint
 
-
-def distilled_views(
-    setup: Setup, trained: TrainedField, scene: Scene, budget: Budget, count: int, log: Log
-) -> tuple[Split, float]:
-    """Render `count` random views among the training cameras with `trained`, at full resolution,
-    or load them if they were rendered before; also return the seconds that took (Section 3.5)."""
-    if not count:
-        return Split([], [], []), 0.0
-    key = {**setup.key(scene, budget), "views": count, "distillation": digest(distilled_views)}
-    path = log.stage_dir("distilled", key) / "views.safetensors"
-    generator = torch.Generator().manual_seed(setup.seed)
-    taken, target = scene.splits["train"].cameras, viewing_target(scene)
-    cameras = [novel_view(taken, target, generator) for _ in range(count)]
-    names = [str(number) for number in range(count)]
-    with missing(path, log) as to_render:
-        if to_render:
-            began, pictures, probe = time.monotonic(), {}, NullProbe()
-            field, occupancy = trained.field, trained.occupancy
-            background = scene.background.to(field.device)
-            render = everywhere(field, occupancy, probe, trained.sampling)
-            with log.progress("distilling", count) as progress:
-                for name, camera in zip(names, cameras, strict=True):
-                    placed = place_camera(camera, field.device)
-                    rgb = render_frame(placed, occupancy, background, probe, render).values
-                    pictures[name] = (rgb.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
-                    progress.advance()
-            checkpoint.write(path, pictures, {"seconds": time.monotonic() - began})
-    pictures, figures = checkpoint.read(path)
-    with checkpoint.restoring(path):
-        return Split(cameras, [pictures[name] for name in names], names), figures["seconds"]
+Rendered = Iterator[tuple[Tensor, Pixels]]
+"""Indices of pixels of a frame, and those pixels, frame by frame."""
 
 
 @dataclass
@@ -73,13 +40,31 @@ class Example:
     number: int  # of the view
     buffer: Buffer  # the preceding frames
     uses: int  # patches that may still be cut from it
-    lasting: bool  # whether it is then continued instead of replaced
 
 
-class Examples:
-    """A pool of examples that end in random views, those of `scene` and `distilled` ones. The
-    frames before a view are rendered by `pipeline`; `options.motion` says when an example is
-    replaced; `generator` is the source of all random numbers."""
+@dataclass(frozen=True)
+class Patch:
+    """A patch of the view that an example ends in."""
+
+    example: Example
+    view: TwoScales
+    truth: Tensor  # [H, W, 3] the true picture
+    points: Sequence[Points]  # features of the preceding frames, where `view` shows them
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Patches to learn from."""
+
+    observations: Sequence[Observation]  # with a gradient if the field learns
+    truth: Tensor  # [B, H, W, 3] the true pictures
+    opacity: Tensor  # [R] of all rendered rays
+
+
+class Patches:
+    """Batches of random patches of the views of `scene` and of `distilled` ones. Each is cut from
+    an example, one of a pool, whose preceding frames are rendered by `pipeline`; `generator` is the
+    source of all random numbers."""
 
     def __init__(
         self,
@@ -97,117 +82,47 @@ class Examples:
         self.pictures = [*real.images, *distilled.images]
         self._real, self._distilled = len(real), len(distilled)
 
-    def example(self) -> Example:
-        """Draw an example from the pool; counts as one use."""
-        place = min(self.random(self.options.motion.pool), len(self._pool))
-        old = self._pool[place] if place < len(self._pool) else None
-        if old is None or old.uses <= 0:
-            self._pool[place : place + 1] = [self._following(old)]
-        self._pool[place].uses -= 1
-        return self._pool[place]
-
-    def _following(self, old: Example | None) -> Example:
-        """Continue a lasting `old` example, there and back from its view, or begin another one."""
-        options, frames = self.options, self.pipeline.model.frames
-        if old and old.lasting:
-            number, buffer = old.number, old.buffer.copy()
-            back = self._before(number)  # half of it and back: the view is again the last frame
-            back = back[len(back) // 2 :]
-            path = [self.cameras[number], *reversed(back), *back[1:]]
-        else:
-            distilled = self._chance() < options.distilled_share and self._distilled > 0
-            number = self.random(self._distilled if distilled else self._real)
-            number += self._real if distilled else 0
-            path, buffer = self._before(number), Buffer(maxlen=frames)
-        if frames:
-            for camera in path:
-                self.pipeline.remember(camera, buffer, self.rendering)
-        # Without preceding frames, continuing would only repeat the view.
-        lasting = self._chance() < options.motion.longer and frames > 0
-        return Example(number, buffer, options.motion.uses, lasting)
-
-    def _before(self, number: int) -> list[Camera]:
-        """A random motion that ends at a view."""
-        motion, view = self.options.motion, self.cameras[number]
-        count = motion.least + self.random(motion.length - motion.least + 1)
-        return preceding(view, self._target, count, motion.degrees, self.generator)
-
-    def _chance(self) -> float:
-        return torch.rand((), generator=self.generator).item()
-
-    def random(self, below: int) -> int:
-        """A random number of 0 to less than `below`."""
-        return int(torch.randint(below, (), generator=self.generator))
-
-    def state(self) -> dict[str, Tensor]:
-        """All examples, to be kept in a file."""
-        tensors = {}
-        for place, example in enumerate(self._pool):
-            figures = example.number, example.uses, example.lasting
-            tensors[f"{place}.figures"] = torch.tensor(figures)
-            for age, cloud in enumerate(example.buffer):
-                for name, x in vars(cloud).items():
-                    packed = pack_camera(x) if isinstance(x, Camera) else x
-                    tensors[f"{place}.{age}.{name}"] = packed
-        return tensors
-
-    def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore the examples that `state` returned, with the same views and options."""
-        self._pool = []
-        while example := checkpoint.part(tensors, f"{len(self._pool)}."):
-            number, uses, lasting = example["figures"].tolist()
-            buffer = Buffer(maxlen=self.pipeline.model.frames)
-            while cloud := checkpoint.part(example, f"{len(buffer)}."):
-                parts = {name: self._unpacked(x) for name, x in cloud.items()}
-                buffer.append(self.pipeline.kept(**parts))
-            self._pool.append(Example(number, buffer, uses, bool(lasting)))
-
-    def _unpacked(self, x: Tensor) -> Any:
-        """A part of a cloud, of which only cameras are kept in float64, on the device."""
-        device = self.pipeline.background.device
-        return place_camera(unpack_camera(x), device) if x.dtype == torch.float64 else x.to(device)
-
-
-@dataclass(frozen=True)
-class Patch:
-    """A patch of the view that an example ends in."""
-
-    example: Example
-    view: View
-    truth: Tensor  # [H, W, 3] the true picture
-    points: Points  # features of preceding frames, reprojected into `view`
-
-    @property
-    def counts(self) -> list[int]:
-        """The number of points of each of these frames."""
-        return [len(cloud.points) for cloud in self.example.buffer][: len(self.points.index)]
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Patches to learn from."""
-
-    observations: Sequence[Any]  # the input of the 2D renderer; with a gradient if the field learns
-    views: Sequence[View]
-    truth: Tensor  # [B, H, W, 3] the true pictures
-    opacity: Tensor  # [R] of all rendered rays
-
-
-class Patches(Examples):
-    """Batches of random patches, each cut from an example. A subclass may override `place` and
-    `observations`."""
-
     def draw(self, count: int) -> Batch:
         """Draw `count` patches."""
         return self.render([self.cut(self.example()) for _ in range(count)])
 
+    def example(self) -> Example:
+        """Draw an example from the pool; counts as one use."""
+        place = min(self._random(self.options.motion.pool), len(self._pool))
+        if place == len(self._pool) or not self._pool[place].uses:
+            self._pool[place : place + 1] = [self._another()]
+        self._pool[place].uses -= 1
+        return self._pool[place]
+
+    def _another(self) -> Example:
+        """An example of a random view, behind L frames of a random motion."""
+        options, frames = self.options, self.pipeline.model.frames
+        distilled = self._chance() < options.distilled_share and self._distilled > 0
+        number = self._random(self._distilled if distilled else self._real)
+        number += self._real if distilled else 0
+        # This number, and that after the loop, are not used: without them, all others would change.
+        self._random(1)
+        view, buffer, degrees = self.cameras[number], Buffer(maxlen=frames), options.motion.degrees
+        for camera in preceding(view, self._target, frames, degrees, self.generator):
+            self.pipeline.remember(camera, buffer, self.rendering)
+        self._chance()
+        return Example(number, buffer, options.motion.uses)
+
+    def _chance(self) -> float:
+        return torch.rand((), generator=self.generator).item()
+
+    def _random(self, below: int) -> int:
+        """A random number of 0 to less than `below`."""
+        return int(torch.randint(below, (), generator=self.generator))
+
     def cut(self, example: Example) -> Patch:
         """Cut a random square from `example`."""
         view, side = self.pipeline.view(self.cameras[example.number]), self._side
-        top, left = self.place(example, side, (view.low.height, view.low.width))
+        top, left = (self._random(size - side + 1) for size in (view.low.height, view.low.width))
         cut = view.crop((slice(top, top + side), slice(left, left + side)))
         truth = self._truth(example, top, left, cut.full)
-        return Patch(example, cut, truth, self.pipeline.reproject(example.buffer, cut))
+        points = [cloud.shown_in(cut.full, self.pipeline.backend) for cloud in example.buffer]
+        return Patch(example, cut, truth, points)
 
     @cached_property
     def _side(self) -> int:
@@ -215,10 +130,6 @@ class Patches(Examples):
         shortest = min(min(camera.width, camera.height) for camera in self.cameras)
         share = self.options.patch_share * -(-shortest // self.pipeline.model.scale)
         return min(self.options.patch, max(1, int(share)))
-
-    def place(self, example: Example, side: int, size: tuple[int, int]) -> Sequence[int]:
-        """Choose the first row and column of a patch of `side` in a frame of `size` h, w."""
-        return [self.random(extent - side + 1) for extent in size]
 
     def _truth(self, example: Example, top: int, left: int, full: Camera) -> Tensor:
         """The true picture [H, W, 3] of the patch. Beyond the border of a picture whose sides are
@@ -232,8 +143,8 @@ class Patches(Examples):
         return functional.pad(part.movedim(-1, 0), beyond, mode="replicate").movedim(0, -1)
 
     def render(self, patches: Sequence[Patch]) -> Batch:
-        """Render `patches` as far as the input of the 2D renderer."""
-        parts = [part for patch in patches for part in self._rendered(patch)]
+        """Render `patches` as far as the input of the 2D renderer; rays of all go together."""
+        parts = [part for patch in patches for part in self._to_render(patch)]
         chosen = indices_where([mask for _, mask in parts])
         each = [
             cast(camera, pixel_grid(camera.width, camera.height, some.device)[some])
@@ -247,54 +158,58 @@ class Patches(Examples):
             how, occupancy = self.rendering.sampling, self.pipeline.occupancy
             pixels, _ = render_batch(field, rays, occupancy, how, jitter=jitter)
             ends = accumulate(map(len, chosen))
-            of_each = (  # in the order of `_rendered`
+            rendered = (  # in the order of `_to_render`
                 (some, pixels.take(slice(end - len(some), end)))
                 for some, end in zip(chosen, ends, strict=True)
             )
-            shown = []
-            for patch in patches:
-                frame, points = self._frame(patch.view.low, *next(of_each)), patch.points
-                if self.learning:
-                    points = self._learned(patch, [next(of_each) for _ in patch.points.index])
-                shown.append(Observation(frame, points, self.pipeline.backend))
-            observations = self.observations(patches, shown)
+            observations = [self._observation(patch, rendered) for patch in patches]
         truth = torch.stack([patch.truth for patch in patches])
-        return Batch(observations, [patch.view for patch in patches], truth, pixels.alpha)
+        return Batch(observations, truth, pixels.alpha)
 
-    def observations(self, patches: Sequence[Patch], shown: Sequence[Observation]) -> Sequence[Any]:
-        """What the 2D renderer is shown of `patches`: all that is `shown`."""
-        return shown
-
-    def _rendered(self, patch: Patch) -> Iterator[tuple[Camera, Tensor]]:
-        """Cameras, and which of their pixels [h w] are rendered: the present one and, if the field
-        learns from them, those of the preceding frames."""
-        low = patch.view.low
+    def _to_render(self, patch: Patch) -> Iterator[tuple[Camera, Tensor]]:
+        """Cameras, and which of their pixels [h w] are rendered: of the present frame, those that
+        may see matter; if the field learns, of the preceding frames those that the patch shows."""
+        low, full = patch.view.low, patch.view.full
         yield low, sees_matter(low, self.pipeline.occupancy).flatten()
         if self.learning:
-            masks = _shown(patch.points).split(patch.counts)
-            for cloud, mask in zip(patch.example.buffer, masks, strict=False):
-                yield cloud.camera, mask
+            for cloud, points in zip(patch.example.buffer, patch.points, strict=True):
+                yield cloud.camera, points.pixel < full.width * full.height
 
-    def _frame(self, low: Camera, seen: Tensor, pixels: Pixels) -> FeatureFrame:
-        """The frame of the whole patch, from its rendered `pixels`, those at indices `seen`."""
+    def _observation(self, patch: Patch, rendered: Rendered) -> Observation:
+        """What the 2D renderer is shown of `patch`, of which pixels are as `rendered` now."""
+        low, background = patch.view.low, self.pipeline.background
+        seen, pixels = next(rendered)
         canvas = Pixels.blank(low.height * low.width, pixels.values.shape[1], seen.device)
         canvas.put(seen, pixels)
-        frame = FeatureFrame.of(low, canvas, self.pipeline.background)
-        return replace(frame, depth=frame.depth.detach())
+        frame = FeatureFrame.of(low, canvas, background)
+        points = patch.points
+        if self.learning:
+            points = [_renewed(old, *next(rendered), background) for old in points]
+        return Observation(replace(frame, depth=frame.depth.detach()), points)
 
-    def _learned(self, patch: Patch, rendered: Sequence[tuple[Tensor, Pixels]]) -> Points:
-        """Preceding features: in each frame, those of the shown points are as `rendered` now."""
-        old, background = patch.points, self.pipeline.background
-        frames = zip(old.values.split(patch.counts), rendered, strict=True)
-        each = [
-            values.index_copy(0, shown, pixels.over(background).values)
-            for values, (shown, pixels) in frames
-        ]
-        return replace(old, values=torch.cat([old.values[:0], *each]))
+    def state(self) -> dict[str, Tensor]:
+        """All examples, to be kept in a file."""
+        tensors = {}
+        for place, example in enumerate(self._pool):
+            tensors[f"{place}.figures"] = torch.tensor((example.number, example.uses))
+            for age, cloud in enumerate(example.buffer):
+                parts = {**vars(cloud), "camera": pack_camera(cloud.camera)}
+                tensors |= {f"{place}.{age}.{name}": x for name, x in parts.items()}
+        return tensors
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Restore the examples that `state` returned, with the same views and options."""
+        self._pool, device = [], self.pipeline.background.device
+        while example := checkpoint.part(tensors, f"{len(self._pool)}."):
+            number, uses = example["figures"].tolist()
+            buffer = Buffer(maxlen=self.pipeline.model.frames)
+            while cloud := checkpoint.part(example, f"{len(buffer)}."):
+                camera = place_camera(unpack_camera(cloud.pop("camera")), device)
+                parts = {name: x.to(device) for name, x in cloud.items()}
+                buffer.append(PointCloud(camera, **parts))
+            self._pool.append(Example(number, buffer, uses))
 
 
-def _shown(points: Points) -> Tensor:
-    """Which of P `points` some pixel shows: [P] bool."""
-    count = len(points.values)
-    shown = torch.zeros(count + 1, dtype=torch.bool, device=points.index.device)
-    return shown.index_fill_(0, points.index.flatten().long() % (count + 1), True)[:count]
+def _renewed(old: Points, seen: Tensor, pixels: Pixels, background: Tensor) -> Points:
+    """Points whose features, of those at indices `seen`, are as rendered now."""
+    return replace(old, values=old.values.index_copy(0, seen, pixels.over(background).values))

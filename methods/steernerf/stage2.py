@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
-from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -20,10 +19,11 @@ from methods.kernels import multiplies_bf16
 from methods.kernels.types import expect
 from methods.rendering.batch import opacity_entropy
 from methods.rendering.occupancy import EVERY
-from methods.steernerf.options import JointOptions, Model
-from methods.steernerf.patches import Batch, Patches, distilled_views
+from methods.steernerf.distillation import distilled_views
+from methods.steernerf.options import JointOptions, ModelOptions
+from methods.steernerf.patches import Patches
 from methods.steernerf.pipeline import Pipeline
-from methods.steernerf.unet import Renderer2d
+from methods.steernerf.unet import UNet
 from methods.training import checkpoint, loop
 from methods.training.muon import Muon
 
@@ -35,19 +35,80 @@ MUON = 5
 rate."""
 
 
+@dataclass(frozen=True)
+class Stage2:
+    """What is trained in stage 2, and how."""
+
+    model: ModelOptions  # the settings it is trained for
+    renderer: partial[UNet]  # makes the 2D renderer for K, L and s
+    joint: JointOptions  # how it is trained
+    after: float = 1.0  # share of the steps whose weights are used, 1 or one of `MARKS`
+
+    def __post_init__(self) -> None:
+        marks = ", ".join(map(str, MARKS))
+        expect(self.after in (*MARKS, 1), "after", f"{marks} or 1", self.after)
+
+    def key(self, budget: Budget) -> dict[str, object]:
+        """Everything that the training depends on, besides the field of stage 1."""
+        return {
+            "renderer_steps": budget.renderer_steps,
+            "model": asdict(self.model),
+            "renderer": self.renderer.keywords,
+            "joint": asdict(self.joint),
+            "stage2": digest(Stage2, self.renderer.func),
+            "stage2_libraries": libraries(Stage2),
+        }
+
+    def make(self, setup: Setup) -> UNet:
+        """Make the untrained 2D renderer of the seed and the device of `setup`."""
+        torch.manual_seed(setup.seed)
+        model = self.model
+        return self.renderer(model.channels, model.frames, model.scale).to(setup.device)
+
+
+def train_stage2(
+    trained: TrainedField, setup: Setup, stage2: Stage2, scene: Scene, budget: Budget, log: Log
+) -> tuple[Pipeline, dict[str, object], float]:
+    """Train `stage2` on the field that `setup` made for `scene`, or load the result of the same
+    training. The field is widened to K features and changed in place. Returns the pipeline, the
+    key of its weights, and the seconds of stage 2 spent on them."""
+    model, joint, steps = stage2.model, stage2.joint, budget.renderer_steps
+    key = {**setup.key(scene, budget), **stage2.key(budget)}
+    folder = log.stage_dir("steernerf", key)
+    finished = folder / "steernerf.safetensors"
+    count = 0 if finished.exists() else joint.distilled(steps)
+    # These show the field of stage 1, which is changed from here on.
+    distilled, distilled_s = distilled_views(setup, trained, scene, budget, count, log)
+    trained.field.widen(model.channels, torch.Generator().manual_seed(setup.seed))
+
+    renderer, generator = stage2.make(setup), torch.Generator().manual_seed(setup.seed)
+    pipeline = Pipeline(trained, scene.background, renderer, model)
+    patches = Patches(pipeline, scene, distilled, joint, generator)
+    training = JointTraining(renderer, patches, steps, trained if patches.learning else None)
+    training.seconds = distilled_s
+
+    marks = {folder / f"after-{share}.safetensors": math.ceil(share * steps) for share in MARKS}
+    loop.train(training, finished, "training the 2D renderer", log, marks)
+    if stage2.after < 1:
+        loop.load(training, folder / f"after-{stage2.after}.safetensors")
+        key["after"] = stage2.after
+    trained.field.requires_grad_(False).gradients = None
+    renderer.requires_grad_(False)
+    return pipeline, key, training.seconds
+
+
 class JointTraining:
     """Stage 2 as a `loop.Training`: trains `renderer` in place, on patches from `patches`, and the
-    field `trained`, unless that is None: then it is frozen. `outcome` is the 2D renderer that
-    results. A subclass may override `judge`, `update` and `outcome`."""
+    field `trained`, unless that is None: then it is frozen."""
 
     advice = "Try smaller learning rates (method.joint.rate, method.joint.field_rate)."
     asked: loop.Asked | None = None
 
     def __init__(
-        self, renderer: Renderer2d, patches: Patches, steps: int, trained: TrainedField | None
+        self, renderer: UNet, patches: Patches, steps: int, trained: TrainedField | None
     ) -> None:
-        self.renderer = self.outcome = renderer
-        self.patches, self.options, self.generator = patches, patches.options, patches.generator
+        self.renderer, self.patches = renderer, patches
+        self.options, self.generator = patches.options, patches.generator
         self.step, self.steps, self.seconds = 0, steps, 0.0
         self.trained = trained
         if trained is not None:
@@ -75,28 +136,19 @@ class JointTraining:
         batch = self.patches.draw(self.options.batch)
         kind = batch.truth.device.type
         with torch.autocast(kind, torch.bfloat16, enabled=multiplies_bf16(kind)):
-            drawn = self.renderer(batch.observations)
-        pictures, more = self.judge(drawn, batch)
-        loss = functional.mse_loss(pictures, batch.truth)
-        (loss + more).backward()
-        errors = loop.look(self, {"": loss}, {"loss": loss, "picture": pictures})
-        self.update()
-        self.step += 1
-        return errors
-
-    def judge(self, drawn: Any, batch: Batch) -> tuple[Tensor, Tensor | float]:
-        """The pictures that the renderer has `drawn`, and the loss besides their squared error."""
+            pictures = self.renderer(batch.observations)
+        loss = error = functional.mse_loss(pictures, batch.truth)
         if self.trained and len(batch.opacity):
-            return drawn, self.options.opacity_entropy * opacity_entropy(batch.opacity)
-        return drawn, 0.0
-
-    def update(self) -> None:
-        """Update the weights."""
+            loss = error + self.options.opacity_entropy * opacity_entropy(batch.opacity)
+        loss.backward()
+        errors = loop.look(self, {"": error}, {"loss": error, "picture": pictures})
         rate = self.rate_now(self.options.rate)
         for name, optimiser in self.optimisers.items():
             loop.step_at(optimiser, MUON * rate if name == "muon" else rate)
         if self.trained:
             self.field_optimiser.step(self.rate_now(self.options.field_rate))
+        self.step += 1
+        return errors
 
     def rate_now(self, first: float) -> float:
         """The learning rate of the next step, for one that starts at `first`."""
@@ -110,7 +162,7 @@ class JointTraining:
 
     def result(self) -> dict[str, Tensor]:
         """Renderer, and field and density grid if they learn."""
-        result = self.outcome.state_dict(prefix="outcome.")
+        result = self.renderer.state_dict(prefix="renderer.")
         if self.trained:
             result |= self.trained.field.state_dict(prefix="field.")
             result["grid.density"] = self.trained.grid.density
@@ -118,7 +170,7 @@ class JointTraining:
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
         """Restore what `result` returned."""
-        self.outcome.load_state_dict(checkpoint.part(tensors, "outcome."))
+        self.renderer.load_state_dict(checkpoint.part(tensors, "renderer."))
         if self.trained:
             restore_field(self.trained.field, self.trained.grid, tensors)
             self.patches.pipeline.occupancy = self.trained.grid.occupancy
@@ -143,73 +195,3 @@ class JointTraining:
         if self.trained:
             self.field_optimiser.restore(tensors)
             self._visits.set_state(tensors["visits"].cpu())
-
-
-@dataclass(frozen=True)
-class Stage2:
-    """What is trained in stage 2, and how. A variant of the method has other classes of the
-    pipeline, of its patches and of the training."""
-
-    model: Model  # the settings it is trained for
-    renderer: Callable[..., Renderer2d]  # makes the 2D renderer for K, L and s
-    joint: JointOptions  # how it is trained
-    after: float = 1.0  # share of the steps whose weights are used, 1 or one of `MARKS`
-
-    pipeline: ClassVar[type[Pipeline]] = Pipeline
-    patches: ClassVar[type[Patches]] = Patches
-    training: ClassVar[type[JointTraining]] = JointTraining
-
-    def __post_init__(self) -> None:
-        marks = ", ".join(map(str, MARKS))
-        expect(self.after in (*MARKS, 1), "after", f"{marks} or 1", self.after)
-
-    def key(self, budget: Budget) -> dict[str, object]:
-        """Everything that the training depends on, besides the field of stage 1."""
-        make: Any = self.renderer
-        kind, settings = (make.func, make.keywords) if isinstance(make, partial) else (make, {})
-        return {
-            "renderer_steps": budget.renderer_steps,
-            "model": asdict(self.model),
-            "renderer": {"kind": f"{kind.__module__}.{kind.__qualname__}", **settings},
-            "joint": asdict(self.joint),
-            "stage2": digest(type(self), kind),
-            "stage2_libraries": libraries(type(self), kind),
-        }
-
-    def make(self, setup: Setup) -> Renderer2d:
-        """Make the untrained 2D renderer of the seed and the device of `setup`."""
-        torch.manual_seed(setup.seed)
-        made: Any = self.renderer(self.model.channels, self.model.frames, self.model.scale)
-        return made.to(setup.device, memory_format=torch.channels_last)
-
-
-def train_stage2(
-    trained: TrainedField, setup: Setup, stage2: Stage2, scene: Scene, budget: Budget, log: Log
-) -> tuple[Pipeline, dict[str, object], float]:
-    """Train `stage2` on the field that `setup` made for `scene`, or load the result of the same
-    training. The field is widened to K features and changed in place. Returns the pipeline, the
-    key of its weights, and the seconds of stage 2 spent on them."""
-    model, joint, steps = stage2.model, stage2.joint, budget.renderer_steps
-    key = {**setup.key(scene, budget), **stage2.key(budget)}
-    folder = log.stage_dir("steernerf", key)
-    finished = folder / "steernerf.safetensors"
-    count = 0 if finished.exists() else joint.distilled(steps, model.frames)
-    # These show the field of stage 1, which is changed from here on.
-    distilled, distilled_s = distilled_views(setup, trained, scene, budget, count, log)
-    random = torch.Generator().manual_seed(setup.seed) if joint.features == "random" else None
-    trained.field.widen(model.channels, random)
-
-    renderer, generator = stage2.make(setup), torch.Generator().manual_seed(setup.seed)
-    pipeline = stage2.pipeline(trained, scene.background, renderer, model)
-    patches = stage2.patches(pipeline, scene, distilled, joint, generator)
-    training = stage2.training(renderer, patches, steps, trained if patches.learning else None)
-    pipeline.renderer, training.seconds = training.outcome, distilled_s
-
-    marks = {folder / f"after-{share}.safetensors": math.ceil(share * steps) for share in MARKS}
-    loop.train(training, finished, "training the 2D renderer", log, marks)
-    if stage2.after < 1:
-        loop.load(training, folder / f"after-{stage2.after}.safetensors")
-        key["after"] = stage2.after
-    trained.field.requires_grad_(False).gradients = None
-    pipeline.renderer.requires_grad_(False)
-    return pipeline, key, training.seconds

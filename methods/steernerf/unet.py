@@ -1,4 +1,4 @@
-"""What a 2D renderer is shown and how it draws, and that of the released code (Section 3.3)."""
+"""The 2D renderer: what it is shown, and the U-Net of the released code (Section 3.3)."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ from methods.engines.network import Built, Network
 from methods.kernels.types import expect
 from methods.rendering.frame import FeatureFrame
 from methods.steernerf.buffer import Points
-from methods.steernerf.kernels.drawing import corrected, shown
 
 UNWATCHED = NullProbe()
 
-Part = tuple[slice, slice]
+Rectangle = tuple[slice, slice]
 """Rows and columns of a low-resolution frame."""
 
 WHOLE = slice(None), slice(None)
@@ -31,107 +30,88 @@ DIVISOR = 4  # of the sides of the network's pictures, which it halves twice
 
 @dataclass(frozen=True)
 class Observation:
-    """What the 2D renderer is shown."""
+    """What the U-Net is shown of a view."""
 
     frame: FeatureFrame  # the present features F, [h, w, K]
-    preceding: Points  # of preceding frames, newest first, indices [L', H', W'], L' at most L
-    backend: str  # of the kernels that a renderer calls
-    part: Part = WHOLE  # of the frame, to be drawn; the H' x W' pixels are of this part
-
-    def inside(self, height: int, width: int) -> Part:
-        """What is drawn of the `height` x `width` pixels of the part, without its border.
-
-        Zeros beyond the border change what the network draws there by less than a grey level, but
-        such a line across a white background costs 0.01 of LPIPS.
-        """
-        kept = []
-        for one, side, pixels in zip(
-            self.part, self.frame.values.shape, (height, width), strict=False
-        ):
-            begin, end, _ = one.indices(side)
-            kept.append(slice(RIM if begin else 0, pixels - (RIM if end < side else 0)))
-        return kept[0], kept[1]
+    preceding: Sequence[Points]  # of at most L preceding frames, newest first, in the `part`
+    part: Rectangle = WHOLE  # of the frame, to be drawn
 
 
-class Renderer2d(nn.Module):
-    """Turns observations into pictures [B, H, W, 3] with a `network`, which an `engine` computes if
-    set (Eq. 11). A subclass has a method `forward(observations, probe)`, as that of `UNet`."""
-
-    network: Network
-    engine: Built | None = None
-
-    def run(self, probe: Probe, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Compute the network's output."""
-        probe.count("products", self.network.products(*inputs))
-        with probe.stage("network"):
-            return (self.engine.run if self.engine else self.network)(*inputs)
-
-
-class UNet(Renderer2d):
+class UNet(nn.Module):
     """The U-Net of the released code (`ReconstructionNet_v4`), at full resolution.
 
     Its inputs are the features of all frames: those of the present frame at every s-th pixel, those
     of the preceding frames at the pixels where their points land, zero elsewhere. Its output is
-    added to the bilinearly enlarged RGB of the present frame, which keeps every pixel in its place
-    if `aligned`; the release uses align_corners=True, which moves all pixels but the middle one.
-    `channels`, `frames`, `scale` are K, L, s; `width` is the number of channels at full size.
+    added to the bilinearly enlarged RGB of the present frame, of which, as in the release, the
+    corners keep their places (`align_corners=True`): all pixels but the middle one move.
+    `channels`, `frames`, `scale` are K, L, s; `width` is the number of channels at full size. The
+    `engine` computes the `network`, if there is one.
     """
 
-    network: _Network
+    engine: Built | None = None
 
-    def __init__(
-        self, channels: int, frames: int, scale: int, *, width: int, aligned: bool
-    ) -> None:
+    def __init__(self, channels: int, frames: int, scale: int, *, width: int) -> None:
         super().__init__()
         expect(1 <= width <= 4096, "renderer.width", "1 to 4096", width)
-        self.channels, self.frames, self.scale, self.aligned = channels, frames, scale, aligned
-        self.network = _Network(channels * (frames + 1), width)
-        self._memory = torch.empty(0)  # of the last input
+        self.frames, self.scale = frames, scale
+        self.network = _Layers(channels * (frames + 1), width)
 
-    def forward(
-        self,
-        observations: Sequence[Observation],
-        probe: Probe = UNWATCHED,
-        *,
-        clip: bool = False,
-    ) -> Tensor:
-        """Draw all observations, which have one size: pictures [B, H, W, 3], `clip`ped to [0, 1].
-        Beyond what is `inside` its part, a picture is its base."""
-        once = len(observations) == 1 and not torch.is_grad_enabled()
-        inputs = _stacked([self._input(o, once) for o in observations]).permute(0, 3, 1, 2)
+    def forward(self, observations: Sequence[Observation], probe: Probe = UNWATCHED) -> Tensor:
+        """Draw all observations, whose parts have one size: pictures I [B, H, W, 3]."""
+        inputs = _stacked([self._input(shown) for shown in observations]).permute(0, 3, 1, 2)
         height, width = inputs.shape[-2:]
         if height % DIVISOR or width % DIVISOR:
             inputs = functional.pad(inputs, (0, -width % DIVISOR, 0, -height % DIVISOR))
-        (correction,) = self.run(probe, inputs)  # Eq. 11
-        correction = correction[..., :height, :width]
-        pictures = []
-        for o, added in zip(observations, correction.permute(0, 2, 3, 1), strict=True):
-            rgb, (top, left) = o.frame.values[..., :3], (side.start or 0 for side in o.part)
-            rows, columns = o.inside(height, width)
-            corner = self.scale * top + rows.start, self.scale * left + columns.start
-            given = rgb, added[rows, columns], corner, self.scale, self.aligned
-            picture = corrected(*given, clip=clip, backend=o.backend)
-            pictures.append(picture)
-        return _stacked(pictures)
+        probe.count("products", self.network.products(inputs))
+        with probe.stage("network"):
+            (corrections,) = (self.engine.run if self.engine else self.network)(inputs)  # Eq. 11
+        corrections = corrections[..., :height, :width].permute(0, 2, 3, 1)
+        drawn = zip(observations, corrections, strict=True)
+        return _stacked([self._picture(shown, correction) for shown, correction in drawn])
 
-    def _input(self, observation: Observation, once: bool) -> Tensor:
-        """[H', W', K (L + 1)]; zeros for preceding frames that are missing after a cold start. If
-        it is needed `once`, until the next call, it lies in the memory of the last one."""
-        o, dtype = observation, None
-        kind = o.frame.values.device.type
-        if self.engine:
-            dtype = self.engine.dtype
-        elif torch.is_autocast_enabled(kind):
-            dtype = torch.get_autocast_dtype(kind)
-        given = o.frame.values[o.part], o.preceding.values, o.preceding.index, self.frames
-        memory = self._memory if once else None
-        canvas = shown(*given, dtype=dtype, memory=memory, backend=o.backend)
-        if once and canvas.data_ptr() != self._memory.data_ptr():
-            self._memory = canvas.view(-1)
-        return canvas
+    def _input(self, shown: Observation) -> Tensor:
+        """What the network is shown, [H', W', K (L + 1)]: the RGB of all frames, newest first, then
+        their other features. What is missing after a cold start is zero."""
+        present = shown.frame.values[shown.part]
+        device, (height, width, features) = present.device, present.shape
+        height, width, count = self.scale * height, self.scale * width, self.frames + 1
+        pixels = torch.arange(height * width, device=device).view(height, width)
+        pixels = pixels[:: self.scale, :: self.scale].flatten()
+        frames = [Points(present.flatten(0, 1), pixels), *shown.preceding]
+        age, feature = (torch.arange(n, device=device) for n in (count, features))
+        rgb = 3 * age[:, None] + feature
+        other = 3 * count + (features - 3) * age[:, None] + feature - 3
+        channels = torch.where(feature < 3, rgb, other)  # [L + 1, K]
+        size = height * width + 1, features * count  # the last pixel is of points not shown
+        pairs = zip(frames, channels, strict=False)
+        places = torch.cat([size[1] * points.pixel[:, None] + of_age for points, of_age in pairs])
+        dtype = self.engine.dtype if self.engine else present.dtype
+        values = torch.cat([points.values for points in frames]).to(dtype)
+        canvas = present.new_zeros(size, dtype=dtype)
+        canvas.view(-1).index_put_((places,), values)  # Eq. 10
+        return canvas[:-1].view(height, width, -1)
+
+    def _picture(self, shown: Observation, correction: Tensor) -> Tensor:
+        """The enlarged RGB [H, W, 3], with the `correction` [H', W', 3] of the part that is drawn.
+
+        At the border of the part, the network reads zeros beyond. They change what it draws there
+        by less than a grey level, but such a line across a white background costs 0.01 of LPIPS.
+        """
+        rgb = shown.frame.values[..., :3].permute(2, 0, 1)[None]
+        size = [self.scale * side for side in rgb.shape[2:]]
+        base = functional.interpolate(rgb, size, mode="bilinear", align_corners=True)
+        picture, inside, drawn = base[0].permute(1, 2, 0).contiguous(), [], []
+        for one, side in zip(shown.part, rgb.shape[2:], strict=True):
+            begin, end, _ = one.indices(side)
+            first = self.scale * begin + (RIM if begin > 0 else 0)
+            last = self.scale * end - (RIM if end < side else 0)
+            inside.append(slice(first, last))
+            drawn.append(slice(first - self.scale * begin, last - self.scale * begin))
+        picture[tuple(inside)] += correction[tuple(drawn)]
+        return picture
 
 
-class _Network(Network):
+class _Layers(Network):
     """The layers of `ReconstructionNet_v4`, with `width` channels at full resolution."""
 
     def __init__(self, inputs: int, width: int) -> None:
@@ -147,6 +127,9 @@ class _Network(Network):
         self.last = _conv(width, 3)
         for layer in (self.widen_quarter, self.widen_half):
             _kaiming(layer, 1.0)
+        for x in self.parameters():
+            if x.dim() == 4:  # as the inputs lie
+                x.data = x.data.contiguous(memory_format=torch.channels_last)
 
     def forward(self, inputs: Tensor) -> tuple[Tensor]:
         """[B, C, H, W] to [B, 3, H, W]; H and W are multiples of `DIVISOR`."""

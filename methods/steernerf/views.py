@@ -24,7 +24,7 @@ COMPARED = 4
 
 
 @dataclass(frozen=True)
-class Views:
+class TrainingViews:
     """The training views of `scene`, rendered by `pipeline` as in training, whatever is chosen
     afterwards; `seed` is that of the motions before them."""
 

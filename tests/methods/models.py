@@ -17,7 +17,7 @@ from methods.rendering.sampling import Sampling
 from methods.steernerf.options import (
     EVERYWHERE,
     JointOptions,
-    Model,
+    ModelOptions,
     MotionOptions,
     Rendering,
     Skips,
@@ -26,12 +26,11 @@ from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.unet import UNet
 
 SMALL_GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=16)
-MODEL = Model(channels=4, frames=2, scale=4, step=8.0, stop=STOP, feature_background=0.5)
+MODEL = ModelOptions(channels=4, frames=2, scale=4, step=8.0, stop=STOP, feature_background=0.5)
 RENDERING = Rendering(8.0, STOP, EVERYWHERE, Skips(empty=True, hidden=True, background=True))
-MOTION = MotionOptions(degrees=(0.0, 2.5), length=4, least=0, pool=12, uses=16, longer=0.75)
+MOTION = MotionOptions(degrees=(0.0, 2.5), pool=12, uses=16)
 JOINT = JointOptions(
     field="joint",
-    features="constant",
     optimiser="muon",
     rate=1e-3,
     field_rate=1e-3,
@@ -56,7 +55,7 @@ small_rendering = partial(replace, RENDERING)
 """As `small_model()` is trained."""
 
 small_motion = partial(replace, MOTION)
-"""0 to 4 frames before a view."""
+"""An example serves 16 patches."""
 
 small_joint = partial(replace, JOINT)
 """Two patches of at most 32 x 32 a step."""
@@ -87,9 +86,9 @@ def misty_field(precision: str = "bf16", backend: str = "auto", channels: int = 
     return field
 
 
-def new_pipeline(model: Model = MODEL) -> Pipeline:
+def new_pipeline(model: ModelOptions = MODEL) -> Pipeline:
     """A misty field and an untrained U-Net on white; always the same weights."""
     torch.manual_seed(0)
     field = misty_field(channels=model.channels)
-    unet = UNet(model.channels, model.frames, model.scale, width=4, aligned=False)
+    unet = UNet(model.channels, model.frames, model.scale, width=4)
     return Pipeline(trained_field(field), torch.ones(3), unet, model)

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TypeVar
 
 import torch
-from torch import Tensor
 
 from methods.rendering.frame import FeatureFrame
 from methods.steernerf.buffer import Points
-from methods.steernerf.unet import Observation, Renderer2d
+from methods.steernerf.unet import Observation, UNet
 from tests.methods.conftest import look_at_the_middle
 
 CAMERA = look_at_the_middle(0.0, 0.0)  # no renderer looks at it
@@ -19,8 +17,6 @@ ROUNDING = 1e-12
 another order, a few tens of u = 1.1e-16 a layer, a few layers deep."""
 
 POINTS = 20
-
-AnyRenderer = TypeVar("AnyRenderer", bound=Renderer2d)
 
 
 def observe(
@@ -32,36 +28,31 @@ def observe(
     scale: int = 4,
     seed: int = 0,
 ) -> Observation:
-    """Random features in steps of 1/256, and preceding points on a third of the pixels."""
+    """Random features in steps of 1/256, and preceding points, of which some are not shown."""
     generator = torch.Generator().manual_seed(seed)
     values = torch.randint(257, (height, width, channels), generator=generator) / 256
     depth, alpha = torch.full((height, width), 1.5), torch.ones(height, width)
-    points = torch.rand(POINTS, channels, generator=generator)
-    size = frames, scale * height, scale * width
-    index = torch.randint(POINTS, size, generator=generator, dtype=torch.int32)
-    shown = torch.rand(size, generator=generator) < 0.33
-    preceding = Points(points, torch.where(shown, index, -1))
-    return Observation(FeatureFrame(CAMERA, values, depth, alpha), preceding, "auto")
+    size = scale**2 * height * width
+    preceding = [
+        Points(
+            torch.rand(POINTS, channels, generator=generator),
+            torch.randperm(size + POINTS, generator=generator)[:POINTS].clamp(max=size),
+        )
+        for _ in range(frames)
+    ]
+    return Observation(FeatureFrame(CAMERA, values, depth, alpha), preceding)
 
 
 def doubled(observation: Observation) -> Observation:
-    """In float64, for the backend that takes it."""
-
-    def twice(part):
-        if isinstance(part, Tensor) and part.is_floating_point():
-            return part.double()
-        if isinstance(part, list):
-            return [twice(one) for one in part]
-        if isinstance(part, tuple):
-            return tuple(map(twice, part))
-        if isinstance(part, FeatureFrame | Points | Observation):
-            return replace(part, **{name: twice(x) for name, x in vars(part).items()})
-        return part
-
-    return replace(twice(observation), backend="reference")
+    """In float64."""
+    frame = observation.frame
+    preceding = [replace(points, values=points.values.double()) for points in observation.preceding]
+    return replace(
+        observation, frame=replace(frame, values=frame.values.double()), preceding=preceding
+    )
 
 
-def shaken(renderer: AnyRenderer, seed: int = 0) -> AnyRenderer:
+def shaken(renderer: UNet, seed: int = 0) -> UNet:
     """The renderer with no weight that is 0, as after some training."""
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():

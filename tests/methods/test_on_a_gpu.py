@@ -69,7 +69,7 @@ needs_triton = pytest.mark.skipif(
 BUDGET = Budget("test", steps=4, samples=512, renderer_steps=2)
 GRID = HashGrid(levels=4, log2_table=10, n_min=4, n_max=32)
 STAGE1 = TrainingOptions(march_step=8.0, grid_samples=4096, max_rays=64)
-MOTION = small_motion(pool=1, length=2, least=2, uses=3, longer=0.0)
+MOTION = small_motion(pool=1, uses=3)
 FEW: dict[str, Any] = {"batch": 1, "patch": 4, "distilled_views": 1, "motion": MOTION}
 
 
@@ -80,7 +80,7 @@ def steernerf(field: str, **others: Any) -> Method:
         "training": STAGE1,
         "model": small_model(),
         "rendering": small_rendering(range=RangeReduction("paper", 0.03, "sum")),
-        "renderer": partial(UNet, width=4, aligned=False),
+        "renderer": partial(UNet, width=4),
         "joint": small_joint(field=field, jitter=True, grid_samples=512, **FEW),
         "engine": TorchEngine(),
     }
@@ -304,7 +304,7 @@ def smallest(name: str, **where: Any) -> Method:
         return InstantNgp(**few, **where)
     if name == "gaussians":
         return GaussianSplatting(**few, count=4, fitting=Fitting(), **where)
-    less = FEW | {"distilled_views": 0, "motion": replace(MOTION, length=1, least=1)}
+    less = FEW | {"distilled_views": 0}
     lessons = small_joint(field="joint", **less)
     return steernerf("joint", model=small_model(step=64.0, frames=1), joint=lessons, **few, **where)
 

@@ -35,7 +35,7 @@ CPU = torch.device("cpu")
 def unet() -> tuple[Network, list[Inputs]]:
     """The U-Net, and inputs of one size."""
     torch.manual_seed(1000)
-    renderer = shaken(UNet(6, 1, 4, width=64, aligned=False)).requires_grad_(False)
+    renderer = shaken(UNet(6, 1, 4, width=64)).requires_grad_(False)
     generator = torch.Generator().manual_seed(0)
     return renderer.network, [(torch.rand(1, 12, 36, 44, generator=generator),) for _ in range(3)]
 

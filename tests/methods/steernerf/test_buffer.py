@@ -18,7 +18,7 @@ from methods.kernels.types import Occupancy
 from methods.rendering.frame import FeatureFrame, everywhere, render_frame
 from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import Sampling
-from methods.steernerf.buffer import RELIABLE_ALPHA, Cloud, reproject
+from methods.steernerf.buffer import RELIABLE_ALPHA, PointCloud
 from methods.steernerf.options import RangeReduction
 from tests.methods.conftest import Work, look_at_the_middle
 from tests.methods.solids import Solid, ball, wall
@@ -44,9 +44,12 @@ def low_camera(scale: int) -> Camera:
     return scale_camera(replace(full, fx=9.0 * scale, fy=10.0 * scale), 8, 6)
 
 
-def shown(cloud: Cloud, camera: Camera) -> Tensor:
-    """The point of `cloud` that each pixel of `camera` shows, [H, W]."""
-    return reproject([cloud], camera, cloud.values.shape[1], "auto").index[0]
+def shown(cloud: PointCloud, camera: Camera) -> Tensor:
+    """The point of `cloud` that each pixel of `camera` shows, -1 for none: [H, W]."""
+    pixel = cloud.shown_in(camera, "auto").pixel
+    index = torch.full((camera.height * camera.width + 1,), -1)
+    index[pixel] = torch.arange(len(pixel))
+    return index[:-1].view(camera.height, camera.width)
 
 
 @pytest.mark.parametrize("scale", [1, 2, 3, 4])
@@ -54,9 +57,9 @@ def test_a_still_frame_is_shown_in_the_first_pixel_of_each_cell(scale: int) -> N
     """Off by s / 2 - 1/2 pixels from the middle of the cell."""
     low = low_camera(scale)
     full = scale_camera(low, 8 * scale, 6 * scale)
-    cloud = Cloud.of(frame_of(low))
+    cloud = PointCloud.of(frame_of(low))
     index, depth = shown(cloud, full), project(full, cloud.points)[1]
-    assert torch.equal(index[::scale, ::scale].flatten(), torch.arange(48).int())
+    assert torch.equal(index[::scale, ::scale].flatten(), torch.arange(48))
     assert (index >= 0).sum() == 48
     # Coordinates up to 2 are rounded a dozen times.
     torch.testing.assert_close(depth, frame_of(low).depth.flatten(), rtol=0, atol=24 * 2.0**-24)
@@ -65,7 +68,7 @@ def test_a_still_frame_is_shown_in_the_first_pixel_of_each_cell(scale: int) -> N
 def test_a_frame_of_nothing_is_shown_nowhere_else() -> None:
     """Its points lie at its camera: behind, or in front of, any other."""
     low = low_camera(2)
-    cloud = Cloud.of(frame_of(low, torch.full((6, 8), math.inf), alpha=0.0))
+    cloud = PointCloud.of(frame_of(low, torch.full((6, 8), math.inf), alpha=0.0))
     torch.testing.assert_close(cloud.points, low.c2w[:, 3].expand(48, 3), rtol=0, atol=1e-11)
     ahead = replace(low, c2w=low.c2w.clone())
     ahead.c2w[:, 3] += 0.1 * low.c2w[:, 2]
@@ -84,11 +87,10 @@ def test_features_land_where_the_released_code_puts_them(which: str, age: int) -
     depth, values = given["depth"][age], torch.from_numpy(features).permute(1, 2, 0)
     seen = depth > 0
     frame = FeatureFrame(cameras[age], values, depth.where(seen, math.inf), seen.float())
-    points = reproject([Cloud.of(frame)], scale_camera(cameras[0], 48, 40), 6, "auto")
+    index = shown(PointCloud.of(frame), scale_camera(cameras[0], 48, 40))
     # Features are moved, not computed: no rounding at all.
     wanted = torch.from_numpy(RELEASE[f"warp.{which}"][age]).permute(1, 2, 0)
-    nothing = torch.zeros(1, points.values.shape[1])
-    assert torch.equal(torch.cat((points.values, nothing))[points.index[0].long()], wanted)
+    assert torch.equal(torch.cat((values.flatten(0, 1), torch.zeros(1, 6)))[index], wanted)
 
 
 def test_summed_depths_are_too_near_unless_the_opacity_is_divided_out() -> None:
@@ -97,7 +99,7 @@ def test_summed_depths_are_too_near_unless_the_opacity_is_divided_out() -> None:
     frame.alpha[:3] = 0.5
     frame.alpha[3, 2:4] = torch.tensor([RELIABLE_ALPHA, RELIABLE_ALPHA * 1.01])
     frame.depth[5], frame.alpha[5] = math.inf, 0.0
-    summed = Cloud.of(frame)
+    summed = PointCloud.of(frame)
     _, z = project(low, summed.points)
     _, expected = project(low, summed.expected().points)
     error = 24 * 2 * 2.0**-24
@@ -133,7 +135,7 @@ def render(field: Solid, interval: Tensor | None = None) -> tuple[FeatureFrame, 
 
 def interval_of(frame: FeatureFrame) -> Tensor:
     """Of a camera that stays where it is."""
-    return Cloud.of(frame).expected().interval(along_x(), EPSILON, "cpu")
+    return PointCloud.of(frame).expected().interval(along_x(), EPSILON, "cpu")
 
 
 def test_a_surface_is_found_inside_the_interval_alone() -> None:

@@ -27,7 +27,7 @@ from tests.methods.models import (
 from tests.methods.trainings import GRID, QUICK
 
 BUDGET = Budget("test", steps=40, samples=1024, renderer_steps=4)
-RENDERER = partial(UNet, width=4, aligned=False)
+RENDERER = partial(UNet, width=4)
 RANGED = RangeReduction("paper", 0.03, "sum")
 
 
@@ -40,7 +40,7 @@ def new_method(
     steps: int | None = None,
     **rendering: Any,
 ) -> SteerNerf:
-    motion = small_motion(pool=2, length=2)
+    motion = small_motion(pool=2)
     return SteerNerf(
         grid=GRID,
         training=QUICK,
@@ -132,11 +132,10 @@ def test_a_network_is_built_once_for_each_training_and_for_no_other(
 
 
 def test_shorter_examples_use_more_distilled_views() -> None:
-    motion = small_motion(pool=2, uses=4, longer=0.75)
-    options = small_joint(distilled_share=1.0, motion=motion)
-    # 2 examples at the beginning, and 100 steps of 2 patches, 4 of an example.
-    assert options.distilled(100, frames=2) == 2 + 50 / 4 // 1 + 1
-    assert options.distilled(100, frames=0) == 2 + 50
+    # 2 examples at the beginning, and 100 steps of 2 patches, 4 or 8 of an example.
+    for uses, examples in ((4, 2 + 50), (8, 2 + 25)):
+        options = small_joint(distilled_share=1.0, motion=small_motion(pool=2, uses=uses))
+        assert options.distilled(100) == examples
 
 
 def key_of(method: SteerNerf, **changed: Any) -> dict[str, object]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,12 +11,13 @@ import torch
 
 from bench.cameras import crop_camera, pack_camera
 from bench.console import ConsoleLog
-from bench.types import Budget, Camera, NullProbe, Scene, Split
+from bench.types import Budget, NullProbe, Scene, Split
 from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.rendering.frame import everywhere, render_frame
-from methods.steernerf import patches
+from methods.steernerf import distillation
+from methods.steernerf.distillation import distilled_views
 from methods.steernerf.options import MotionOptions
-from methods.steernerf.patches import Patches, distilled_views
+from methods.steernerf.patches import Patches
 from tests.methods.conftest import SIZE, ball
 from tests.methods.models import (
     SMALL_GRID,
@@ -86,7 +86,7 @@ def test_distilled_views_are_found_again_without_rendering(
     first = views_of(trained, ball_scene, tmp_path)
     assert views_of(trained, ball_scene, tmp_path, count=0).cameras == []
     assert len(views_of(trained, ball_scene, tmp_path, count=1)) == 1  # other views
-    monkeypatch.delattr(patches, "render_frame")
+    monkeypatch.delattr(distillation, "render_frame")
     assert same(views_of(trained, ball_scene, tmp_path), first)
     with pytest.raises(NameError, match="render_frame"):
         views_of(trained, ball_scene, tmp_path / "elsewhere")
@@ -124,30 +124,21 @@ def test_an_example_is_replaced_after_its_uses(ball_scene: Scene) -> None:
 
 
 def test_the_pool_holds_no_more_than_it_is_to(ball_scene: Scene) -> None:
-    source = new_patches(ball_scene, small_motion(pool=3, uses=100, length=1))
+    source = new_patches(ball_scene, small_motion(pool=3, uses=100))
     assert len({id(source.example()) for _ in range(40)}) == 3
 
 
 @pytest.mark.parametrize("share", [0, 1])
 def test_the_share_of_distilled_views_is_kept(ball_scene: Scene, share: float) -> None:
-    source = new_patches(ball_scene, small_motion(pool=1, uses=1, length=0), share)
+    source = new_patches(ball_scene, small_motion(pool=1, uses=1), share, frames=0)
     assert all((source.example().number >= 12) == share for _ in range(20))
 
 
-@pytest.mark.parametrize(
-    ("motion", "lengths"), [({"length": 3}, {0, 1, 2}), ({"length": 2, "least": 2}, {2})]
-)
-def test_cold_and_steady_starts_both_occur_if_they_may(
-    ball_scene: Scene, motion: dict[str, int], lengths: set[int]
-) -> None:
-    source = new_patches(ball_scene, small_motion(pool=1, uses=1, **motion))
-    assert {len(source.example().buffer) for _ in range(24)} == lengths  # L = 2
-
-
 def test_the_newest_preceding_frame_is_a_step_away(ball_scene: Scene) -> None:
-    motion = small_motion(degrees=(2.0, 2.0), pool=1, uses=1, length=3, longer=0.0)
+    motion = small_motion(degrees=(2.0, 2.0), pool=1, uses=1)
     source = new_patches(ball_scene, motion)
     for example in (source.example() for _ in range(12)):
+        assert len(example.buffer) == 2
         away = source.cameras[example.number].c2w[:, 3] - TARGET
         for age, cloud in enumerate(example.buffer, 1):
             then = cloud.camera.c2w[:, 3] - TARGET
@@ -155,37 +146,7 @@ def test_the_newest_preceding_frame_is_a_step_away(ball_scene: Scene) -> None:
             assert turn.item() == pytest.approx(2.0 * age, rel=0.05)  # the bend makes it shorter
 
 
-def test_an_example_goes_on_there_and_back_to_its_view(
-    ball_scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """And leaves what was drawn before as it was."""
-    motion = small_motion(degrees=(2.0, 2.0), pool=1, uses=1, length=4, longer=0.999)
-    source = new_patches(ball_scene, motion)
-    drawn, rendered = [source.example()], []
-    buffers = [list(drawn[0].buffer)]
-    remember = source.pipeline.remember
-
-    def watched(camera: Camera, *rest: Any) -> None:
-        rendered[-1].append(camera)
-        remember(camera, *rest)
-
-    monkeypatch.setattr(source.pipeline, "remember", watched)
-    for _ in range(11):
-        rendered.append([])
-        drawn.append(source.example())
-        buffers.append(list(drawn[-1].buffer))
-    assert [list(example.buffer) for example in drawn] == buffers
-    assert len({example.number for example in drawn}) == 1
-    centre = source.cameras[drawn[0].number].c2w[:, 3]
-    for done, after in zip(rendered, drawn[1:], strict=True):
-        frames = len(done)
-        assert frames in (1, 2, 4)  # the view, and if the camera leaves it, out and back
-        moved = (after.buffer[0].camera.c2w[:, 3] - centre).norm().item()
-        step = 2 * (centre - TARGET).norm().item() * math.sin(math.radians(1.0))
-        assert moved == pytest.approx(0.0 if frames == 1 else step, rel=0.02, abs=1e-6)
-
-
-MOTION = small_motion(pool=3, uses=100, length=2)
+MOTION = small_motion(pool=3, uses=100)
 
 
 @pytest.mark.parametrize(("share", "side"), [(1.0, 6), (0.75, 6), (0.5, 4), (0.01, 1)])
@@ -205,7 +166,7 @@ def test_patches_of_pictures_of_several_sizes_have_one_side(ball_scene: Scene) -
     cameras = [narrow, *split.cameras[1:]]
     images = [split.images[0][:, 4:-4], *split.images[1:]]
     scene = replace(ball_scene, splits={"train": replace(split, cameras=cameras, images=images)})
-    source = new_patches(scene, small_motion(uses=1, length=1), patch=8, patch_share=0.5)
+    source = new_patches(scene, small_motion(uses=1), patch=8, patch_share=0.5)
     cuts = [source.cut(source.example()) for _ in range(60)]
     assert {0, 1} <= {cut.example.number for cut in cuts}
     assert {cut.truth.shape for cut in cuts} == {(12, 12, 3)}

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -28,7 +27,7 @@ from tests.methods.models import (
 )
 from tests.methods.trainings import goes_on_after_a_kill
 
-MOTION = small_motion(pool=3, uses=4, length=2)
+MOTION = small_motion(pool=3, uses=4)
 OPTIONS = small_joint(patch=4, batch=2, motion=MOTION)
 
 
@@ -42,8 +41,7 @@ def new_training(
     torch.manual_seed(0)
     model = small_model(frames=frames)
     trained = trained_field(field or misty_field(channels=model.channels))
-    renderer: Any = UNet(model.channels, frames, model.scale, width=8, aligned=False)
-    renderer = renderer.to(memory_format=torch.channels_last)
+    renderer = UNet(model.channels, frames, model.scale, width=8)
     pipeline = Pipeline(trained, scene.background, renderer, model)
     generator = torch.Generator().manual_seed(1)
     patches = Patches(pipeline, scene, Split([], [], []), options, generator)
@@ -59,17 +57,17 @@ def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
     two preceding frames, and the 2D renderer; depths, and so places, are constants.
     """
     field = misty_field("fp32", "reference").double()
-    options = replace(OPTIONS, motion=replace(MOTION, pool=4, least=2))
+    options = replace(OPTIONS, motion=replace(MOTION, pool=4))
     training = new_training(ball_scene, options, field.float())
     renderer, pipeline = training.renderer, training.patches.pipeline
     patches = [training.patches.cut(training.patches.example()) for _ in range(8)]
-    shown = [p for p in patches if all((i >= 0).any() for i in p.points.index)][:2]
-    assert [len(patch.points.index) for patch in shown] == [2, 2]
+    assert [len(patch.points) for patch in patches[:2]] == [2, 2]
     field.double(), renderer.double()
     pipeline.background = torch.ones(4, dtype=torch.float64)
     field.gradients = None
     monkeypatch.setattr(torch, "zeros", partial(torch.zeros, dtype=torch.float64))  # of a canvas
-    patches = [replace(p, points=replace(p.points, values=p.points.values.double())) for p in shown]
+    doubled = [[replace(of, values=of.values.double()) for of in p.points] for p in patches[:2]]
+    patches = [replace(p, points=of) for p, of in zip(patches, doubled, strict=False)]
     truth = torch.stack([patch.truth for patch in patches])
 
     def loss() -> Tensor:
@@ -125,7 +123,7 @@ def test_the_error_falls(ball_scene: Scene, frames: int) -> None:
     @torch.no_grad()
     def error() -> float:
         batch = training.patches.render(kept)
-        return (training.outcome(batch.observations) - batch.truth).square().mean().item()
+        return (training.renderer(batch.observations) - batch.truth).square().mean().item()
 
     before = error()
     for _ in range(120):
@@ -187,9 +185,9 @@ def test_weights_on_the_way_are_kept(ball_scene: Scene, tmp_path: Path, quiet_lo
 def test_a_killed_training_ends_as_if_it_had_never_stopped(
     ball_scene: Scene, tmp_path: Path, optimiser: str
 ) -> None:
-    """The examples go on, too: there and back, or are replaced when they are used up. Kernels of
-    the U-Net are channels last, and files keep no order; optimisers read both as they lie."""
-    options = replace(OPTIONS, optimiser=optimiser, motion=small_motion(pool=2, uses=3, longer=0.5))
+    """The examples go on, too. Kernels of the U-Net are channels last, and files keep no order;
+    optimisers read both as they lie."""
+    options = replace(OPTIONS, optimiser=optimiser, motion=small_motion(pool=2, uses=3))
     goes_on_after_a_kill(lambda: new_training(ball_scene, options, steps=8), 5, tmp_path)
 
 

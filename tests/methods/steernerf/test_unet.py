@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +12,16 @@ import torch
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from methods.steernerf.unet import UNet
+from methods.engines import Built
+from methods.steernerf.unet import RIM, UNet
 from tests.methods.observations import ROUNDING, doubled, observe, shaken
 
 RELEASE = np.load(Path(__file__).parents[2] / "data" / "steernerf_release.npz")
 """What the released code computes on the formulas below."""
 
 
-def unet(channels: int, frames: int, scale: int, width: int = 64, aligned: bool = False) -> UNet:
-    return UNet(channels, frames, scale, width=width, aligned=aligned)
+def unet(channels: int, frames: int, scale: int, width: int = 64) -> UNet:
+    return UNet(channels, frames, scale, width=width)
 
 
 def hashed(count: int, number: int) -> Tensor:
@@ -101,22 +103,63 @@ def test_a_batch_of_two_is_one_after_the_other() -> None:
     torch.testing.assert_close(renderer(observations), alone, rtol=0, atol=ROUNDING)
 
 
-@pytest.mark.parametrize("aligned", [False, True])
-def test_the_base_puts_the_corners_on_corners_or_centres(aligned: bool) -> None:
+def test_the_base_puts_the_corners_on_corners() -> None:
     """Without an output of the network, the picture is the base."""
     height, width, scale = 4, 6, 4
     observation = observe(height, width, frames=0)
     row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     observation.frame.values[..., 0], observation.frame.values[..., 1] = row / 8, column / 8
-    renderer = unet(6, 0, scale, aligned=aligned)
+    renderer = unet(6, 0, scale)
     for layer in renderer.network.last.parameters():
         nn.init.zeros_(layer)
     base = renderer([observation])
     for channel, size in ((0, height), (1, width)):
         pixel = torch.arange(size * scale)
-        if aligned:
-            place = ((pixel + 0.5) / scale - 0.5).clamp(0, size - 1)
-        else:
-            place = pixel * (size - 1) / (size * scale - 1)
+        place = pixel * (size - 1) / (size * scale - 1)
         ramp = base[0, :, 0, 0] if channel == 0 else base[0, 0, :, 1]
         torch.testing.assert_close(ramp, place / 8, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("frames", [2, 3])
+def test_a_pixel_has_the_features_of_its_points_and_every_fourth_the_present_ones(
+    frames: int,
+) -> None:
+    """Frame by frame, in Python; with L = 3 one frame is missing."""
+    height, width, scale, features = 2, 3, 4, 5
+    shown = observe(height, width, channels=features, frames=2, scale=scale)
+    seen, renderer = [], unet(features, frames, scale)
+    renderer.engine = Built(lambda x: seen.append(x) or (x[:, :3],), 0)
+    renderer([shown])
+    (got,) = seen[0].permute(0, 2, 3, 1)
+    at_pixel = [dict(zip(p.pixel.tolist(), p.values, strict=True)) for p in shown.preceding]
+    nothing = torch.zeros(features)
+    for row in range(height * scale):
+        for column in range(width * scale):
+            here = row % scale == column % scale == 0
+            present = shown.frame.values[row // scale, column // scale] if here else nothing
+            pixel = row * width * scale + column
+            of_each = [present, *(points.get(pixel, nothing) for points in at_pixel)]
+            of_each += [nothing] * (frames - 2)
+            want = torch.cat([x[:3] for x in of_each] + [x[3:] for x in of_each])
+            assert torch.equal(got[row, column], want)
+
+
+def test_features_of_16_bits_are_rounded_before_the_network_is_shown_them() -> None:
+    seen, renderer = [], unet(6, 2, 4)
+    for dtype in (torch.float32, torch.bfloat16):
+        renderer.engine = Built(lambda x: seen.append(x) or (x[:, :3],), 0, dtype)
+        renderer([observe()])
+    assert seen[1].dtype == torch.bfloat16
+    assert torch.equal(seen[1], seen[0].bfloat16())
+
+
+def test_only_the_part_without_its_border_is_corrected() -> None:
+    """Where the part ends with the picture, there is no border."""
+    renderer, shown = unet(6, 0, 4), observe(12, 20, frames=0)
+    renderer.engine = Built(lambda x: (torch.full_like(x[:, :3], 0.25),), 0)
+    part = replace(shown, part=(slice(0, 8), slice(8, 16)))
+    added = renderer([part])[0] - renderer([shown])[0] + 0.25
+    drawn = torch.zeros(48, 80, dtype=torch.bool)
+    drawn[: 32 - RIM, 32 + RIM : 64 - RIM] = True
+    assert torch.equal(added.amax(2) > 0.2, drawn)
+    assert added[drawn].min() > 0.2

@@ -1,4 +1,4 @@
-"""Views that engines are built and compared on."""
+"""TrainingViews that engines are built and compared on."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from bench.metrics import psnr
 from bench.types import Log, Scene, composite
 from methods.engines import Built
 from methods.steernerf.pipeline import Pipeline
-from methods.steernerf.views import COMPARED, Views
+from methods.steernerf.views import COMPARED, TrainingViews
 from tests.methods.models import new_pipeline, small_joint, small_model
 
 
-def views_of(scene: Scene, log: Log, seed: int = 0) -> Views:
-    return Views(new_pipeline(small_model(frames=1)), scene, small_joint(), seed, log)
+def views_of(scene: Scene, log: Log, seed: int = 0) -> TrainingViews:
+    return TrainingViews(new_pipeline(small_model(frames=1)), scene, small_joint(), seed, log)
 
 
 @torch.no_grad()

@@ -21,13 +21,11 @@ WRONG = (math.nan, math.inf, -math.inf, 1e20, -1e20, 0.0, -0.0, 1e-20, -1e-20)
 
 
 def _shown(given: Given, backend: str) -> tuple[Tensor, ...]:
-    points, depth = given["pixels"], given["depth"]
-    counts = [len(depth) // 3, len(depth) - len(depth) // 3]  # two frames
-    return (splat(points, depth, counts, *given["size"], backend=backend),)
+    return (splat(given["pixels"], given["depth"], *given["size"], backend=backend),)
 
 
 EXACT = Bound("decided by comparisons, nothing is computed: 0", 0.0)
-SPLAT = Operation("splat", served(__package__), _shown, {"index": EXACT})
+SPLAT = Operation("splat", served(__package__), _shown, {"pixels": EXACT})
 
 
 def cases() -> list[Case]:

@@ -13,21 +13,25 @@ from methods.kernels.gpu import check_types, launch
 BLOCK = 256
 
 
-def splat(pixels: Tensor, depth: Tensor, first: int, index: Tensor) -> None:
+def splat(pixels: Tensor, depth: Tensor, width: int, height: int, last: Tensor) -> Tensor:
     """As the reference, of float32."""
     check_types(torch.float32, pixels=pixels, depth=depth)
-    given = (pixels.contiguous(), depth.contiguous(), len(depth), first, *reversed(index.shape))
-    launch(_splat, (triton.cdiv(len(depth), BLOCK),), *given, index, BLOCK=BLOCK)
+    landed = torch.empty(len(depth), dtype=torch.int64, device=depth.device)
+    size = width, height, width * height
+    given = pixels.contiguous(), depth.contiguous(), len(depth), *size, last, landed
+    launch(_splat, (triton.cdiv(len(depth), BLOCK),), *given, BLOCK=BLOCK)
+    return landed
 
 
 @triton.jit
-def _splat(pixels, depth, points, first, width, height, index, BLOCK: tl.constexpr):
-    """Compared as floats, as on a CPU."""
+def _splat(pixels, depth, points, width, height, nowhere, last, landed, BLOCK: tl.constexpr):
+    """Compared as floats, as by the reference."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     u = tl.load(pixels + 2 * i, mask=i < points, other=-1.0)
     v = tl.load(pixels + 2 * i + 1, mask=i < points, other=-1.0)
     z = tl.load(depth + i, mask=i < points, other=-1.0)
-    shown = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (z > 0) & (z < float("inf"))
-    row = tl.where(shown, v, 0.0).to(tl.int64)
-    pixel = row * width + tl.where(shown, u, 0.0).to(tl.int64)
-    tl.atomic_max(index + pixel, (first + i).to(tl.int32), mask=shown, sem="relaxed")
+    taken = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (z > 0) & (z < float("inf"))
+    row = tl.where(taken, v, 0.0).to(tl.int64)
+    pixel = row * width + tl.where(taken, u, 0.0).to(tl.int64)
+    tl.atomic_max(last + pixel, i.to(tl.int32), mask=taken, sem="relaxed")
+    tl.store(landed + i, tl.where(taken, pixel, nowhere), mask=i < points)
