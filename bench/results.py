@@ -28,7 +28,7 @@ from PIL import Image
 from bench.errors import SteerbenchError, explained, unexpected
 from bench.provenance import commit, machine
 
-SCHEMA_VERSION = 3  # of record.json and rows.csv; other folders are reported and skipped
+SCHEMA_VERSION = 4  # of record.json and rows.csv; other folders are reported and skipped
 
 COLUMNS = [
     *("run", "method", "scene", "split", "trajectory", "resolution", "protocol", "budget"),
@@ -148,9 +148,11 @@ class Store:
     def rows(
         self, report: Callable[[str], object] = warnings.warn, keys: Collection[str] | None = None
     ) -> pd.DataFrame:
-        """Every row of all runs, or of those in `keys`; `report` gets a line on unreadable ones."""
+        """Every row of all runs, or of those in `keys`; `report` gets a line on each schema that
+        cannot be read."""
         header = ",".join(COLUMNS)
-        bodies = []
+        bodies: list[str] = []
+        others: dict[object, list[str]] = {}
         for folder in sorted(self.folder.glob("[!.]*")):
             if keys is not None and folder.name not in keys:
                 continue
@@ -162,7 +164,10 @@ class Store:
             if schema == SCHEMA_VERSION and first == header:
                 bodies.append(body)
             else:
-                report(f"{folder}: left out, {unreadable(schema)}")
+                others.setdefault(schema, []).append(folder.name)
+        for schema, names in others.items():
+            more = f" and {len(names) - 1} more" * (len(names) > 1)
+            report(f"{self.folder}: left out: {names[0]}{more}: {unreadable(schema)}")
         return pd.read_csv(
             io.StringIO("\n".join((header, "".join(bodies)))),
             dtype={column: FIGURES.get(column, "str") for column in COLUMNS},
@@ -192,7 +197,10 @@ class Store:
 
 
 def unreadable(schema: object) -> str:
-    return f"its rows have schema {schema}; this version reads schema {SCHEMA_VERSION}"
+    return (
+        f"stored by another version of steerbench, or damaged (schema {schema}, this one reads "
+        f"{SCHEMA_VERSION}); measure again, with outputs=DIR to keep what is there"
+    )
 
 
 def _text(path: Path) -> str:

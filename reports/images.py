@@ -56,7 +56,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class View:
+class Rendering:
     """A frame rendered by one run: titles, rendering and error map, uint8 [H, W, 3] each."""
 
     titles: tuple[str, ...]
@@ -65,7 +65,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Frame:
+class ComparedFrame:
     """A frame of several runs, for comparison.
 
     `name` has scene, view and number; `stem` begins the names of its files; `truth` is uint8
@@ -76,13 +76,13 @@ class Frame:
     name: str
     stem: str
     truth: np.ndarray
-    views: Sequence[View]
+    views: Sequence[Rendering]
     box: Box
     where: str
     errors: str
 
 
-Part = str | Table | Picture | Frame
+Part = str | Table | Picture | ComparedFrame
 """A part that is a string is Markdown."""
 
 
@@ -93,7 +93,7 @@ def kept_frames(runs: Sequence[Run]) -> list[str]:
     return [common[index] for index in spread(len(common), MOST_FRAMES)]
 
 
-def frame_section(runs: Sequence[Run], frame: str, stem: str) -> Iterator[str | Frame]:
+def frame_section(runs: Sequence[Run], frame: str, stem: str) -> Iterator[str | ComparedFrame]:
     """`frame` of `runs` as parts of a page: heading, pictures and caption."""
     first = runs[0]
     truth = _read(first.pictures / f"{frame}-truth.png")
@@ -103,21 +103,21 @@ def frame_section(runs: Sequence[Run], frame: str, stem: str) -> Iterator[str | 
     place = f"frame {int(frame) + 1} of {len(first.frames)}"
     name, errors = f"{first.facts['scene']}, {view}, {place}", first.record["error_map"]
     yield f"### {name}"
-    yield Frame(name, f"{stem}-{frame}", truth, views, box, where, errors)
+    yield ComparedFrame(name, f"{stem}-{frame}", truth, views, box, where, errors)
     yield (
         f"PSNR is that of this frame, the time the mean of all steady ones. The framed part, where"
         f" {where}, can be seen {ZOOM} times enlarged. Error maps show the {errors}."
     )
 
 
-def _view(run: Run, frame: str) -> View:
+def _view(run: Run, frame: str) -> Rendering:
     """A kept frame of a run, with its PSNR and the time of a steady frame, or its own, if cold."""
     figures = run.frames.set_index("frame").loc[int(frame)]
     cold = figures["phase"] == COLD
     ms = figures["frame_ms"] if cold else run.values["frame_ms"]
     title = f"PSNR {figures['psnr']:.2f} dB, {ms:,.1f} ms{', cold' if cold else ''}"
     pictures = [_read(run.pictures / f"{frame}-{kind}.png") for kind in ("rendered", "error")]
-    return View((run.label, title), *pictures)
+    return Rendering((run.label, title), *pictures)
 
 
 def _read(path: Path) -> np.ndarray:
@@ -146,7 +146,7 @@ def find_detail(truth: np.ndarray, renderings: Sequence[np.ndarray]) -> tuple[Bo
     return (left, top, left + wide, top + high), where
 
 
-def still_images(frame: Frame) -> Iterator[Picture]:
+def still_images(frame: ComparedFrame) -> Iterator[Picture]:
     """Static images that show all renderings of `frame`, at most `MOST_RENDERINGS` in each."""
     count = len(frame.views)
     width = math.ceil(count / math.ceil(count / MOST_RENDERINGS))  # evenly filled images
@@ -157,7 +157,7 @@ def still_images(frame: Frame) -> Iterator[Picture]:
         yield Picture(f"{frame.stem}-{first}", shows, partial(write_image, group))
 
 
-def write_image(frame: Frame, path: Path) -> None:
+def write_image(frame: ComparedFrame, path: Path) -> None:
     """Write a PNG with the ground truth, the views of `frame`, a detail of each, and error maps.
 
     A single view takes two rows, several take three.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -126,3 +127,11 @@ def test_a_package_has_few_floors_and_no_circle(package, floors):
         return 1 + max((floor(other, (*above, file)) for other in others), default=0)
 
     assert max(map(floor, below)) <= floors
+
+
+def test_a_class_has_a_name_of_its_own():
+    files = [path for name in PACKAGES for path in (ROOT / name).rglob("*.py")]
+    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in files]
+    nodes = (node for tree in trees for node in ast.walk(tree))
+    names = Counter(node.name for node in nodes if isinstance(node, ast.ClassDef))
+    assert [name for name, count in names.items() if count > 1] == []

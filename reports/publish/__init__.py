@@ -28,7 +28,7 @@ from PIL import Image
 from bench.errors import explained
 from bench.sharing import whole
 from reports.comparison import COST, shown_as, written
-from reports.images import ZOOM, Frame, Part, Picture, still_images
+from reports.images import ZOOM, ComparedFrame, Part, Picture, still_images
 from reports.runs import Repeated, Run
 from reports.tables import QUALITY, Table
 
@@ -75,7 +75,7 @@ def markdown(parts: Sequence[Part], folder: Path) -> str:
         match part:
             case Table():
                 texts.append(part.markdown())
-            case Frame():
+            case ComparedFrame():
                 texts += [_shown(picture, folder) for picture in still_images(part)]
             case Picture():
                 texts.append(_shown(part, folder))
@@ -135,7 +135,7 @@ def _html(part: Part, origins: dict[str, dict[str, str]], headings: dict[str, st
             return TEMPLATES.get_template("table.html").render(table=part, origins=origins)
         case Picture():
             return f'<div class="plot scrolls">{_svg(part)}</div>'
-        case Frame():
+        case ComparedFrame():
             return _frame(part)
     tokens = PARSER.parse(part)
     for heading, text in pairwise(tokens):
@@ -175,7 +175,7 @@ def _svg(plot: Picture) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def _frame(frame: Frame) -> str:
+def _frame(frame: ComparedFrame) -> str:
     height, width = frame.truth.shape[:2]
     left, top, right, bottom = frame.box
     box = (left / width, top / height, (right - left) / width, (bottom - top) / height)

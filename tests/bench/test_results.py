@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from bench import results
-from bench.results import COLUMNS, Measurement, Store, content_key
+from bench.results import COLUMNS, SCHEMA_VERSION, Measurement, Store, content_key
 from bench.types import SteerbenchError
 
 JSON = st.recursive(
@@ -157,7 +157,8 @@ def test_a_run_of_another_schema_is_reported_and_left_out(store):
     assert store.rows()["run"].value_counts().to_dict() == dict.fromkeys(keys, 2)
     kept, other, foreign, damaged = keys
     record = store.folder / foreign / "record.json"
-    record.write_text(record.read_text().replace('"schema_version": 3', '"schema_version": 99'))
+    now = f'"schema_version": {SCHEMA_VERSION}'
+    record.write_text(record.read_text().replace(now, '"schema_version": 99'))
     (store.folder / damaged / "record.json").write_text("{")
     reports: list[str] = []
     assert set(store.rows(report=reports.append)["run"]) == {kept, other}
@@ -165,6 +166,18 @@ def test_a_run_of_another_schema_is_reported_and_left_out(store):
     assert any(damaged in line for line in reports)
     with pytest.warns(UserWarning, match="left out"):
         store.rows()
+
+
+def test_a_store_of_before_is_refused_in_one_line(store):
+    keys = [store.save({"seed": i}, measurement([i, 2.0])) for i in range(3)]
+    for key in keys:
+        record = store.folder / key / "record.json"
+        now = f'"schema_version": {SCHEMA_VERSION}'
+        record.write_text(record.read_text().replace(now, '"schema_version": 3'))
+    reports: list[str] = []
+    assert store.rows(report=reports.append).empty
+    assert len(reports) == 1
+    assert f"{min(keys)} and 2 more" in reports[0]
 
 
 def test_a_disk_that_refuses_is_a_clear_error_and_leaves_nothing(store, monkeypatch):

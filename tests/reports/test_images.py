@@ -11,8 +11,8 @@ from PIL import Image
 
 from reports.images import (
     MOST_FRAMES,
-    Frame,
-    View,
+    ComparedFrame,
+    Rendering,
     find_detail,
     frame_section,
     kept_frames,
@@ -53,8 +53,8 @@ def test_of_one_rendering_the_detail_is_where_it_is_wrong_and_of_equal_ones_in_t
 
 @pytest.mark.parametrize(("runs", "columns", "lines"), [(1, 3, 2), (2, 3, 3), (4, 5, 3)])
 def test_an_image_has_a_place_for_every_picture(tmp_path, runs, columns, lines):
-    views = [View(("a", "b"), flat(50 * number), flat(7)) for number in range(runs)]
-    frame = Frame("ball", "ball", flat(255), views, (0, 0, 24, 16), "they differ", "error")
+    views = [Rendering(("a", "b"), flat(50 * number), flat(7)) for number in range(runs)]
+    frame = ComparedFrame("ball", "ball", flat(255), views, (0, 0, 24, 16), "they differ", "error")
     write_image(frame, tmp_path / "image.png")
     with Image.open(tmp_path / "image.png") as image:
         pixels = np.asarray(image)
@@ -73,7 +73,9 @@ def test_what_stands_below_a_picture_is_of_its_frame(run):
     of_frames = replace(changed(run, {"frame_ms": 250.0}), read_frames=lambda: frames)
     kept = kept_frames([of_frames])
     parts = (part for frame in kept for part in frame_section([of_frames], frame, "frames"))
-    titles = [view.titles[1] for part in parts if isinstance(part, Frame) for view in part.views]
+    titles = [
+        view.titles[1] for part in parts if isinstance(part, ComparedFrame) for view in part.views
+    ]
     assert titles[0] == "PSNR 30.00 dB, 100.0 ms, cold"
     assert titles[1:] == [f"PSNR {30 + int(frame):.2f} dB, 250.0 ms" for frame in kept[1:]]
 

@@ -26,7 +26,7 @@ def composite(
 ) -> Pixels:
     t, delta = intervals.t, intervals.delta
     check_types(torch.float32, sigma=sigma, values=values, t=t, delta=delta)
-    return Pixels(*_Composite.apply(sigma, values, t, delta, intervals.offsets, stop, carry))
+    return Pixels(*_TritonComposite.apply(sigma, values, t, delta, intervals.offsets, stop, carry))
 
 
 def weights(sigma: Tensor, intervals: Intervals, stop: float, front: Tensor) -> Tensor:
@@ -50,7 +50,7 @@ def _launch(sigma: Tensor, intervals: Intervals, front: Tensor, *rest: Any) -> N
     launch(_light, (len(front),), *samples, *rest, num_warps=1)
 
 
-class _Composite(torch.autograd.Function):
+class _TritonComposite(torch.autograd.Function):
     @staticmethod
     def forward(ctx, sigma, values, t, delta, offsets, stop, carry):
         rays, channels = len(offsets) - 1, values.shape[1]

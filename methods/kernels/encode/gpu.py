@@ -25,10 +25,10 @@ def encode(positions: Tensor, table: Tensor, grid: HashGrid, packed: Tensor | No
     if positions.requires_grad:
         raise ValueError("backend 'gpu' gives no gradient for positions: use backend='reference'")
     check_types(torch.float32, positions=positions, table=table)
-    return _Encode.apply(positions.contiguous(), table, grid, packed)
+    return _TritonEncode.apply(positions.contiguous(), table, grid, packed)
 
 
-class _Encode(torch.autograd.Function):
+class _TritonEncode(torch.autograd.Function):
     @staticmethod
     def forward(ctx, positions, table, grid, packed):
         ctx.save_for_backward(positions)
