@@ -22,14 +22,14 @@ from methods.engines.torch_engine import TorchEngine
 KINDS = (TorchEngine, OpenVino, TensorRt)
 
 
-class Figures(NamedTuple):
+class EngineFigures(NamedTuple):
     """What frames have and take with an engine."""
 
     psnr: float  # dB
     ms: float  # of the 2D renderer
 
 
-Measure = Callable[[Sequence[Engine]], Sequence[Figures]]
+Measure = Callable[[Sequence[Engine]], Sequence[EngineFigures]]
 """Renders the same frames with several engines, in turns."""
 
 
@@ -80,7 +80,7 @@ class Auto:
             new.write_text(json.dumps(measured))
 
         keep(path, write, log)
-        found = [Figures(*figures) for figures in json.loads(path.read_text())]
+        found = [EngineFigures(*figures) for figures in json.loads(path.read_text())]
         for engine, figures in zip(engines, found, strict=True):
             log.info(f"engine {engine}: {figures.ms:.1f} ms, {figures.psnr:.2f} dB")
         good = [place for place, it in enumerate(found) if it.psnr >= found[0].psnr - self.loss]

@@ -15,8 +15,8 @@ from bench.study import Study, Variant, turned
 from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.engines import Built, Engine
-from methods.engines.auto import Auto, Figures
-from methods.instant_ngp.field import Precision
+from methods.engines.auto import Auto, EngineFigures
+from methods.instant_ngp.field import FieldPrecision
 from methods.instant_ngp.stage1 import Setup, train_field
 from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.encode import HashGrid
@@ -90,7 +90,7 @@ class SteerNerf:
         engine: Engine | Auto,
         steps: int | None = None,
         after: float = 1.0,
-        precision: Precision = "bf16",
+        precision: FieldPrecision = "bf16",
         name: str = "steernerf",
         backend: str = "auto",
         device: str = "auto",
@@ -132,7 +132,7 @@ class SteerNerf:
             samples = partial(inputs, engine.samples)
             return engine.build(renderer.network, samples, lambda: folder(engine.key()), log)
 
-        def measure(engines: Sequence[Engine]) -> Sequence[Figures]:
+        def measure(engines: Sequence[Engine]) -> Sequence[EngineFigures]:
             return views.compare([build(engine) for engine in engines])
 
         if isinstance(engine := self.engine, Auto):

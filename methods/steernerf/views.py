@@ -14,7 +14,7 @@ from bench.metrics import psnr
 from bench.motion import preceding, viewing_target
 from bench.types import Camera, Frame, Log, NullProbe, Probe, Scene, composite
 from methods.engines import Built, Inputs
-from methods.engines.auto import Figures
+from methods.engines.auto import EngineFigures
 from methods.steernerf.buffer import Buffer
 from methods.steernerf.options import JointOptions, Rendering
 from methods.steernerf.pipeline import Pipeline
@@ -49,7 +49,7 @@ class Views:
             renderer.engine = None
         return recorded
 
-    def compare(self, networks: Sequence[Built]) -> list[Figures]:
+    def compare(self, networks: Sequence[Built]) -> list[EngineFigures]:
         """The PSNR of pictures and the time of the 2D renderer with each of the `networks`."""
         pictures, background = self.scene.splits["train"].images, self.pipeline.background
         clocks = [StageClock(str(background.device)) for _ in networks]
@@ -64,7 +64,9 @@ class Views:
                 found.append(psnr(frame.rgb.cpu(), truth))
             self.pipeline.renderer.engine = None  # the network itself draws the frames before
         return [
-            Figures(statistics.mean(found), statistics.median(map(_renderer_ms, clock.frames)))
+            EngineFigures(
+                statistics.mean(found), statistics.median(map(_renderer_ms, clock.frames))
+            )
             for found, clock in zip(quality, clocks, strict=True)
         ]
 

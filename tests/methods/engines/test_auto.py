@@ -12,7 +12,7 @@ import torch
 from bench.errors import SteerbenchError, Unavailable
 from bench.types import Log
 from methods.engines import Engine, auto
-from methods.engines.auto import Auto, Figures
+from methods.engines.auto import Auto, EngineFigures
 
 CPU = torch.device("cpu")
 
@@ -36,10 +36,10 @@ class Elsewhere(Exact):
 
 
 FIGURES = {
-    "exact, fp32": Figures(30.0, 9.0),
-    "exact, bf16": Figures(29.96, 8.0),
-    "quick, fp32": Figures(30.1, 10.0),
-    "quick, int8": Figures(29.94, 2.0),
+    "exact, fp32": EngineFigures(30.0, 9.0),
+    "exact, bf16": EngineFigures(29.96, 8.0),
+    "quick, fp32": EngineFigures(30.1, 10.0),
+    "quick, int8": EngineFigures(29.94, 2.0),
 }
 
 
@@ -48,7 +48,7 @@ def kinds(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(auto, "KINDS", (Exact, Elsewhere, Quick))
 
 
-def measured(engines: Sequence[Engine]) -> list[Figures]:
+def measured(engines: Sequence[Engine]) -> list[EngineFigures]:
     return [FIGURES[str(engine)] for engine in engines]
 
 
@@ -72,8 +72,8 @@ def test_what_was_measured_is_remembered(tmp_path: Path, quiet_log: Log) -> None
 def test_pictures_that_are_not_finite_are_an_error_and_not_remembered(
     psnr: float, tmp_path: Path, quiet_log: Log
 ) -> None:
-    def broken(engines: Sequence[Engine]) -> list[Figures]:
-        return [Figures(psnr, 9.0) for _ in engines]
+    def broken(engines: Sequence[Engine]) -> list[EngineFigures]:
+        return [EngineFigures(psnr, 9.0) for _ in engines]
 
     with pytest.raises(SteerbenchError, match=r"finite pictures .* renders others with exact, fp"):
         Auto(0.05).chosen(CPU, broken, tmp_path, quiet_log)
