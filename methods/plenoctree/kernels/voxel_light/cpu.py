@@ -69,10 +69,10 @@ def shade_voxels(
 ) -> Tensor:
     check_float32(harmonics, directions)
     basis = spherical_harmonics(directions, backend="cpu")
-    return _Shade.apply(harmonics, voxel, ray, basis, grad_buffer)
+    return _ShadeVoxels.apply(harmonics, voxel, ray, basis, grad_buffer)
 
 
-class _Shade(torch.autograd.Function):
+class _ShadeVoxels(torch.autograd.Function):
     @staticmethod
     def forward(ctx, harmonics, voxel, ray, basis, grad_buffer):
         given = [x.detach().contiguous() for x in (voxel, ray, basis.view(-1))]
