@@ -120,17 +120,17 @@ class Diver(Student):
     def model_settings(self) -> Mapping[str, object]:
         return {"resolution": self.resolution}
 
-    def begin(self, trained: TrainedField, scene: Scene, budget: Budget) -> DiverTraining:
+    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> DiverTraining:
         """Make the training of corners that start as the trained field encodes them."""
         generator = torch.Generator().manual_seed(self.teacher.seed)
-        model = CornerModel.taught(trained, self.resolution, generator)
+        model = CornerModel.taught(teacher, self.resolution, generator)
         return DiverTraining(model, scene, budget, self.training, self.teacher.seed)
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         device = self.teacher.device
         blank = torch.zeros(0, 3, dtype=torch.int32, device=device)
         model = CornerModel(blank, self.resolution, Decoder().to(device), self.teacher.backend)
-        model.load(tensors)
+        model.restore(tensors)
         self.baked = Baked(model, self.stored)
 
     def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:

@@ -73,17 +73,17 @@ class CornerModel(nn.Module):
     @classmethod
     @torch.no_grad()
     def taught(
-        cls, trained: TrainedField, resolution: int, generator: torch.Generator
+        cls, teacher: TrainedField, resolution: int, generator: torch.Generator
     ) -> CornerModel:
         """Make a model with voxels where the trained field is occupied, and a random decoder.
 
         The features of a corner are its hash encoding, 16 levels of 2, divided by their standard
         deviation; ValueError if it has more than 32 channels.
         """
-        field = trained.field
+        field = teacher.field
         few = f"at most the {CHANNELS} channels of a corner: choose fewer levels or features"
         expect(field.grid.channels <= CHANNELS, "grid", few, field.grid.channels)
-        coordinates = occupied_voxels(trained.occupancy, resolution)
+        coordinates = occupied_voxels(teacher.occupancy, resolution)
         decoder = Decoder(generator).to(field.device)
         model = cls(coordinates, resolution, decoder, field.backend)
         positions = model.vertices / resolution
@@ -117,7 +117,7 @@ class CornerModel(nn.Module):
         decoder = {f"decoder.{name}": value for name, value in self.decoder.state_dict().items()}
         return decoder | {"coordinates": self.voxels.coordinates, "table": self.table.detach()}
 
-    def load(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Restore what `tensors` returned."""
         self.decoder.load_state_dict(checkpoint.part(tensors, "decoder."))
         device = self.table.device

@@ -134,7 +134,7 @@ class DiverTraining(PixelTraining):
         return self.model.tensors()
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
-        self.model.load(tensors)
+        self.model.restore(tensors)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
         tensors, figures = super().state()

@@ -62,7 +62,7 @@ class Engine(ABC):
     def __str__(self) -> str:
         return f"{self.name}, {self.precision}"
 
-    def load(self, library: str) -> ModuleType:
+    def import_library(self, library: str) -> ModuleType:
         """Import a library of the engine; raise `Unavailable` if it is not installed."""
         try:
             return importlib.import_module(library)

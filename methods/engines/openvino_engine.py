@@ -41,8 +41,8 @@ class OpenVino(Engine):
 
     def __init__(self, precision: Precision = "fp32", calibration: Calibration = "frames") -> None:
         super().__init__(precision, calibration)
-        self._openvino = self.load("openvino")
-        self._nncf = self.load("nncf") if precision == "int8" else None
+        self._openvino = self.import_library("openvino")
+        self._nncf = self.import_library("nncf") if precision == "int8" else None
         self._half = precision != "fp32" and "BF16" in _capabilities(self._openvino)
         if precision == "bf16" and not self._half:
             raise Unavailable(

@@ -49,7 +49,7 @@ class TensorRt(Engine):
                 "engine=openvino"
             )
         for library in self.libraries:
-            self.load(library)
+            self.import_library(library)
 
     def check(self, device: torch.device) -> None:
         """Raise `Unavailable` unless `device` is the first CUDA GPU."""

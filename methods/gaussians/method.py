@@ -16,7 +16,7 @@ from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.gaussians import ply
 from methods.gaussians.model import Gaussians, rounded, stored_bytes
 from methods.gaussians.training import Fitting, GaussianTraining, anywhere, on_surfaces, spacing
-from methods.instant_ngp.field import Precision
+from methods.instant_ngp.field import FieldPrecision
 from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
 from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.composite import STOP, check_stop
@@ -41,7 +41,7 @@ class GaussianSplatting:
     checkpoint: str | None = None
     stored: Literal["fp32", "int8"] = "fp32"
     stop: float = STOP
-    precision: Precision = "bf16"
+    precision: FieldPrecision = "bf16"
     name: str = "gaussians"
     backend: str = "auto"
     device: str = "auto"

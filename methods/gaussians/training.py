@@ -162,16 +162,16 @@ class GaussianTraining:
 
 
 def on_surfaces(
-    trained: TrainedField, scene: Scene, count: int, generator: torch.Generator
+    teacher: TrainedField, scene: Scene, count: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """Choose `count` points where rays of random training pixels end, and their colours: [count, 3]
     each. If the pictures show too little matter, points are taken more than once."""
-    field = trained.field
+    field = teacher.field
     batches = PixelBatches(scene.splits["train"], field.device)
     points, colours = [], []
     for _ in range(64):  # too few if less than 1/64 of the pixels show matter
         rays, _ = batches.draw(count, generator)
-        pixels = render_rays(field, rays, trained.occupancy, NullProbe(), trained.sampling)
+        pixels = render_rays(field, rays, teacher.occupancy, NullProbe(), teacher.sampling)
         hit = pixels.alpha > SOLID
         depth = pixels.depth_sum[hit] / pixels.alpha[hit]
         points.append(rays.origins[hit] + depth[:, None] * rays.directions[hit])

@@ -15,7 +15,7 @@ from torch import Tensor
 from bench.cameras import look_at
 from bench.case import U16, U32, Case, Property
 from bench.types import Budget, Camera, Scene, Split, SteerbenchError, Unavailable
-from methods.instant_ngp.field import LOG_DENSITY_CLAMP, HashField, Precision
+from methods.instant_ngp.field import LOG_DENSITY_CLAMP, FieldPrecision, HashField
 from methods.instant_ngp.training import MIN_RAYS, FieldTraining, TrainingOptions
 from methods.kernels.composite import composite
 from methods.kernels.encode import HashGrid
@@ -90,7 +90,7 @@ def _scene(level: int, *, alpha: int = 255, size: int = 8, apart: float = 1.0) -
 
 def _field(backend: str, device: str, precision: str) -> HashField:
     generator = torch.Generator().manual_seed(0)
-    kind: Precision = "bf16" if precision == "bf16" else "fp32"
+    kind: FieldPrecision = "bf16" if precision == "bf16" else "fp32"
     return HashField(GRID, precision=kind, backend=backend, generator=generator).to(device)
 
 

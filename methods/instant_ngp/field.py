@@ -24,7 +24,7 @@ from methods.rendering.field import (
     cat,
 )
 
-Precision = Literal["bf16", "fp32"]
+FieldPrecision = Literal["bf16", "fp32"]
 
 HIDDEN_CHANNELS = 64  # width of every layer between input and output
 
@@ -50,7 +50,7 @@ class HashField(nn.Module):
         grid: HashGrid,
         channels: int = 3,
         *,
-        precision: Precision = "bf16",
+        precision: FieldPrecision = "bf16",
         backend: str = "auto",
         generator: torch.Generator | None = None,
     ) -> None:

@@ -10,7 +10,7 @@ from bench.cameras import place_camera
 from bench.study import Study, turned
 from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
-from methods.instant_ngp.field import Precision
+from methods.instant_ngp.field import FieldPrecision
 from methods.instant_ngp.stage1 import Setup, train_field
 from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.composite import STOP, check_stop
@@ -42,7 +42,7 @@ class InstantNgp:
         *,
         grid: HashGrid,
         training: TrainingOptions,
-        precision: Precision = "bf16",
+        precision: FieldPrecision = "bf16",
         stop: float = STOP,
         name: str = "ngp",
         backend: str = "auto",

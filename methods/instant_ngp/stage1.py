@@ -8,7 +8,7 @@ import torch
 
 from bench.provenance import computed_by
 from bench.types import DEVICE, Budget, Log, Scene
-from methods.instant_ngp.field import HashField, Precision
+from methods.instant_ngp.field import FieldPrecision, HashField
 from methods.instant_ngp.table import SuitedGrid
 from methods.instant_ngp.training import FieldTraining, TrainingOptions, new_grid, restore_field
 from methods.kernels import multiplies_bf16, resolve
@@ -26,7 +26,7 @@ class Setup:
 
     grid: HashGrid  # shape of the hash table; `SuitedGrid`: the scene says how long it is
     training: TrainingOptions
-    precision: Precision  # "bf16": packed table, bfloat16 networks
+    precision: FieldPrecision  # "bf16": packed table, bfloat16 networks
     backend: str
     device: torch.device
     seed: int  # of everything random in the training
@@ -36,7 +36,7 @@ class Setup:
         cls,
         grid: HashGrid,
         training: TrainingOptions,
-        precision: Precision,
+        precision: FieldPrecision,
         backend: str,
         device: str,
         seed: int,

@@ -98,11 +98,11 @@ class KiloNerf(FieldStudent):
         generator = torch.Generator().manual_seed(self.teacher.seed)
         return KiloField(self.grid, self.teacher.backend, generator).to(self.teacher.device)
 
-    def begin(self, trained: TrainedField, scene: Scene, budget: Budget) -> KiloTraining:
+    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> KiloTraining:
         bounds = scene.bounds.to(self.teacher.device)
-        self.occupancy = trained.occupancy
-        self.grid, pieces = place_networks(trained.occupancy, bounds, self.networks)
-        training = KiloTraining(self, self.new_field(), trained, scene, budget)
+        self.occupancy = teacher.occupancy
+        self.grid, pieces = place_networks(teacher.occupancy, bounds, self.networks)
+        training = KiloTraining(self, self.new_field(), teacher, scene, budget)
         training.pieces = pieces
         return training
 

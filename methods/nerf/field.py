@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from bench.types import Probe
-from methods.instant_ngp.field import Precision
+from methods.instant_ngp.field import FieldPrecision
 from methods.students.fields import REACH
 from methods.students.networks import (
     DIRECTION_CHANNELS,
@@ -39,7 +39,7 @@ class NerfField(NetworkField):
     """
 
     def __init__(
-        self, precision: Precision, backend: str, generator: torch.Generator | None = None
+        self, precision: FieldPrecision, backend: str, generator: torch.Generator | None = None
     ) -> None:
         super().__init__(backend)
         position = 3 + 2 * 3 * POSITION_FREQUENCIES

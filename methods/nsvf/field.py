@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from bench.types import Probe
-from methods.instant_ngp.field import Precision
+from methods.instant_ngp.field import FieldPrecision
 from methods.kernels.corner_gather import CORNERS, corner_gather, trilinear
 from methods.kernels.types import Occupancy
 from methods.students.networks import Dense, NetworkField, density_of, positional, products
@@ -50,7 +50,7 @@ class NsvfField(NetworkField):
     def __init__(
         self,
         occupancy: Occupancy,
-        precision: Precision,
+        precision: FieldPrecision,
         backend: str,
         generator: torch.Generator | None = None,
     ) -> None:

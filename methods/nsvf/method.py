@@ -46,10 +46,10 @@ class Nsvf(FieldStudent):
         """Voxels, their first embeddings, and the steps of the rays."""
         return {"resolution": self.resolution, "start": self.start, "step": self.step}
 
-    def occupied(self, trained: TrainedField) -> Occupancy:
+    def occupied(self, teacher: TrainedField) -> Occupancy:
         """The voxels, as cells."""
         size = self.resolution
-        return Occupancy.at(occupied_voxels(trained.occupancy, size), size)
+        return Occupancy.at(occupied_voxels(teacher.occupancy, size), size)
 
     def sampling(self, budget: Budget) -> Sampling:
         """Samples `step` voxels apart."""
@@ -62,16 +62,16 @@ class Nsvf(FieldStudent):
         field = NsvfField(self.occupancy, teacher.precision, teacher.backend, generator)
         return field.to(teacher.device)
 
-    def begin(self, trained: TrainedField, scene: Scene, budget: Budget) -> StudentTraining:
+    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> StudentTraining:
         """Make the training of a new field. With `start=teacher` every corner begins as the trained
         field's encoding of its position, in 1 / pi of the usual size of embeddings: the angles of
         the positional encoding then begin at that size and reach 32 times it, which is still smooth
         from corner to corner."""
-        training = super().begin(trained, scene, budget)
+        training = super().begin(teacher, scene, budget)
         field = training.field
         if self.start == "teacher" and isinstance(field, NsvfField):
             with torch.no_grad():
-                features = trained.field.encode(field.vertices / self.resolution)
+                features = teacher.field.encode(field.vertices / self.resolution)
                 spread = features.std() if features.numel() > 1 else features.new_ones(())
                 size = EMBEDDING**-0.5 / math.pi
                 field.embeddings.copy_(features * size / spread.clamp(min=1e-12))

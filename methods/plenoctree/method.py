@@ -146,11 +146,11 @@ class PlenOctree(Student):
     def model_settings(self) -> Mapping[str, object]:
         return asdict(self.extraction)
 
-    def begin(self, trained: TrainedField, scene: Scene, budget: Budget) -> OctreeTraining:
+    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> OctreeTraining:
         setup = self.teacher
         generator = torch.Generator(setup.device).manual_seed(setup.seed)
         batches = PixelBatches(scene.splits["train"], setup.device)
-        octree = extract(trained, batches, self.extraction, generator)
+        octree = extract(teacher, batches, self.extraction, generator)
         return OctreeTraining(octree, scene, budget, self.training, setup)
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:

@@ -111,12 +111,12 @@ class Extraction:
 
 @torch.no_grad()
 def extract(
-    trained: TrainedField, batches: PixelBatches, options: Extraction, generator: torch.Generator
+    teacher: TrainedField, batches: PixelBatches, options: Extraction, generator: torch.Generator
 ) -> Octree:
     """Extract the octree of what `trained` shows to the training rays of `batches`; raise
     SteerbenchError if there are too many candidates, or if nothing is to be seen."""
-    field, resolution, backend = trained.field, options.resolution, trained.field.backend
-    voxels = Voxels(_candidates(trained.occupancy, options), resolution)
+    field, resolution, backend = teacher.field, options.resolution, teacher.field.backend
+    voxels = Voxels(_candidates(teacher.occupancy, options), resolution)
     density = _densities(field, voxels, options.points, generator)
 
     def weigh(_: Rays, crossings: Crossings) -> Tensor:

@@ -30,7 +30,7 @@ def render_batch(
     *,
     jitter: Tensor | None = None,
     background: Tensor | None = None,
-    guide: Field | None = None,
+    teacher: Field | None = None,
 ) -> tuple[Pixels, int]:
     """Render R `rays` differentiably; also return the number of samples that were composited.
 
@@ -41,10 +41,10 @@ def render_batch(
         how: `window` is ignored; without `jitter`, `thin` is as well.
         jitter: [R] phase of the samples of each ray, in [0, 1); None: as in `frame.render_rays`.
         background: [K] or [R, K]; None: pixels are not composited on a background.
-        guide: a cheaper field whose densities decide in the first pass which samples are hidden,
+        teacher: a cheaper field whose densities decide in the first pass which samples are hidden,
             and so have neither weight nor gradient; None: `field` itself.
     """
-    samples = visible_samples(field, rays, occupancy, how, jitter=jitter, guide=guide)
+    samples = visible_samples(field, rays, occupancy, how, jitter=jitter, teacher=teacher)
     directions = field.encode_directions(rays.directions)
     sigma, values = query(field, samples.positions, samples.ray, directions, samples.encoded)
     pixels = composite(sigma, values, samples, stop=how.stop, backend=field.backend)
@@ -70,7 +70,7 @@ def visible_samples(
     how: Sampling,
     *,
     jitter: Tensor | None = None,
-    guide: Field | None = None,
+    teacher: Field | None = None,
 ) -> Samples:
     """The samples of `rays` that are visible, without most of the thin ones; the arguments are
     those of `render_batch`. The host waits for a GPU to count them."""
@@ -89,11 +89,11 @@ def visible_samples(
             limit=limit,
             backend=field.backend,
         )
-        if guide is None and isinstance(field, Encoder):
+        if teacher is None and isinstance(field, Encoder):
             sigma, samples = _encoded_densities(field, samples)
         else:
             parts = pad(samples.positions).split(CHUNK_SAMPLES)
-            judge = field if guide is None else guide
+            judge = field if teacher is None else teacher
             sigma = torch.cat([judge.density(part)[0] for part in parts])[: len(samples)]
         counts, left = visible(sigma, samples, stop=how.stop, front=front, backend=field.backend)
         rounds.append(Round(chosen, samples, sigma, counts))

@@ -15,7 +15,7 @@ from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.engines import Built, Engine
 from methods.engines.auto import Auto, EngineFigures
-from methods.instant_ngp.field import Precision
+from methods.instant_ngp.field import FieldPrecision
 from methods.instant_ngp.stage1 import Setup, train_field
 from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.encode import HashGrid
@@ -88,7 +88,7 @@ class SteerNerf:
         engine: Engine | Auto,
         steps: int | None = None,
         after: float = 1.0,
-        precision: Precision = "bf16",
+        precision: FieldPrecision = "bf16",
         name: str = "steernerf",
         backend: str = "auto",
         device: str = "auto",

@@ -90,7 +90,7 @@ def train_stage2(
     marks = {folder / f"after-{share}.safetensors": math.ceil(share * steps) for share in MARKS}
     loop.train(training, finished, "training the 2D renderer", log, marks)
     if stage2.after < 1:
-        loop.load(training, folder / f"after-{stage2.after}.safetensors")
+        loop.load_result(training, folder / f"after-{stage2.after}.safetensors")
         key["after"] = stage2.after
     trained.field.requires_grad_(False).gradients = None
     renderer.requires_grad_(False)

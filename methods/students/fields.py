@@ -1,4 +1,4 @@
-"""Students that are fields: they learn the densities and colours of a trained field, their guide,
+"""Students that are fields: they learn the densities and colours of a trained field, their teacher,
 then the photos."""
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class FieldLessons(PixelOptions):
     rate: float = 1e-3
     final_rate: float = 0.1
     # Share of the steps, at the beginning, that compare densities and colours at random points of
-    # occupied cells with the guide's.
+    # occupied cells with the teacher's.
     points: float = 0.5
     share: float = 0.25  # samples with a gradient in a step, as a share of the budget's
 
@@ -74,21 +74,21 @@ class FieldStudent(Student):
 
     @abstractmethod
     def new_field(self) -> StudentField:
-        """Make the untrained field on the device of its guide, with weights drawn from the seed;
+        """Make the untrained field on the device of its teacher, with weights drawn from the seed;
         the occupied cells are known already."""
 
-    def occupied(self, trained: TrainedField) -> Occupancy:
+    def occupied(self, teacher: TrainedField) -> Occupancy:
         """The cells in which the field may hold matter; it is empty elsewhere."""
-        return trained.occupancy
+        return teacher.occupancy
 
     def sampling(self, budget: Budget) -> Sampling:
-        """How its rays are sampled in training: as those of its guide."""
+        """How its rays are sampled in training: as those of its teacher."""
         return self.teacher.training.sampling(budget)
 
-    def begin(self, trained: TrainedField, scene: Scene, budget: Budget) -> StudentTraining:
+    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> StudentTraining:
         """Make the training of a new field."""
-        self.occupancy = self.occupied(trained)
-        return StudentTraining(self, self.new_field(), trained, scene, budget)
+        self.occupancy = self.occupied(teacher)
+        return StudentTraining(self, self.new_field(), teacher, scene, budget)
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Load a field, and where it is occupied."""
@@ -111,24 +111,24 @@ class FieldStudent(Student):
 
 
 class StudentTraining(PixelTraining):
-    """Trains on points of the guide, then on rays of the photos, within occupied cells.
+    """Trains on points of the teacher, then on rays of the photos, within occupied cells.
 
-    On rays, samples that the guide's density hides are left out: it costs less than the density of
-    a large network. The training follows the settings of `student`; `trained` holds the guide.
+    On rays, samples that the teacher's density hides are left out: it costs less than the density
+    of a large network. The training follows the settings of `student`.
     """
 
     def __init__(
         self,
         student: FieldStudent,
         field: StudentField,
-        trained: TrainedField,
+        teacher: TrainedField,
         scene: Scene,
         budget: Budget,
     ) -> None:
         options, seed = student.training, student.teacher.seed
-        samples, device = math.ceil(options.share * budget.samples), trained.field.device
+        samples, device = math.ceil(options.share * budget.samples), teacher.field.device
         super().__init__(scene, device, budget.renderer_steps, samples, options, seed)
-        self.field, self.guide = field, trained.field
+        self.field, self.teacher = field, teacher.field
         self.occupancy, self.sampling = student.occupancy, student.sampling(budget)
         self.cells = self.occupancy.cells.nonzero()
         self.points_until = options.points * self.steps if len(self.cells) else 0
@@ -158,21 +158,21 @@ class StudentTraining(PixelTraining):
 
     def _difference(self, positions: Tensor, directions: Tensor) -> Tensor:
         """Mean squared difference in opacity over `REACH`, plus those in red, green and blue,
-        weighted by the guide's opacity."""
+        weighted by the teacher's opacity."""
         with torch.no_grad():
-            wanted, shown = _seen(self.guide, positions, directions)
+            wanted, shown = _seen(self.teacher, positions, directions)
         opacity, colour = self._learned(positions, directions)
         apart = (colour - shown).square().sum(dim=1)
         return functional.mse_loss(opacity, wanted) + (wanted * apart).mean()
 
     def _learned(self, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """The opacity [S] over `REACH` and colour [S, 3] that are compared with the guide's."""
+        """The opacity [S] over `REACH` and colour [S, 3] that are compared with the teacher's."""
         return _seen(self.field, positions, directions)
 
     def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
-        field, cells, how, guide = self.field, self.occupancy, self.sampling, self.guide
+        field, cells, how, teacher = self.field, self.occupancy, self.sampling, self.teacher
         return render_batch(
-            field, rays, cells, how, jitter=jitter, background=background, guide=guide
+            field, rays, cells, how, jitter=jitter, background=background, teacher=teacher
         )
 
     def _update(self) -> None:

@@ -57,7 +57,7 @@ class Student(ABC):
         return {}
 
     @abstractmethod
-    def begin(self, trained: TrainedField, scene: Scene, budget: Budget) -> loop.Training:
+    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> loop.Training:
         """Make the training of the model, as it is before its first step."""
 
     @abstractmethod
@@ -83,14 +83,14 @@ class Student(ABC):
         """Train the field and the model, or load their results if they were trained before."""
         budget = replace(budget, renderer_steps=self.steps or budget.renderer_steps)
         with torch_threads(budget.threads):
-            trained = train_field(self.teacher, scene, budget, log)
+            teacher = train_field(self.teacher, scene, budget, log)
             folder = log.stage_dir(self.kind, self._key(scene, budget))
             finished = folder / f"{self.kind}.safetensors"
-            begin = partial(self.begin, trained, scene, budget)
+            begin = partial(self.begin, teacher, scene, budget)
             tensors, seconds = loop.trained(begin, finished, self.kind, log)
             with checkpoint.restoring(finished):
                 self.restore(tensors)
-        self.train_s = trained.train_s + seconds
+        self.train_s = teacher.train_s + seconds
         self.background = scene.background.to(self.teacher.device)
 
     def _key(self, scene: Scene, budget: Budget) -> dict[str, object]:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from methods.instant_ngp.field import Precision
+from methods.instant_ngp.field import FieldPrecision
 from methods.kernels import multiplies_bf16
 from methods.students.fields import StudentField
 
@@ -53,7 +53,11 @@ class Dense(nn.Linear):
     """
 
     def __init__(
-        self, inputs: int, outputs: int, precision: Precision, generator: torch.Generator | None
+        self,
+        inputs: int,
+        outputs: int,
+        precision: FieldPrecision,
+        generator: torch.Generator | None,
     ) -> None:
         super().__init__(inputs, outputs)
         self.precision = precision

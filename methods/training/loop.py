@@ -89,7 +89,7 @@ def train(
         if to_train:
             _drive(training, finished, label, log, marks or {})
         else:
-            load(training, finished)
+            load_result(training, finished)
             log.info(f"{label}: found in {finished}")
 
 
@@ -131,7 +131,7 @@ def save(training: Training, path: Path, done: bool = False) -> None:
     checkpoint.write(path, training.result() | ({} if done else more), figures)
 
 
-def load(training: Training, path: Path) -> None:
+def load_result(training: Training, path: Path) -> None:
     """Load into `training` a result that `train` wrote to `path`; raise `SteerbenchError` if the
     file is damaged, or belongs to another training."""
     tensors, figures = checkpoint.read(path)
@@ -141,7 +141,7 @@ def load(training: Training, path: Path) -> None:
 
 
 def resume(training: Training, path: Path) -> None:
-    """Restore `training` to the state of a checkpoint; it raises what `load` raises."""
+    """Restore `training` to the state of a checkpoint; it raises what `load_result` raises."""
     tensors, figures = checkpoint.read(path)
     with checkpoint.restoring(path):
         training.restore(tensors, figures)

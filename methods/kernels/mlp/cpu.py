@@ -42,7 +42,7 @@ def mlp(inputs: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:
     right = inputs[1] if len(inputs) > 1 else left.new_empty(len(left), 0)
     if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
         return _outputs(left, right, weights, learning=False)[0]
-    return _Network.apply(left, right, *weights)
+    return _Mlp.apply(left, right, *weights)
 
 
 def _outputs(
@@ -57,7 +57,7 @@ def _outputs(
     return out, kept
 
 
-class _Network(torch.autograd.Function):
+class _Mlp(torch.autograd.Function):
     @staticmethod
     def forward(ctx, left, right, *weights):
         out, kept = _outputs(left, right, weights, learning=True)

@@ -14,7 +14,7 @@ from methods.engines.torch_engine import Replay, Replayed, TorchEngine
 from methods.steernerf.unet import UNet
 from tests.methods.observations import shaken
 
-NO_BF16 = "BF16" not in _capabilities(OpenVino().load("openvino"))
+NO_BF16 = "BF16" not in _capabilities(OpenVino().import_library("openvino"))
 
 ENGINES = [
     *((TorchEngine, p) for p in ("fp32", "bf16")),

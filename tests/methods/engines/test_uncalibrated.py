@@ -64,7 +64,7 @@ def rounded(x: Tensor, largest: float) -> Tensor:
 def weights(kind: Kind, folder: Path) -> dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]]:
     """The 8-bit weights that are convolved with, and their scales, by shape."""
     if kind is OpenVino:
-        model = OpenVino().load("openvino").Core().read_model(folder / "network.xml")
+        model = OpenVino().import_library("openvino").Core().read_model(folder / "network.xml")
         convolved = [op for op in model.get_ordered_ops() if op.get_type_name() == "Convolution"]
         kernels = [op.input_value(1).get_node() for op in convolved]
         pairs = [(k.input_value(0).get_node().input_value(0), k.input_value(1)) for k in kernels]

@@ -114,22 +114,22 @@ def test_rounds_change_no_sample(thick: Thick, monkeypatch: pytest.MonkeyPatch) 
     assert 0 < len(found[0][1]) < len(found[0][0])
 
 
-def test_a_guide_tells_which_samples_are_hidden(cloud: Cloud, device: str) -> None:
+def test_a_teacher_tells_which_samples_are_hidden(cloud: Cloud, device: str) -> None:
     field, occupancy = cloud
     rays = rays_on(device)
 
-    class Guide:
+    class Teacher:
         """As dense everywhere as is given, without colours."""
 
         def __init__(self, sigma: float) -> None:
             self.density = lambda places: (torch.full_like(places[:, 0], sigma), places)
 
     own, most = render_batch(field, rays, occupancy, Sampling(stop=0))
-    clear, all_ = render_batch(field, rays, occupancy, Sampling(stop=0), guide=Guide(0.0))  # type: ignore[arg-type]
+    clear, all_ = render_batch(field, rays, occupancy, Sampling(stop=0), teacher=Teacher(0.0))  # type: ignore[arg-type]
     assert all_ == most
     assert torch.equal(own.values, clear.values)
     # Opaque at once: only the first sample of every ray is seen.
-    wall, few = render_batch(field, rays, occupancy, Sampling(), guide=Guide(1e6))  # type: ignore[arg-type]
+    wall, few = render_batch(field, rays, occupancy, Sampling(), teacher=Teacher(1e6))  # type: ignore[arg-type]
     offsets = march(rays, occupancy, STEP).offsets
     assert few == int((offsets.diff() > 0).sum())
     assert (wall.alpha <= own.alpha + 1e-6).all()

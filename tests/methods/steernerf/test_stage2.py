@@ -175,7 +175,7 @@ def test_weights_on_the_way_are_kept(ball_scene: Scene, tmp_path: Path, quiet_lo
     for _ in range(2):
         half.advance()
     found = new_training(ball_scene, steps=4)
-    loop.load(found, tmp_path / "half.safetensors")
+    loop.load_result(found, tmp_path / "half.safetensors")
     assert 0 < found.seconds < training.seconds
     for name, tensor in half.result().items():
         assert torch.equal(tensor, found.result()[name]), name
