@@ -53,7 +53,7 @@ class Settings:
 
 
 def checked_settings(config: DictConfig) -> Settings:
-    """The settings in `config`, checked. Also sets torch's number of threads as they say."""
+    """The settings in `config`, checked."""
     names = [field.name for field in fields(Settings)]
     values = {name: config[name] for name in names if name in config}
     if values.get("frame_size") is not None:
@@ -79,13 +79,19 @@ def checked_settings(config: DictConfig) -> Settings:
             f"device={settings.device}: torch sees {torch.cuda.device_count() or 'no'} GPUs here, "
             "numbered from 0; use another, or device=cpu"
         )
-    torch.set_num_threads(settings.threads or USUAL_THREADS)
     return settings
+
+
+def use_threads(settings: Settings) -> None:
+    """Let torch, and the kernels with it, use as many threads as the settings say from now on."""
+    torch.set_num_threads(settings.threads or USUAL_THREADS)
 
 
 def trained(config: DictConfig, log: Log) -> Method:
     """The method that `config` describes, trained on its scene."""
-    torch.manual_seed(checked_settings(config).seed)
+    settings = checked_settings(config)
+    use_threads(settings)
+    torch.manual_seed(settings.seed)
     method, budget = (build(config, name) for name in ("method", "budget"))
     method.fit(scene_of(config), budget, log)
     return method

@@ -32,6 +32,7 @@ from sweeps.configured import (
     scene_digest,
     scene_folder,
     scene_of,
+    use_threads,
 )
 from sweeps.overrides import target_of
 from sweeps.processes import device_lock
@@ -215,6 +216,7 @@ def _needed(job: Job, jobs: Sequence[Job]) -> bool:
 
 def _prepared(job: Job, log: Log) -> _Ready:
     config, settings = job.config, checked_settings(job.config)
+    use_threads(settings)
     torch.manual_seed(settings.seed)
     method, budget = (build(config, name) for name in ("method", "budget"))
     protocol = protocol_of(config)

@@ -19,7 +19,7 @@ from bench.provenance import digest, libraries
 from bench.results import REPORTED, Store
 from bench.types import Camera
 from reports.runs import Run, load_runs
-from sweeps.configured import checked_settings, protocol_of, scene_of
+from sweeps.configured import checked_settings, protocol_of, scene_of, use_threads
 from sweeps.measurement import send
 from sweeps.overrides import composed
 
@@ -46,6 +46,7 @@ def score(
     """
     folder, config = Path(pictures), composed(settings)
     plain = checked_settings(config)
+    use_threads(plain)
     if config.report:
         raise SteerbenchError("report: a page compares times, which given pictures do not have")
     log, store = ConsoleLog(Path(plain.outputs)), Store(Path(plain.outputs))

@@ -1,4 +1,4 @@
-"""`steerbench check` and `steerbench compare`: are the figures as good as they were."""
+"""`steerbench check`: are the figures as good as they were, when a baseline was recorded."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bench.errors import SteerbenchError, explained
 from bench.results import Store
 from bench.sharing import whole
 from reports.regression import LIMITS, Figures, Limit, change_table, changes
-from reports.runs import Run, load_runs, readable
+from reports.runs import Run, readable
 from sweeps.measurement import PLACES
 from sweeps.terminal import console, show
 
@@ -23,8 +23,6 @@ SCHEMA = 2  # of baseline files
 
 def main(options: argparse.Namespace) -> int:
     """Compare the store with a baseline, or write one; 1 if anything is worse or missing."""
-    if options.command == "compare":
-        return _compare(options)
     stored = _by_command(Store(options.outputs))
     if options.record:
         _record(options.baseline, stored)
@@ -52,16 +50,6 @@ def main(options: argparse.Namespace) -> int:
         failed += 1
     console().print("as good as the baseline" if not failed else f"worse or missing: {failed}")
     return int(failed > 0)
-
-
-def _compare(options: argparse.Namespace) -> int:
-    """Print what the second of two runs of the store is, less the first; 1 if it is worse."""
-    store = Store(options.outputs)
-    keys = [store.whole_key(key) for key in (options.old, options.new)]
-    old, new = (Figures.of(load_runs(store, {key: key})[0]) for key in keys)
-    rows = list(changes([old], [new]))
-    show(change_table(" to ".join(keys), rows))
-    return int(any(row.verdict for row in rows))
 
 
 def _by_command(store: Store) -> dict[str, dict[str, Run]]:

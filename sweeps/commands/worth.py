@@ -25,7 +25,7 @@ from bench.measure import Task, measure
 from bench.types import Camera, Frame, Method, NullProbe, Probe, Scene
 from methods.kernels.dispatch import forced, kernel_calls
 from reports.tables import Table, decimal
-from sweeps.configured import build, checked_settings, protocol_of, scene_of
+from sweeps.configured import build, checked_settings, protocol_of, scene_of, use_threads
 from sweeps.overrides import choices, composed, swept
 from sweeps.processes import device_lock
 from sweeps.terminal import print_rows, show
@@ -79,6 +79,7 @@ def _of_method(words: Sequence[str], options: argparse.Namespace) -> list[Row]:
 
     config = composed(words)
     settings = checked_settings(config)
+    use_threads(settings)
     log = ConsoleLog(Path(settings.outputs))
     scene, budget = scene_of(config), build(config, "budget")
     path = build(config, "trajectory", scene)
