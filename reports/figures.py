@@ -210,13 +210,13 @@ def frontier_plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
     The left panel shows the error against the ground truth, with the Pareto frontier as a
     staircase; the right panel, the error against the first of `rows`. Settings on the frontier
-    (those whose `instead` is themselves) and the `unchanged` one are circled, and named if there is
+    (`frontier`) and the `unchanged` one are circled, and named if there is
     room. What takes more than twice as long as any of the frontier is only named.
     """
     figure = Figure(figsize=(11, 6.5), layout="constrained")
     truth, off = figure.subplots(1, 2, sharex=True)
     every = pd.DataFrame(rows)
-    best = every[every["instead"] == every["setting"]].sort_values("ms", kind="stable")
+    best = every[every["frontier"]].sort_values("ms", kind="stable")
     far = every["ms"] > 2 * best["ms"].max()
     table = every[~far]
     unchanged = table[table["unchanged"]]

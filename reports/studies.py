@@ -53,7 +53,7 @@ class Measured:
     fastest: float
     slowest: float
     lost: float = math.nan  # PSNR, against the first line, in dB
-    instead: str = ""  # the best line that takes no longer; on the frontier itself
+    better: StudyLine | None = None  # the best one that takes no longer; none on the frontier
 
     @classmethod
     def of(cls, line: StudyLine, run: Run) -> Measured:
@@ -89,25 +89,25 @@ def pooled(found: Sequence[Measured]) -> list[Measured]:
     line which all groups have, the last of several, takes as long in each as in their median. Lost
     is the PSNR of the first line less that of a line.
     """
-    groups: dict[str, dict[str, Measured]] = {}
+    groups: dict[str, dict[tuple[str, ...], Measured]] = {}
     for each in found:
-        groups.setdefault(each.line.group, {})[each.line.label] = each
-    labels = dict.fromkeys(each.line.label for each in found)
-    common = [label for label in labels if all(label in group for group in groups.values())]
+        groups.setdefault(each.line.group, {})[each.line.settings] = each
+    lines = dict.fromkeys(each.line.settings for each in found)
+    common = [line for line in lines if all(line in group for group in groups.values())]
     pace = dict.fromkeys(groups, 1.0)
     if common:
         times = {name: group[common[-1]].ms for name, group in groups.items()}
         usual = statistics.median_low(times.values())
         pace = {name: usual / ms for name, ms in times.items()}
     once = {}
-    for label in labels:
+    for line in lines:
         several = [
-            _paced(group[label], pace[name]) for name, group in groups.items() if label in group
+            _paced(group[line], pace[name]) for name, group in groups.items() if line in group
         ]
         middle = statistics.median_low(each.ms for each in several)
         usual_one = next(each for each in several if each.ms == middle)
         ends = min(x.fastest for x in several), max(x.slowest for x in several)
-        once[label] = replace(usual_one, fastest=ends[0], slowest=ends[1])
+        once[line] = replace(usual_one, fastest=ends[0], slowest=ends[1])
     first = next(iter(once.values())).figure("psnr")
     return [replace(each, lost=first - each.figure("psnr")) for each in once.values()]
 
@@ -143,8 +143,8 @@ def on_frontier(lines: Sequence[Measured]) -> list[Measured]:
     """The lines, each with the best one that takes no longer."""
     best = best_instead([x.ms for x in lines], [-x.figure("psnr") for x in lines])
     return [
-        replace(line, instead=lines[instead].line.label)
-        for line, instead in zip(lines, best, strict=True)
+        line if place == number else replace(line, better=lines[place].line)
+        for number, (line, place) in enumerate(zip(lines, best, strict=True))
     ]
 
 
@@ -159,13 +159,12 @@ def _point(line: Measured) -> dict[str, Any]:
         "ms_hi": line.slowest,
         "psnr": line.figure("psnr"),
         "psnr_to_first": line.figure("psnr_to_first"),
-        "instead": line.instead,
+        "frontier": line.better is None,
     }
 
 
 def _accuracy_table(method: str, lines: Sequence[Measured]) -> Table:
     lines = sorted(lines, key=lambda line: line.ms)
-    best = [line.instead == line.line.label for line in lines]
     cells = tuple(
         (
             line.line.label,
@@ -174,15 +173,15 @@ def _accuracy_table(method: str, lines: Sequence[Measured]) -> Table:
             decimal(line.figure("psnr"), 2),
             decimal(line.lost, 2),
             _apart(line),
-            ON_FRONTIER if good else line.instead,
+            line.better.label if line.better else ON_FRONTIER,
         )
-        for line, good in zip(lines, best, strict=True)
+        for line in lines
     )
     columns = (
         *("setting", "ms / frame ↓", "of rounds", "PSNR, dB ↑", "lost, dB ↓"),
         *("PSNR to the first, dB ↑", "better at no more time"),
     )
-    bold = frozenset((row, 0) for row, good in enumerate(best) if good)
+    bold = frozenset((row, 0) for row, line in enumerate(lines) if line.better is None)
     title = f"{method}: run time against error of a frame, {_where(lines)}"
     return Table(title, columns, cells, bold, _sources(lines))
 
