@@ -22,8 +22,8 @@ from methods.students.fields import FieldLessons
 from methods.training import loop
 from tests.methods.small_students import LEAVES, SMALL, budget, fitted
 from tests.methods.trainings import (
+    EXACT_TEACHER,
     PIXEL,
-    TEACHER,
     goes_on_after_a_kill,
     shows_the_ball,
 )
