@@ -15,7 +15,7 @@ from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.gaussians import ply
 from methods.gaussians.model import Gaussians, rounded, stored_bytes
-from methods.gaussians.training import Fitting, GaussianTraining, anywhere, on_surfaces, spacing
+from methods.gaussians.training import Fitting, GaussianTraining, on_surfaces, spacing
 from methods.instant_ngp.field import FieldPrecision
 from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
 from methods.instant_ngp.training import TrainingOptions
@@ -37,7 +37,6 @@ class GaussianSplatting:
     count: int
     steps: int | None = None  # None: `budget.renderer_steps`
     degree: int = 3
-    start: Literal["field", "scratch"] = "field"
     checkpoint: str | None = None
     stored: Literal["fp32", "int8"] = "fp32"
     stop: float = STOP
@@ -64,7 +63,6 @@ class GaussianSplatting:
     def __post_init__(self) -> None:
         expect(self.count >= 1, "count", "1 or more", self.count)
         expect(self.steps is None or self.steps >= 1, "steps", "1 or more, or none", self.steps)
-        expect(self.start in ("field", "scratch"), "start", "field or scratch", self.start)
         expect(self.stored in ("fp32", "int8"), "stored", "fp32 or int8", self.stored)
         expect(self.degree in range(4), "degree", "0 to 3", self.degree)
         check_stop(self.stop)
@@ -84,43 +82,35 @@ class GaussianSplatting:
         self.background = scene.background.to(self.setup.device)
 
     def _trained(self, scene: Scene, budget: Budget, log: Log) -> Gaussians:
-        setup, field, steps = self.setup, None, self.steps or budget.renderer_steps
+        setup, steps = self.setup, self.steps or budget.renderer_steps
+        teacher = train_field(setup, scene, budget, log)
         key = {
-            "scene": scene.digest,
+            "field": setup.key(scene, budget),
             "steps": steps,
             "fitting": asdict(self.fitting),
             "count": self.count,
             "degree": self.degree,
-            "start": self.start,
-            "backend": setup.backend,
-            "device": setup.device.type,
-            "seed": setup.seed,
             **computed_by(type(self)),
         }
-        if self.start == "field":
-            field = train_field(setup, scene, budget, log)
-            key["field"] = setup.key(scene, budget)
         finished = log.stage_dir("gaussians", key) / "gaussians.safetensors"
 
         def begin() -> GaussianTraining:
-            return GaussianTraining(
-                self._untrained(field, scene), scene, steps, self.fitting, setup
-            )
+            untrained = self._untrained(teacher, scene)
+            return GaussianTraining(untrained, scene, steps, self.fitting, setup)
 
         tensors, seconds = loop.trained(begin, finished, "gaussians", log)
         with checkpoint.restoring(finished):
             gaussians = Gaussians(**tensors).to(setup.device)
-        self.train_s = seconds + (0.0 if field is None else field.train_s)
+        self.train_s = teacher.train_s + seconds
         if not (exported := finished.with_suffix(".ply")).exists():
             ply.write(gaussians, scene, exported)
             log.info(f"Gaussians for other programs: {exported}")
         return gaussians
 
-    def _untrained(self, field: TrainedField | None, scene: Scene) -> Gaussians:
+    def _untrained(self, teacher: TrainedField, scene: Scene) -> Gaussians:
         """The Gaussians before training."""
-        device = self.setup.device
-        given = scene, self.count, torch.Generator(device).manual_seed(self.setup.seed)
-        points, colours = anywhere(*given) if field is None else on_surfaces(field, *given)
+        generator = torch.Generator(self.setup.device).manual_seed(self.setup.seed)
+        points, colours = on_surfaces(teacher, scene, self.count, generator)
         scales = self.fitting.size * spacing(points)
         return Gaussians.at(points, colours, scales, self.fitting.opacity, self.degree)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 
@@ -26,7 +25,6 @@ class Nsvf(FieldStudent):
     name: str = "nsvf"
     resolution: int = 128  # voxels along a side of the cube, a multiple of 16
     step: float = 0.5  # length of a step of the rays in voxels, in training and rendering
-    start: Literal["random", "teacher"] = "teacher"  # embeddings: its features at their corners
 
     kind = "nsvf"
 
@@ -35,16 +33,12 @@ class Nsvf(FieldStudent):
         check_step("step", self.step)
         size = self.resolution
         expect(size > 0 and not size % BRICK**2, "resolution", f"a multiple of {BRICK**2}", size)
-        expect(self.start in ("random", "teacher"), "start", "random or teacher", self.start)
-        if self.start == "teacher" and self.teacher.grid.channels != EMBEDDING:
-            raise ValueError(
-                f"start=teacher: expected a grid of {EMBEDDING} channels (levels x features), got "
-                f"{self.teacher.grid.channels}: use start=random"
-            )
+        channels, as_many = self.teacher.grid.channels, f"{EMBEDDING} channels (levels x features)"
+        expect(channels == EMBEDDING, "teacher.grid", as_many, channels)
 
     def model_settings(self) -> Mapping[str, object]:
-        """Voxels, their first embeddings, and the steps of the rays."""
-        return {"resolution": self.resolution, "start": self.start, "step": self.step}
+        """Voxels, and the steps of the rays."""
+        return {"resolution": self.resolution, "step": self.step}
 
     def occupied(self, teacher: TrainedField) -> Occupancy:
         """The voxels, as cells."""
@@ -56,23 +50,23 @@ class Nsvf(FieldStudent):
         return Sampling(step=self.step / self.resolution)
 
     def new_field(self) -> NsvfField:
-        """Make a field of random embeddings."""
+        """Make a field of random embeddings, which `begin` replaces."""
         teacher = self.teacher
         generator = torch.Generator().manual_seed(teacher.seed)
         field = NsvfField(self.occupancy, teacher.precision, teacher.backend, generator)
         return field.to(teacher.device)
 
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> StudentTraining:
-        """Make the training of a new field. With `start=teacher` every corner begins as the trained
-        field's encoding of its position, in 1 / pi of the usual size of embeddings: the angles of
-        the positional encoding then begin at that size and reach 32 times it, which is still smooth
-        from corner to corner."""
+        """Make the training of a new field. Every corner begins as the teacher's encoding of its
+        position, in 1 / pi of the usual size of embeddings: the angles of the positional encoding
+        then begin at that size and reach 32 times it, which is still smooth from corner to corner.
+        """
         training = super().begin(teacher, scene, budget)
         field = training.field
-        if self.start == "teacher" and isinstance(field, NsvfField):
-            with torch.no_grad():
-                features = teacher.field.encode(field.vertices / self.resolution)
-                spread = features.std() if features.numel() > 1 else features.new_ones(())
-                size = EMBEDDING**-0.5 / math.pi
-                field.embeddings.copy_(features * size / spread.clamp(min=1e-12))
+        assert isinstance(field, NsvfField)
+        with torch.no_grad():
+            features = teacher.field.encode(field.vertices / self.resolution)
+            spread = features.std() if features.numel() > 1 else features.new_ones(())
+            size = EMBEDDING**-0.5 / math.pi
+            field.embeddings.copy_(features * size / spread.clamp(min=1e-12))
         return training

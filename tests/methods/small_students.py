@@ -28,9 +28,7 @@ SMALL: dict[str, Callable[..., Student]] = {
         KiloNerf, teacher=TEACHER, training=KiloLessons(points_each=64, rate=1e-2), networks=4
     ),
     "nerf": partial(Nerf, teacher=EXACT_TEACHER, training=FieldLessons()),
-    "nsvf": partial(
-        Nsvf, teacher=EXACT_TEACHER, training=FieldLessons(rate=2e-3), resolution=32, start="random"
-    ),
+    "nsvf": partial(Nsvf, teacher=EXACT_TEACHER, training=FieldLessons(rate=2e-3), resolution=32),
     "plenoctree": partial(
         PlenOctree,
         teacher=TEACHER,

@@ -88,7 +88,8 @@ def steernerf(field: str, **others: Any) -> Method:
 
 
 def student(make: Callable[..., Method], device: str, backend: str, **options: Any) -> Method:
-    teacher = Setup.resolved(GRID, STAGE1, "fp32", backend, device, seed=0)
+    grid = replace(GRID, levels=16)
+    teacher = Setup.resolved(grid, STAGE1, "fp32", backend, device, seed=0)
     return make(teacher=teacher, **options)
 
 
@@ -108,7 +109,7 @@ METHODS: Mapping[str, Callable[..., Method]] = {
     "kilonerf": partial(
         student, KiloNerf, training=KiloLessons(points_each=8, max_rays=64), networks=2
     ),
-    "nsvf": partial(student, Nsvf, training=NETWORK, resolution=32, start="random"),
+    "nsvf": partial(student, Nsvf, training=NETWORK, resolution=32),
     "nerf": partial(student, Nerf, training=NETWORK),
 }
 

@@ -92,7 +92,7 @@ def test_its_step_is_in_voxels(ball_scene: Scene, shared_log: Log) -> None:
 
 
 def test_embeddings_begin_as_the_teachers_features(ball_scene: Scene, shared_log: Log) -> None:
-    method = SMALL["nsvf"](start="teacher")
+    method = SMALL["nsvf"]()
     teacher = train_field(method.teacher, ball_scene, BUDGET, shared_log)
     field = method.begin(teacher, ball_scene, BUDGET).field
     assert isinstance(field, NsvfField)
@@ -105,6 +105,6 @@ def test_embeddings_begin_as_the_teachers_features(ball_scene: Scene, shared_log
     torch.testing.assert_close(embeddings, scale * learned, rtol=1e-4, atol=1e-5)
 
 
-def test_a_teacher_of_other_channels_is_no_start() -> None:
-    with pytest.raises(ValueError, match=r"32 channels .* got 16"):
-        SMALL["nsvf"](teacher=TEACHER, start="teacher")
+def test_a_teacher_of_other_channels_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"^teacher.grid: expected 32 channels .* got 16"):
+        SMALL["nsvf"](teacher=TEACHER)

@@ -22,8 +22,8 @@ from methods.students.fields import FieldLessons
 from methods.training import loop
 from tests.methods.small_students import LEAVES, SMALL, budget, fitted
 from tests.methods.trainings import (
+    EXACT_TEACHER,
     PIXEL,
-    TEACHER,
     goes_on_after_a_kill,
     shows_the_ball,
 )
@@ -67,8 +67,7 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(
 def test_it_learns_a_ball(
     name: str, steps: int, least: float, off: float, ball_scene: Scene, shared_log: Log
 ) -> None:
-    start = {"start": "teacher"} if name == "nsvf" else {}
-    shows_the_ball(fitted(name, ball_scene, shared_log, steps, **start), ball_scene, least, off)
+    shows_the_ball(fitted(name, ball_scene, shared_log, steps), ball_scene, least, off)
 
 
 @names
@@ -85,7 +84,7 @@ def test_a_training_is_found_again(name: str, ball_scene: Scene, shared_log: Log
 @names
 def test_a_row_names_what_its_own_products_are_computed_in(name: str) -> None:
     """`stored` is another matter: it is what they are computed from."""
-    teacher = replace(TEACHER, precision="bf16")
+    teacher = replace(EXACT_TEACHER, precision="bf16")
     as_teacher = name in ("nerf", "nsvf")
     shown = SMALL[name](teacher=teacher).settings()
     computed = teacher.settings(object)["field_precision"] if as_teacher else "fp32"
@@ -102,7 +101,6 @@ REFUSED: list[tuple[Callable[..., Any], str, Any]] = [
     *((SMALL["kilonerf"], "networks", x) for x in (0, 33)),
     (SMALL["nsvf"], "resolution", 40),
     (SMALL["nsvf"], "step", 0.0),
-    (SMALL["nsvf"], "start", "zero"),
     (SMALL["plenoctree"], "stored", "fp8"),
     (DiverLessons, "corner_rate", 0.0),
     (DiverLessons, "prune_at", 2.0),
