@@ -56,7 +56,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Rendering:
+class RunView:
     """A frame rendered by one run: titles, rendering and error map, uint8 [H, W, 3] each."""
 
     titles: tuple[str, ...]
@@ -76,7 +76,7 @@ class ComparedFrame:
     name: str
     stem: str
     truth: np.ndarray
-    views: Sequence[Rendering]
+    views: Sequence[RunView]
     box: Box
     where: str
     errors: str
@@ -110,14 +110,14 @@ def frame_section(runs: Sequence[Run], frame: str, stem: str) -> Iterator[str | 
     )
 
 
-def _view(run: Run, frame: str) -> Rendering:
+def _view(run: Run, frame: str) -> RunView:
     """A kept frame of a run, with its PSNR and the time of a steady frame, or its own, if cold."""
     figures = run.frames.set_index("frame").loc[int(frame)]
     cold = figures["phase"] == COLD
     ms = figures["frame_ms"] if cold else run.values["frame_ms"]
     title = f"PSNR {figures['psnr']:.2f} dB, {ms:,.1f} ms{', cold' if cold else ''}"
     pictures = [_read(run.pictures / f"{frame}-{kind}.png") for kind in ("rendered", "error")]
-    return Rendering((run.label, title), *pictures)
+    return RunView((run.label, title), *pictures)
 
 
 def _read(path: Path) -> np.ndarray:

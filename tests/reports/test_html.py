@@ -18,7 +18,7 @@ from PIL import Image
 
 from bench.results import Store
 from reports import publish
-from reports.images import ComparedFrame, Rendering
+from reports.images import ComparedFrame, RunView
 from reports.page import write_page
 from reports.tables import Table
 from tests.reports.conftest import rewrite
@@ -106,7 +106,7 @@ def test_pictures_lose_nothing(several, stored_run, parsed):
 
 def test_a_page_with_large_pictures_says_that_they_are_compressed(monkeypatch):
     grey = np.full((8, 8, 3), 99, np.uint8)
-    views = [Rendering(("a", "b"), grey, grey)]
+    views = [RunView(("a", "b"), grey, grey)]
     frame = ComparedFrame(
         "ball, 0", "frame", grey, views, (0, 0, 2, 2), "nothing differs", "no error"
     )

@@ -12,7 +12,7 @@ from PIL import Image
 from reports.images import (
     MOST_FRAMES,
     ComparedFrame,
-    Rendering,
+    RunView,
     find_detail,
     frame_section,
     kept_frames,
@@ -53,7 +53,7 @@ def test_of_one_rendering_the_detail_is_where_it_is_wrong_and_of_equal_ones_in_t
 
 @pytest.mark.parametrize(("runs", "columns", "lines"), [(1, 3, 2), (2, 3, 3), (4, 5, 3)])
 def test_an_image_has_a_place_for_every_picture(tmp_path, runs, columns, lines):
-    views = [Rendering(("a", "b"), flat(50 * number), flat(7)) for number in range(runs)]
+    views = [RunView(("a", "b"), flat(50 * number), flat(7)) for number in range(runs)]
     frame = ComparedFrame("ball", "ball", flat(255), views, (0, 0, 24, 16), "they differ", "error")
     write_image(frame, tmp_path / "image.png")
     with Image.open(tmp_path / "image.png") as image:
