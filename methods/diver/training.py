@@ -28,13 +28,11 @@ class DiverLessons(PixelOptions):
     """How to train the model, as `sweeps/configs/method/diver.yaml` explains; `rate` is that of the
     decoder."""
 
-    rate: float = 5e-3
-    opacity_entropy: float = 0.0
-    corner_rate: float = 2e-2
-    sparsity: float = 1e-5
-    prune_at: float = 0.1
-    prune_below: float = 1e-2
-    prune_rays: int = 1 << 20
+    corner_rate: float
+    sparsity: float
+    prune_at: float
+    prune_below: float
+    prune_rays: int
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -118,6 +116,9 @@ class DiverTraining(PixelTraining):
         self.moments = AdamState(moments.first[rows], moments.second[rows], moments.steps[rows])
         self.grad = torch.zeros_like(model.table)
 
+    def optimisers(self) -> checkpoint.Optimisers:
+        return {"adam": self.networks, "moments": self.moments}
+
     def _update(self) -> None:
         rate = self.learning_rate()
         step_at(self.networks, rate)
@@ -135,14 +136,4 @@ class DiverTraining(PixelTraining):
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
         self.model.restore(tensors)
-
-    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        tensors, figures = super().state()
-        tensors |= self.moments.tensors("moments.")
-        return tensors | checkpoint.optimiser_tensors(self.networks, "adam."), figures
-
-    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        super().restore(tensors, figures)
-        self.moments = AdamState.of(tensors, "moments.", self.model.table.device)
         self.grad = torch.zeros_like(self.model.table)
-        checkpoint.restore_optimiser(self.networks, tensors, "adam.")

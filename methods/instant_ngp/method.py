@@ -13,16 +13,16 @@ from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.instant_ngp.field import FieldPrecision
 from methods.instant_ngp.stage1 import Setup, train_field
 from methods.instant_ngp.training import TrainingOptions
-from methods.kernels.composite import STOP, check_stop
+from methods.kernels.composite import check_stop
 from methods.kernels.encode import HashGrid
 from methods.rendering.frame import everywhere, render_frame
 
 
 class InstantNgp:
     """Instant-NGP as a `bench.types.Method`: the field of a `Setup`, rendered with rays that end at
-    the transmittance `stop`, less than 1. `name` is shown in result rows."""
+    the transmittance `stop`, less than 1."""
 
-    memory = 0
+    name, memory = "ngp", 0
     study = Study(
         knobs={"stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3"))},
         trained={
@@ -42,16 +42,15 @@ class InstantNgp:
         *,
         grid: HashGrid,
         training: TrainingOptions,
-        precision: FieldPrecision = "bf16",
-        stop: float = STOP,
-        name: str = "ngp",
-        backend: str = "auto",
-        device: str = "auto",
-        seed: int = 0,
+        precision: FieldPrecision,
+        stop: float,
+        backend: str,
+        device: str,
+        seed: int,
     ) -> None:
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
         check_stop(stop)
-        self.stop, self.name = stop, name
+        self.stop = stop
         self.train_s = 0.0
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:

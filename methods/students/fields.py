@@ -34,12 +34,10 @@ class FieldLessons(PixelOptions):
     """How to train a student that is a field: first on points, then on rays as Instant-NGP is. One
     large network takes many small steps, at a lower rate than a hash grid."""
 
-    rate: float = 1e-3
-    final_rate: float = 0.1
     # Share of the steps, at the beginning, that compare densities and colours at random points of
     # occupied cells with the teacher's.
-    points: float = 0.5
-    share: float = 0.25  # samples with a gradient in a step, as a share of the budget's
+    points: float
+    share: float  # samples with a gradient in a step, as a share of the budget's
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -175,6 +173,9 @@ class StudentTraining(PixelTraining):
             field, rays, cells, how, jitter=jitter, background=background, teacher=teacher
         )
 
+    def optimisers(self) -> checkpoint.Optimisers:
+        return {"adam": self.optimiser}
+
     def _update(self) -> None:
         loop.step_at(self.optimiser, self.learning_rate())
 
@@ -188,15 +189,6 @@ class StudentTraining(PixelTraining):
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
-
-    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """The optimiser, random numbers, size of the batch."""
-        tensors, figures = super().state()
-        return tensors | checkpoint.optimiser_tensors(self.optimiser, "adam."), figures
-
-    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        super().restore(tensors, figures)
-        checkpoint.restore_optimiser(self.optimiser, tensors, "adam.")
 
 
 def _seen(field: Field, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
