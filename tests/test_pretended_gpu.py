@@ -23,7 +23,10 @@ def there(*values: float) -> Tensor:
 
 
 HERE = torch.tensor([1.0, 2.0, 3.0])
-LATTICE, MIDDLE = HashGrid(levels=1, log2_table=6, n_min=4, n_max=4), torch.full((2, 3), 0.5)
+LATTICE, MIDDLE = (
+    HashGrid(levels=1, features=2, log2_table=6, n_min=4, n_max=4),
+    torch.full((2, 3), 0.5),
+)
 
 
 def test_a_tensor_there_says_so_and_so_does_what_is_computed_from_it(gpu):

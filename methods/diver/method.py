@@ -91,10 +91,9 @@ class Diver(Student):
     settings are explained in `sweeps/configs/method/diver.yaml`."""
 
     training: DiverLessons
-    name: str = "diver"
-    resolution: int = 256
-    stored: Stored = "bf16"
-    faint: float = 1e-2
+    resolution: int
+    stored: Stored
+    faint: float
 
     kind = "diver"
     study = Study(

@@ -28,13 +28,11 @@ class DiverLessons(PixelOptions):
     """How to train the model, as `sweeps/configs/method/diver.yaml` explains; `rate` is that of the
     decoder."""
 
-    rate: float = 5e-3
-    opacity_entropy: float = 0.0
-    corner_rate: float = 2e-2
-    sparsity: float = 1e-5
-    prune_at: float = 0.1
-    prune_below: float = 1e-2
-    prune_rays: int = 1 << 20
+    corner_rate: float
+    sparsity: float
+    prune_at: float
+    prune_below: float
+    prune_rays: int
 
     def __post_init__(self) -> None:
         super().__post_init__()

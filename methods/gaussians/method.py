@@ -19,7 +19,7 @@ from methods.gaussians.training import Fitting, GaussianTraining, on_surfaces, s
 from methods.instant_ngp.field import FieldPrecision
 from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
 from methods.instant_ngp.training import TrainingOptions
-from methods.kernels.composite import STOP, check_stop
+from methods.kernels.composite import check_stop
 from methods.kernels.encode import HashGrid
 from methods.kernels.types import expect
 from methods.rendering.frame import FeatureFrame
@@ -35,16 +35,16 @@ class GaussianSplatting:
     training: TrainingOptions
     fitting: Fitting
     count: int
-    steps: int | None = None  # None: `budget.renderer_steps`
-    degree: int = 3
-    checkpoint: str | None = None
-    stored: Literal["fp32", "int8"] = "fp32"
-    stop: float = STOP
-    precision: FieldPrecision = "bf16"
-    name: str = "gaussians"
-    backend: str = "auto"
-    device: str = "auto"
-    seed: int = 0
+    steps: int | None  # None: `budget.renderer_steps`
+    degree: int
+    checkpoint: str | None
+    stored: Literal["fp32", "int8"]
+    stop: float
+    precision: FieldPrecision
+    name: str
+    backend: str
+    device: str
+    seed: int
 
     memory = 0
     study = Study(

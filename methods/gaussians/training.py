@@ -45,22 +45,22 @@ class Fitting:
     """How to train Gaussians, as `sweeps/configs/method/gaussians.yaml` explains; the learning rate
     of the means is in scene units."""
 
-    means: float = 3e-4
-    final_means: float = 0.01
-    scales: float = 1e-2
-    rotations: float = 1e-3
-    opacities: float = 5e-2
-    colours: float = 2e-2
-    similarity: float = 0.2
-    opacity_cost: float = 2e-3
-    scale_cost: float = 0.01
-    noise: float = 5e5
-    every: int = 100
-    relocate_from: float = 0.02
-    relocate_to: float = 0.8
-    half: float = 0.5
-    opacity: float = 0.5
-    size: float = 0.5
+    means: float
+    final_means: float
+    scales: float
+    rotations: float
+    opacities: float
+    colours: float
+    similarity: float
+    opacity_cost: float
+    scale_cost: float
+    noise: float
+    every: int
+    relocate_from: float
+    relocate_to: float
+    half: float
+    opacity: float
+    size: float
 
     def __post_init__(self) -> None:
         expect(0 < self.opacity < 1, "opacity", "more than 0 and less than 1", self.opacity)

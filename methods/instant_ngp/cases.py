@@ -23,11 +23,24 @@ from methods.kernels.types import Intervals
 from methods.rendering.occupancy import DECAY, THRESHOLD, DensityGrid
 from methods.training import loop
 
-GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=16)
+GRID = HashGrid(levels=4, features=2, log2_table=8, n_min=4, n_max=16)
 STEPS = 6
 BY = [("reference", "fp32"), ("cpu", "fp32"), ("cpu", "bf16")]
 
-QUICK = TrainingOptions(grid_samples=1 << 12, max_rays=MIN_RAYS)
+QUICK = TrainingOptions(
+    rate=1e-2,
+    final_rate=1 / 30,
+    opacity_entropy=1e-3,
+    random_background=True,
+    max_rays=MIN_RAYS,
+    by_error=0.5,
+    march_step=None,
+    share=0.5,
+    grid_samples=1 << 12,
+    rays=None,
+    stop=3e-2,
+    thin=1e-2,
+)
 
 FORGOTTEN_AFTER = math.ceil((LOG_DENSITY_CLAMP - math.log(THRESHOLD)) / -math.log(DECAY))
 """Visits after which a cell of the largest possible density counts as empty again."""

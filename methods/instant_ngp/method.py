@@ -13,7 +13,7 @@ from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.instant_ngp.field import FieldPrecision
 from methods.instant_ngp.stage1 import Setup, train_field
 from methods.instant_ngp.training import TrainingOptions
-from methods.kernels.composite import STOP, check_stop
+from methods.kernels.composite import check_stop
 from methods.kernels.encode import HashGrid
 from methods.rendering.frame import everywhere, render_frame
 
@@ -42,12 +42,12 @@ class InstantNgp:
         *,
         grid: HashGrid,
         training: TrainingOptions,
-        precision: FieldPrecision = "bf16",
-        stop: float = STOP,
+        precision: FieldPrecision,
+        stop: float,
+        backend: str,
+        device: str,
+        seed: int,
         name: str = "ngp",
-        backend: str = "auto",
-        device: str = "auto",
-        seed: int = 0,
     ) -> None:
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
         check_stop(stop)

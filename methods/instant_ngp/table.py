@@ -38,7 +38,9 @@ def hash_grid(
 ) -> HashGrid:
     """A hash grid of that shape; `log2_table` None: a `SuitedGrid`."""
     shape = {"levels": levels, "features": features, "n_min": n_min, "n_max": n_max}
-    return SuitedGrid(**shape) if log2_table is None else HashGrid(log2_table=log2_table, **shape)
+    if log2_table is None:
+        return SuitedGrid(log2_table=SHORT, **shape)
+    return HashGrid(log2_table=log2_table, **shape)
 
 
 def detail(split: Split) -> float:

@@ -31,16 +31,16 @@ GRID_YOUTH_STEPS = 256
 
 @dataclass(frozen=True)
 class PixelOptions:
-    """How to train on random pixels; rate, schedule and entropy follow ngp_pl by default."""
+    """How to train on random pixels."""
 
-    rate: float = 1e-2  # initial learning rate
-    final_rate: float = 1 / 30  # share of it left at the end of the cosine schedule
-    opacity_entropy: float = 1e-3  # weight of -o ln o, which drives an opacity to 0 or 1
+    rate: float  # initial learning rate
+    final_rate: float  # share of it left at the end of the cosine schedule
+    opacity_entropy: float  # weight of -o ln o, which drives an opacity to 0 or 1
     # Composite RGBA pictures on a random colour per ray instead of the scene's background, so that
     # no density can pass for background.
-    random_background: bool = True
-    max_rays: int = 1 << 15  # maximum number of rays in a step
-    by_error: float = 0.0  # share of the rays that an `ErrorMap` draws; the rest see all alike
+    random_background: bool
+    max_rays: int  # maximum number of rays in a step
+    by_error: float  # share of the rays that an `ErrorMap` draws; the rest see all alike
 
     def __post_init__(self) -> None:
         expect(self.rate > 0, "rate", "more than 0", self.rate)
@@ -52,17 +52,14 @@ class PixelOptions:
 
 @dataclass(frozen=True)
 class TrainingOptions(PixelOptions):
-    """How to train a field in stage 1; `rate` is that of table and networks. The defaults are made
-    for a short training on a CPU (docs/log.md); `budget=full` sets those of SteerNeRF's release."""
+    """How to train a field in stage 1; `rate` is that of table and networks."""
 
-    # Step of the rays, in diagonals of the cube / 1024, 1 in the release; None: `suitable_step`.
-    march_step: float | None = None
-    share: float = 0.5  # samples with a gradient in a step, as a share of the budget's
-    grid_samples: int = 1 << 17  # cells visited in an update of the density grid
-    rays: int | None = None  # in every step; None: as many as give `share` of the samples
-    stop: float = 3e-2  # transmittance at which a ray ends
-    thin: float = 1e-2  # see `Sampling`
-    by_error: float = 0.5
+    march_step: float | None  # of the rays, in diagonals of the cube / 1024; None: `suitable_step`
+    share: float  # samples with a gradient in a step, as a share of the budget's
+    grid_samples: int  # cells visited in an update of the density grid
+    rays: int | None  # in every step; None: as many as give `share` of the samples
+    stop: float  # transmittance at which a ray ends
+    thin: float  # see `Sampling`
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -27,11 +27,8 @@ LEAK = 0.01
 class KiloLessons(FieldLessons):
     """How to train the networks, as `sweeps/configs/method/kilonerf.yaml` explains."""
 
-    rate: float = 3e-3
-    final_rate: float = 1 / 30
-    share: float = 1.0
-    points_each: int = 128
-    view_cost: float = 1e-6
+    points_each: int
+    view_cost: float
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -81,8 +78,7 @@ class KiloNerf(FieldStudent):
     32."""
 
     training: KiloLessons
-    name: str = "kilonerf"
-    networks: int = 16
+    networks: int
 
     kind = "kilonerf"
 

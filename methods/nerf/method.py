@@ -25,8 +25,7 @@ class Nerf(FieldStudent):
     """One NeRF network, rendered where the field that it starts from is occupied, or everywhere."""
 
     training: FieldLessons
-    name: str = "nerf"
-    skip: bool = True  # the samples outside the occupied cells; the picture is the same
+    skip: bool  # the samples outside the occupied cells; the picture is the same
 
     kind = "nerf"
     study = replace(

@@ -22,9 +22,8 @@ class Nsvf(FieldStudent):
     """A neural sparse voxel field with voxels where the field that it starts from is occupied."""
 
     training: FieldLessons
-    name: str = "nsvf"
-    resolution: int = 128  # voxels along a side of the cube, a multiple of 16
-    step: float = 0.5  # length of a step of the rays in voxels, in training and rendering
+    resolution: int  # voxels along a side of the cube, a multiple of 16
+    step: float  # length of a step of the rays in voxels, in training and rendering
 
     kind = "nsvf"
 

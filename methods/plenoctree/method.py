@@ -36,11 +36,8 @@ class OctreeLessons(PixelOptions):
     the harmonics; `samples` are more than those of a field, each of which changes the whole
     network."""
 
-    rate: float = 1e-2
-    density_rate: float = 0.03
-    samples: int = 1 << 17
-    final_rate: float = 0.1
-    opacity_entropy: float = 0.0
+    density_rate: float
+    samples: int
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -123,8 +120,7 @@ class PlenOctree(Student):
 
     training: OctreeLessons
     extraction: Extraction
-    name: str = "plenoctree"
-    stored: Literal["fp16", "fp32"] = "fp16"
+    stored: Literal["fp16", "fp32"]
 
     kind = "plenoctree"
     study = Study(

@@ -89,13 +89,13 @@ def _half(values: Tensor) -> Tensor:
 class Extraction:
     """How leaves are found and filled, as `sweeps/configs/method/plenoctree.yaml` explains."""
 
-    resolution: int = 512
-    degree: int = 2
-    least_weight: float = 1e-3
-    rays: int = 1 << 22
-    points: int = 8
-    directions: int = 64
-    most_leaves: int = 12_000_000
+    resolution: int
+    degree: int
+    least_weight: float
+    rays: int
+    points: int
+    directions: int
+    most_leaves: int
 
     def __post_init__(self) -> None:
         size, terms = self.resolution, (self.degree + 1) ** 2

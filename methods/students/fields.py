@@ -34,12 +34,10 @@ class FieldLessons(PixelOptions):
     """How to train a student that is a field: first on points, then on rays as Instant-NGP is. One
     large network takes many small steps, at a lower rate than a hash grid."""
 
-    rate: float = 1e-3
-    final_rate: float = 0.1
     # Share of the steps, at the beginning, that compare densities and colours at random points of
     # occupied cells with the teacher's.
-    points: float = 0.5
-    share: float = 0.25  # samples with a gradient in a step, as a share of the budget's
+    points: float
+    share: float  # samples with a gradient in a step, as a share of the budget's
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -34,9 +34,9 @@ class Student(ABC):
 
     teacher: Setup  # the field that it starts from, and where it runs
     training: PixelOptions  # how the model is trained
-    stop: float = 1e-2  # transmittance at which a ray ends when rendering, less than 1
+    stop: float  # transmittance at which a ray ends when rendering, less than 1
     name: str  # as shown in result rows
-    steps: int | None = None  # of its own training; None: `budget.renderer_steps`
+    steps: int | None  # of its own training; None: `budget.renderer_steps`
 
     memory = 0
     kind: ClassVar[str]  # name of its trained stage, for example "nerf"

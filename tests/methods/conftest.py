@@ -21,7 +21,7 @@ from tests.methods.trainings import TAUGHT, TEACHER
 
 SIZE = 32
 
-GRID = HashGrid(levels=4, log2_table=10, n_min=4, n_max=32)
+GRID = HashGrid(levels=4, features=2, log2_table=10, n_min=4, n_max=32)
 
 Cloud = tuple[HashField, Occupancy]
 

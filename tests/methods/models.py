@@ -25,7 +25,7 @@ from methods.steernerf.options import (
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.unet import UNet
 
-SMALL_GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=16)
+SMALL_GRID = HashGrid(levels=4, features=2, log2_table=8, n_min=4, n_max=16)
 MODEL = ModelOptions(channels=4, frames=2, scale=4, step=8.0, stop=STOP, feature_background=0.5)
 RENDERING = Rendering(8.0, STOP, EVERYWHERE, Skips(empty=True, hidden=True, background=True))
 MOTION = MotionOptions(degrees=(0.0, 2.5), pool=12, uses=16)

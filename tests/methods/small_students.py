@@ -2,39 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from bench.types import Budget, Log, Scene
-from methods.diver.method import Diver
-from methods.diver.training import DiverLessons
-from methods.kilonerf.method import KiloLessons, KiloNerf
-from methods.nerf.method import Nerf
-from methods.nsvf.method import Nsvf
-from methods.plenoctree.method import OctreeLessons, PlenOctree
+from methods.instant_ngp.stage1 import Setup
 from methods.plenoctree.octree import Extraction
-from methods.students.fields import FieldLessons
 from methods.students.method import Student
 from tests.methods.trainings import EXACT_TEACHER, TAUGHT, TEACHER
+from tests.methods.usual import lessons, usual
 
-LEAVES = {"resolution": 128, "degree": 1, "rays": 20_000, "points": 2, "directions": 8}
-SMALL: dict[str, Callable[..., Student]] = {
-    "diver": partial(
-        Diver, teacher=TEACHER, training=DiverLessons(prune_rays=1 << 13), resolution=32
-    ),
-    "kilonerf": partial(
-        KiloNerf, teacher=TEACHER, training=KiloLessons(points_each=64, rate=1e-2), networks=4
-    ),
-    "nerf": partial(Nerf, teacher=EXACT_TEACHER, training=FieldLessons()),
-    "nsvf": partial(Nsvf, teacher=EXACT_TEACHER, training=FieldLessons(rate=2e-3), resolution=32),
-    "plenoctree": partial(
-        PlenOctree,
-        teacher=TEACHER,
-        training=OctreeLessons(samples=8192),
-        extraction=Extraction(**LEAVES),
-    ),
+
+def small(
+    name: str, teacher: Setup, lesson: Mapping[str, Any], **options: Any
+) -> Callable[..., Student]:
+    training = lessons(name, **lesson)
+    return partial(usual, f"method/{name}", teacher=teacher, training=training, **options)
+
+
+extraction: Callable[..., Extraction] = partial(
+    usual,
+    "method/plenoctree",
+    "extraction",
+    **{"resolution": 128, "degree": 1, "rays": 20_000, "points": 2, "directions": 8},
+)
+SMALL = {
+    "diver": small("diver", TEACHER, {"prune_rays": 1 << 13}, resolution=32),
+    "kilonerf": small("kilonerf", TEACHER, {"points_each": 64, "rate": 1e-2}, networks=4),
+    "nerf": small("nerf", EXACT_TEACHER, {}),
+    "nsvf": small("nsvf", EXACT_TEACHER, {"rate": 2e-3}, resolution=32),
+    "plenoctree": small("plenoctree", TEACHER, {"samples": 8192}, extraction=extraction()),
 }
 
 

@@ -20,27 +20,17 @@ from bench.trajectories import from_split
 from bench.types import Budget, Method, NullProbe, Scene, Split
 from bench.waits import device_waits
 from methods.checks import found
-from methods.diver.method import Diver
-from methods.diver.training import DiverLessons
 from methods.engines import torch_engine
 from methods.engines.torch_engine import TorchEngine
-from methods.gaussians.method import GaussianSplatting
-from methods.gaussians.training import Fitting
 from methods.instant_ngp.field import HashField
-from methods.instant_ngp.method import InstantNgp
 from methods.instant_ngp.stage1 import Setup
-from methods.instant_ngp.training import FieldTraining, TrainingOptions
+from methods.instant_ngp.training import FieldTraining
 from methods.kernels import availability, multiplies_bf16
 from methods.kernels.encode import HashGrid
 from methods.kernels.march import longest_ray
 from methods.kilonerf.field import KiloField
-from methods.kilonerf.method import KiloLessons, KiloNerf
 from methods.nerf.field import NerfField
-from methods.nerf.method import Nerf
 from methods.nsvf.field import NsvfField
-from methods.nsvf.method import Nsvf
-from methods.plenoctree.method import OctreeLessons, PlenOctree
-from methods.plenoctree.octree import Extraction
 from methods.rendering import field, frame
 from methods.rendering.occupancy import EVERY, STEP
 from methods.steernerf.method import SteerNerf
@@ -48,7 +38,7 @@ from methods.steernerf.options import RangeReduction
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.stage2 import JointTraining
 from methods.steernerf.unet import UNet
-from methods.students.fields import FieldLessons, StudentField
+from methods.students.fields import StudentField
 from methods.training import loop
 from tests.conftest import QUICK
 from tests.methods.conftest import Work
@@ -58,7 +48,9 @@ from tests.methods.models import (
     small_motion,
     small_rendering,
 )
+from tests.methods.small_students import extraction
 from tests.methods.trainings import killed
+from tests.methods.usual import field_options, lessons, new_gaussians, new_ngp, usual
 from tests.pretended_gpu import PretendedGpu, pretended_gpu
 
 pytestmark = pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
@@ -67,8 +59,8 @@ needs_triton = pytest.mark.skipif(
 )
 
 BUDGET = Budget("test", steps=4, samples=512, renderer_steps=2)
-GRID = HashGrid(levels=4, log2_table=10, n_min=4, n_max=32)
-STAGE1 = TrainingOptions(march_step=8.0, grid_samples=4096, max_rays=64)
+GRID = HashGrid(levels=4, features=2, log2_table=10, n_min=4, n_max=32)
+STAGE1 = field_options(march_step=8.0, grid_samples=4096, max_rays=64)
 MOTION = small_motion(pool=1, uses=3)
 FEW: dict[str, Any] = {"batch": 1, "patch": 4, "distilled_views": 1, "motion": MOTION}
 
@@ -87,30 +79,26 @@ def steernerf(field: str, **others: Any) -> Method:
     return SteerNerf(**given | others)
 
 
-def student(make: Callable[..., Method], device: str, backend: str, **options: Any) -> Method:
+def student(
+    name: str, device: str, backend: str, lesson: Mapping[str, Any], **options: Any
+) -> Method:
     grid = replace(GRID, levels=16)
     teacher = Setup.resolved(grid, STAGE1, "fp32", backend, device, seed=0)
-    return make(teacher=teacher, **options)
+    training = lessons(name, **lesson)
+    return usual(f"method/{name}", teacher=teacher, training=training, **options)
 
 
-NETWORK = FieldLessons(max_rays=64)
-EXTRACTION = Extraction(resolution=128, degree=1, rays=200, points=1, directions=4)
+SPARSE = extraction(rays=200, points=1, directions=4)
 METHODS: Mapping[str, Callable[..., Method]] = {
-    "ngp": partial(InstantNgp, grid=GRID, training=STAGE1),
+    "ngp": partial(new_ngp, grid=GRID, training=STAGE1),
     "steernerf": partial(steernerf, "joint"),
     "steernerf, frozen": partial(steernerf, "frozen"),
-    "gaussians": partial(
-        GaussianSplatting, grid=GRID, training=STAGE1, count=40, fitting=Fitting()
-    ),
-    "plenoctree": partial(
-        student, PlenOctree, extraction=EXTRACTION, training=OctreeLessons(samples=512)
-    ),
-    "diver": partial(student, Diver, resolution=32, training=DiverLessons(prune_rays=256)),
-    "kilonerf": partial(
-        student, KiloNerf, training=KiloLessons(points_each=8, max_rays=64), networks=2
-    ),
-    "nsvf": partial(student, Nsvf, training=NETWORK, resolution=32),
-    "nerf": partial(student, Nerf, training=NETWORK),
+    "gaussians": partial(new_gaussians, grid=GRID, training=STAGE1, count=40),
+    "plenoctree": partial(student, "plenoctree", lesson={"samples": 512}, extraction=SPARSE),
+    "diver": partial(student, "diver", lesson={"prune_rays": 256}, resolution=32),
+    "kilonerf": partial(student, "kilonerf", lesson={"points_each": 8, "max_rays": 64}, networks=2),
+    "nsvf": partial(student, "nsvf", lesson={"max_rays": 64}, resolution=32),
+    "nerf": partial(student, "nerf", lesson={"max_rays": 64}),
 }
 
 
@@ -299,12 +287,12 @@ def smallest(name: str, **where: Any) -> Method:
     """A method as small as it gets: an interpreter takes long for a step of a ray."""
     few = {
         "grid": replace(GRID, levels=2),
-        "training": TrainingOptions(march_step=64.0, grid_samples=16, max_rays=64),
+        "training": field_options(march_step=64.0, grid_samples=16, max_rays=64),
     }
     if name == "ngp":
-        return InstantNgp(**few, **where)
+        return new_ngp(**few, **where)
     if name == "gaussians":
-        return GaussianSplatting(**few, count=4, fitting=Fitting(), **where)
+        return new_gaussians(**few, count=4, **where)
     less = FEW | {"distilled_views": 0}
     lessons = small_joint(field="joint", **less)
     return steernerf("joint", model=small_model(step=64.0, frames=1), joint=lessons, **few, **where)

@@ -14,23 +14,23 @@ import torch
 from bench.metrics import psnr
 from bench.types import EMPTY_ALPHA, Budget, Method, NullProbe, Scene, composite
 from methods.instant_ngp.stage1 import Setup
-from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.encode import HashGrid
 from methods.training import loop
+from tests.methods.usual import field_options
 
 PIXEL = 1.6 / 40
 """Width of a pixel of the ball's pictures, in its middle."""
 
-GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
+GRID = HashGrid(levels=8, features=2, log2_table=12, n_min=8, n_max=64)
 
-QUICK = TrainingOptions(march_step=8.0, grid_samples=1 << 15)
+QUICK = field_options(march_step=8.0, grid_samples=1 << 15)
 """Few samples of a ray and few visits of the density grid: enough for a ball."""
 
 TEACHER = Setup.resolved(GRID, QUICK, "bf16", "auto", "cpu", seed=0)
 TAUGHT = Budget("test", steps=200, samples=2048, renderer_steps=40)
 """Of the fixture `teacher`."""
 
-EXACT_GRID = HashGrid(levels=16, log2_table=10, n_min=4, n_max=64)
+EXACT_GRID = HashGrid(levels=16, features=2, log2_table=10, n_min=4, n_max=64)
 EXACT_TEACHER = Setup.resolved(EXACT_GRID, QUICK, "fp32", "auto", "cpu", seed=0)
 """Of networks whose products are in the precision of their teacher's."""
 

@@ -31,11 +31,11 @@ class HashGrid:
     F `features`; vertices along an axis at the coarsest level, `n_min`, and at the finest, `n_max`.
     """
 
-    levels: int = 16
-    features: int = 2
-    log2_table: int = 17
-    n_min: int = 16
-    n_max: int = 1024
+    levels: int
+    features: int
+    log2_table: int
+    n_min: int
+    n_max: int
 
     def __post_init__(self) -> None:
         whole = self.levels >= 1 and self.features >= 1 and 3 <= self.log2_table <= 24

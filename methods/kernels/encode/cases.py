@@ -27,12 +27,12 @@ from methods.kernels.dispatch import served
 from methods.kernels.encode import PRIMES, HashGrid, encode, pack
 from methods.kernels.encode.reference import corners
 
-SMALL = HashGrid(levels=4, log2_table=10, n_min=4, n_max=40)
+SMALL = HashGrid(levels=4, features=2, log2_table=10, n_min=4, n_max=40)
 ODD = HashGrid(levels=3, features=3, log2_table=8, n_min=3, n_max=17)
-LARGE = HashGrid(log2_table=19, n_max=2048)
+LARGE = HashGrid(levels=16, features=2, log2_table=19, n_min=16, n_max=2048)
 VIEW = 1 << 17  # samples of one view, for which the throughput is measured
 
-GRID = HashGrid(levels=8, log2_table=12, n_min=4, n_max=512)
+GRID = HashGrid(levels=8, features=2, log2_table=12, n_min=4, n_max=512)
 
 BELOW_1 = 1 - 2.0**-24  # the float32 before 1
 

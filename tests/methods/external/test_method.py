@@ -17,10 +17,10 @@ from bench.scenes.assemble import hold_out
 from bench.study import Variant
 from bench.types import Budget, NullProbe, SteerbenchError
 from methods.gaussians import ply
-from methods.instant_ngp.method import InstantNgp
 from tests.methods.external.conftest import ROOT
 from tests.methods.gaussians.test_ply import some
 from tests.methods.trainings import GRID, QUICK
+from tests.methods.usual import new_ngp
 
 BUDGET = Budget("test", steps=7, samples=9)
 
@@ -253,9 +253,9 @@ def test_instant_ngp_renders_the_same_in_another_process(
     from bench.console import ConsoleLog
     from bench.scenes import blender
     from bench.types import Budget, Camera, NullProbe
-    from methods.instant_ngp.method import InstantNgp
     from steerbench_worker import serve
     from tests.methods.trainings import GRID, QUICK
+    from tests.methods.usual import new_ngp
 
     class Ngp:
         device = "cpu"
@@ -263,7 +263,7 @@ def test_instant_ngp_renders_the_same_in_another_process(
         def fit(self, job):
             log = ConsoleLog(job.state, quiet=True)
             scene = blender.load(job.scene, bounds=job.bounds, log=log)
-            self.method = InstantNgp(grid=GRID, training=QUICK, device="cpu")
+            self.method = new_ngp(grid=GRID, training=QUICK, device="cpu")
             self.method.fit(scene, Budget("b", steps=job.steps, samples=job.samples), log)
 
         def render(self, camera):
@@ -275,7 +275,7 @@ def test_instant_ngp_renders_the_same_in_another_process(
     cube = torch.tensor([[0.0] * 3, [1.0] * 3])
     scene = replace(ball_scene, origin=torch.full((3,), -1.5), unit_length=3.0, bounds=cube)
     budget = Budget("test", steps=8, samples=2048)
-    inside = InstantNgp(grid=GRID, training=QUICK, device="cpu")
+    inside = new_ngp(grid=GRID, training=QUICK, device="cpu")
     outside = external(worker(before=before, after="serve(Ngp)\n"))
     for method in (inside, outside):
         method.fit(scene, budget, quiet_log)

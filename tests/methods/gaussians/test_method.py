@@ -11,13 +11,12 @@ import torch
 
 from bench.types import Budget, Log, NullProbe, Scene
 from methods.gaussians.method import GaussianSplatting
-from methods.gaussians.training import Fitting
 from tests.methods.trainings import GRID, PIXEL, QUICK, TAUGHT, quality, shows_the_ball
+from tests.methods.usual import new_gaussians
 
 
 def fitted(scene: Scene, log: Log, budget: Budget = TAUGHT, **options) -> GaussianSplatting:
-    settings = {"count": 400, "fitting": Fitting()} | options
-    method = GaussianSplatting(grid=GRID, training=QUICK, device="cpu", **settings)
+    method = new_gaussians(**{"grid": GRID, "training": QUICK, "count": 400} | options)
     method.fit(scene, budget, log)
     return method
 
@@ -59,4 +58,4 @@ def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, shared_log: Log) -
 def test_wrong_settings_are_refused(wrong: dict[str, Any]) -> None:
     (name,) = wrong
     with pytest.raises(ValueError, match=f"^{name}: expected"):
-        GaussianSplatting(grid=GRID, training=QUICK, fitting=Fitting(), **{"count": 10} | wrong)
+        new_gaussians(grid=GRID, training=QUICK, **wrong)

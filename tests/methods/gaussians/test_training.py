@@ -16,7 +16,6 @@ from methods.gaussians import training
 from methods.gaussians.model import Gaussians
 from methods.gaussians.training import (
     DEAD,
-    Fitting,
     GaussianTraining,
     anywhere,
     disturb,
@@ -28,6 +27,7 @@ from methods.gaussians.training import (
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.types import Pixels
 from tests.methods.trainings import TEACHER, goes_on_after_a_kill
+from tests.methods.usual import usual
 
 
 def test_they_begin_on_surfaces_with_their_colours(
@@ -74,7 +74,9 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(ball_scene: Scene, tmp_
     def new() -> GaussianTraining:
         points, colours = anywhere(ball_scene, 200, torch.Generator().manual_seed(0))
         gaussians = Gaussians.at(points, colours, 0.5 * spacing(points), 0.5, degree=3)
-        return GaussianTraining(gaussians, ball_scene, 40, Fitting(every=10), TEACHER)
+        return GaussianTraining(
+            gaussians, ball_scene, 40, usual("method/gaussians", "fitting", every=10), TEACHER
+        )
 
     goes_on_after_a_kill(new, 23, tmp_path)
 

@@ -12,7 +12,7 @@ from methods.instant_ngp.field import LOG_DENSITY_CLAMP, HashField, _ClampedExp
 from methods.kernels.encode import HashGrid, SampleGradients, encode
 from tests.methods.conftest import Work
 
-GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=32)
+GRID = HashGrid(levels=4, features=2, log2_table=8, n_min=4, n_max=32)
 GENERATOR = torch.Generator().manual_seed(1)
 POSITIONS = torch.rand(200, 3, generator=GENERATOR)
 DIRECTIONS = torch.randn(200, 3, generator=GENERATOR)

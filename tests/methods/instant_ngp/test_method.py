@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from bench.types import Budget, Log, NullProbe, Scene
 from methods.instant_ngp.method import InstantNgp
-from methods.kernels.encode import HashGrid
 from tests.methods.trainings import GRID, PIXEL, QUICK, TAUGHT, shows_the_ball
+from tests.methods.usual import new_ngp
 
 BUDGET = Budget("test", steps=8, samples=2048)
 
 
 def fitted(scene: Scene, log: Log, device: str, budget: Budget = BUDGET, **options) -> InstantNgp:
-    method = InstantNgp(grid=GRID, training=QUICK, device=device, **options)
+    method = new_ngp(grid=GRID, training=QUICK, device=device, **options)
     method.fit(scene, budget, log)
     return method
 
@@ -48,7 +50,7 @@ def test_settings_say_in_which_precision_a_field_is_multiplied(
     known = {"cpu": has_products}
     monkeypatch.setattr("methods.instant_ngp.stage1.multiplies_bf16", known.__getitem__)
     for precision, shown in (("bf16", said), ("fp32", "fp32")):
-        method = InstantNgp(grid=GRID, training=QUICK, device="cpu", precision=precision)
+        method = new_ngp(grid=GRID, training=QUICK, device="cpu", precision=precision)
         others = {"device": "cpu", "backend": "cpu", "engine": "none", "precision": "none"}
         assert method.settings() == {**others, "field_precision": shown}
 
@@ -56,7 +58,7 @@ def test_settings_say_in_which_precision_a_field_is_multiplied(
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"grid": HashGrid(features=4)}, r"grid\.features is 4: use precision=fp32"),
+        ({"grid": replace(GRID, features=4)}, r"grid\.features is 4: use precision=fp32"),
         ({"stop": 1.0}, "stop: expected a transmittance of 0 or more and less"),
         *(
             ({"device": name}, rf"^device: expected auto, .* got '{name}'")
@@ -66,4 +68,4 @@ def test_settings_say_in_which_precision_a_field_is_multiplied(
 )
 def test_settings_that_make_no_sense_are_refused(wrong: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        InstantNgp(**{"grid": GRID, "training": QUICK, "device": "cpu", **wrong})
+        new_ngp(**{"grid": GRID, "training": QUICK, "device": "cpu", **wrong})

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from bench.types import Budget, Log, Scene, Split
-from methods.instant_ngp.method import InstantNgp
 from methods.instant_ngp.table import LONG, SHORT, detail, hash_grid
 from methods.kernels.encode import HashGrid
 from tests.methods.trainings import QUICK
+from tests.methods.usual import new_ngp
 
 SHAPE = {"levels": 2, "features": 2, "n_min": 4, "n_max": 8}
 BUDGET = Budget("test", steps=1, samples=64)
@@ -48,7 +48,7 @@ def test_a_field_gets_the_table_that_its_scene_needs(
     ball_scene: Scene, quiet_log: Log, monkeypatch: pytest.MonkeyPatch, fine: int, expected: int
 ) -> None:
     monkeypatch.setattr("methods.instant_ngp.table.FINE", fine)
-    method = InstantNgp(grid=hash_grid(log2_table=None, **SHAPE), training=QUICK, device="cpu")
+    method = new_ngp(grid=hash_grid(log2_table=None, **SHAPE), training=QUICK, device="cpu")
     method.fit(ball_scene, BUDGET, quiet_log)
     assert method.trained.field.grid == HashGrid(log2_table=expected, **SHAPE)
     assert method.setup.key(ball_scene, BUDGET)["grid"] == {"log2_table": expected, **SHAPE}

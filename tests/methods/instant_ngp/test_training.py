@@ -16,11 +16,12 @@ from methods.instant_ngp.cases import cases
 from methods.instant_ngp.field import HashField
 from methods.instant_ngp.pixels import RUN, UNSEEN
 from methods.instant_ngp.stage1 import train_field
-from methods.instant_ngp.training import MIN_RAYS, FieldTraining, PixelTraining, TrainingOptions
+from methods.instant_ngp.training import MIN_RAYS, FieldTraining, PixelTraining
 from methods.kernels.types import Pixels
 from methods.rendering.occupancy import RESOLUTION, STEP
 from methods.training import checkpoint, loop
 from tests.methods.trainings import GRID, QUICK, TEACHER, killed
+from tests.methods.usual import field_options
 
 BUDGET = Budget("test", steps=40, samples=1024)
 
@@ -100,7 +101,7 @@ def test_the_learning_rate_falls_from_the_first_to_the_last_step(ball_scene: Sce
 
 def test_the_step_of_the_rays_suits_the_length_of_the_training_or_is_given() -> None:
     def step(steps: int, march_step: float | None = None) -> float:
-        return TrainingOptions(march_step=march_step).sampling(replace(BUDGET, steps=steps)).step
+        return field_options(march_step=march_step).sampling(replace(BUDGET, steps=steps)).step
 
     assert step(20_000) == STEP  # as long as the release trains
     assert step(1000) / step(8000) == pytest.approx(2)
@@ -205,7 +206,7 @@ def test_pictures_that_do_not_overlap_are_refused(ball_scene: Scene) -> None:
 )
 def test_options_that_make_no_sense_are_refused(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"^{name}: expected"):
-        TrainingOptions(**{name: value})
+        field_options(**{name: value})
 
 
 def test_a_checkpoint_that_cannot_be_written_says_so(tmp_path: Path) -> None:

@@ -60,7 +60,7 @@ def test_the_step_of_collected_gradients_is_that_of_their_sum(backend: str, feat
 
 
 def test_wrong_arguments_are_named() -> None:
-    grid = HashGrid(levels=1, log2_table=6, n_min=4, n_max=4)
+    grid = HashGrid(levels=1, features=2, log2_table=6, n_min=4, n_max=4)
     gradients = SampleGradients([(torch.zeros(5, 3), torch.zeros(5, 3))])
     table = torch.zeros(grid.entries, 2)
     with pytest.raises(ValueError, match="steps: expected shape"):

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
+
 import pytest
 import torch
 from torch import Tensor
 
 from methods.kernels.encode import HashGrid, SampleGradients, encode
 
-GRID = HashGrid(levels=4, log2_table=8, n_min=3, n_max=30)
+GRID = HashGrid(levels=4, features=2, log2_table=8, n_min=3, n_max=30)
 
 
 def random_table(grid: HashGrid, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -18,15 +21,16 @@ def random_table(grid: HashGrid, dtype: torch.dtype = torch.float64) -> Tensor:
 
 def test_levels_of_the_released_grid() -> None:
     """Resolutions and parameter counts of ngp_pl and of the Instant-NGP paper."""
-    grid = HashGrid(log2_table=19, n_min=16, n_max=1024)
+    new = partial(HashGrid, levels=16, features=2, n_min=16)
+    grid = new(log2_table=19, n_max=1024)
     assert grid.resolutions == (
         *(16, 22, 28, 37, 49, 64, 85, 112),
         *(148, 195, 256, 338, 446, 589, 777, 1024),
     )
     assert grid.strides == (*grid.resolutions[:6], *[0] * 10)
     assert grid.entries * grid.features == 11_420_064
-    assert HashGrid(log2_table=16, n_max=2048).entries * 2 == 1_796_048
-    assert HashGrid(log2_table=19, n_max=4096).entries * 2 == 12_599_920
+    assert new(log2_table=16, n_max=2048).entries * 2 == 1_796_048
+    assert new(log2_table=19, n_max=4096).entries * 2 == 12_599_920
 
 
 def test_gradients_in_float64() -> None:
@@ -79,6 +83,6 @@ def test_wrong_arguments_are_named() -> None:
     with pytest.raises(ValueError, match="float32"):
         encode(torch.zeros(4, 3), table.double(), GRID, backend="cpu")
     with pytest.raises(ValueError, match="n_min <= n_max"):
-        HashGrid(n_min=64, n_max=32)
+        replace(GRID, n_min=64)
     with pytest.raises(ValueError, match="no gradient for positions"):
         encode(torch.zeros(4, 3, requires_grad=True), table, GRID, backend="cpu")

@@ -58,7 +58,7 @@ def test_what_is_not_a_number_shows_and_what_is_behind_it_does_not() -> None:
 
 def test_what_is_not_contiguous_is_read_all_the_same() -> None:
     generator = torch.Generator().manual_seed(0)
-    grid = HashGrid(levels=2, log2_table=6, n_min=4, n_max=20)
+    grid = HashGrid(levels=2, features=2, log2_table=6, n_min=4, n_max=20)
     positions = torch.rand(3, 50, generator=generator).to(DEVICE).T
     table = torch.rand(2, grid.entries, generator=generator).to(DEVICE).T.requires_grad_()
     gradients = [
@@ -106,7 +106,10 @@ def test_every_kernel_compiles_for_a_gpu_that_is_not_here(tmp_path: Path) -> Non
 
 
 def test_what_it_does_not_serve_is_refused() -> None:
-    grid, table = HashGrid(levels=1, log2_table=3, n_min=2, n_max=2), torch.zeros(2, 8).T
+    grid, table = (
+        HashGrid(levels=1, features=2, log2_table=3, n_min=2, n_max=2),
+        torch.zeros(2, 8).T,
+    )
     positions = torch.rand(2, 3, dtype=torch.float64, device=DEVICE)
     with pytest.raises(ValueError, match="expects positions of float32"):
         encode(positions, table.to(DEVICE), grid, backend="gpu")

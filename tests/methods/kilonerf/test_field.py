@@ -8,7 +8,8 @@ import torch
 
 from methods.kernels.types import Occupancy
 from methods.kilonerf.field import KiloField, place_networks
-from methods.kilonerf.method import KiloLessons, KiloTraining
+from methods.kilonerf.method import KiloTraining
+from tests.methods.usual import lessons
 
 BOUNDS = torch.tensor([[0.1, 0.2, 0.1], [0.9, 0.8, 0.7]])
 
@@ -76,7 +77,8 @@ def test_layers_that_see_directions_are_drawn_to_zero_by_the_gradient_of_their_n
     field = KiloField(grid, "auto", torch.Generator().manual_seed(0))
     for parameter in field.parameters():
         parameter.grad = torch.zeros_like(parameter)
-    KiloTraining._smooth_views(SimpleNamespace(field=field, options=KiloLessons(view_cost=0.25)))
+    options = lessons("kilonerf", view_cost=0.25)
+    KiloTraining._smooth_views(SimpleNamespace(field=field, options=options))
     seeing = (field.weights["direction"], field.weights["colour"])
     for parameter in seeing:
         assert parameter.grad is not None

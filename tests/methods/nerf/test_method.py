@@ -9,7 +9,6 @@ from bench.types import Log, Scene
 from methods.kernels.composite import STOP
 from methods.nerf.field import NerfField
 from methods.rendering.sampling import Sampling
-from methods.students.fields import FieldLessons
 from tests.methods.conftest import Work
 from tests.methods.small_students import fitted
 from tests.methods.trainings import EXACT_TEACHER
@@ -19,8 +18,7 @@ LONG = EXACT_TEACHER.training.march_step
 
 
 def test_skipping_changes_no_picture_and_saves_products(ball_scene: Scene, shared_log: Log) -> None:
-    lessons = FieldLessons(rate=1e-3)
-    method = fitted("nerf", ball_scene, shared_log, 20, training=lessons, stop=STOP)
+    method = fitted("nerf", ball_scene, shared_log, 20, stop=STOP)
     assert method.sizes() == {"network": 4 * 595_844, "occupancy": 128**3 // 8}
     camera = ball_scene.splits["test"].cameras[0]
     skipping, dense = Work(), Work()

@@ -11,11 +11,12 @@ from bench.types import Log, Scene, SteerbenchError
 from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.types import Pixels
-from methods.plenoctree.method import OctreeLessons, OctreeTraining, PlenOctree, opaque_at_end
-from methods.plenoctree.octree import Extraction, Octree, extract, fibonacci_sphere
+from methods.plenoctree.method import OctreeTraining, PlenOctree, opaque_at_end
+from methods.plenoctree.octree import Octree, extract, fibonacci_sphere
 from tests.methods.conftest import Work
-from tests.methods.small_students import LEAVES, fitted
+from tests.methods.small_students import extraction, fitted
 from tests.methods.trainings import PIXEL, TAUGHT, TEACHER, quality, shows_the_ball
+from tests.methods.usual import lessons
 
 
 def mean_quality(method: PlenOctree, scene: Scene, split: str) -> float:
@@ -26,7 +27,7 @@ def extracted(teacher: TrainedField, scene: Scene, **others: float) -> tuple[Oct
     """An octree, and the centres of its leaves."""
     batches = PixelBatches(scene.splits["train"], torch.device("cpu"))
     generator = torch.Generator().manual_seed(0)
-    octree = extract(teacher, batches, Extraction(**LEAVES | others), generator)
+    octree = extract(teacher, batches, extraction(**others), generator)
     return octree, (octree.voxels.coordinates + 0.5) / 128
 
 
@@ -109,7 +110,7 @@ def test_it_learns_a_ball(ball_scene: Scene, shared_log: Log) -> None:
 def test_only_what_rays_meet_is_changed(ball_scene: Scene, teacher: TrainedField) -> None:
     octree, _ = extracted(teacher, ball_scene)
     before = octree.light.density.clone(), octree.light.harmonics.clone()
-    options = OctreeLessons(max_rays=64)
+    options = lessons("plenoctree", max_rays=64)
     training = OctreeTraining(octree, ball_scene, TAUGHT, options, TEACHER)
     training.advance()
     met = torch.zeros(len(octree.voxels), dtype=torch.bool)

@@ -13,20 +13,16 @@ import pytest
 import torch
 
 from bench.types import Log, NullProbe, Scene
-from methods.diver.training import DiverLessons
 from methods.instant_ngp.stage1 import train_field
-from methods.kilonerf.method import KiloLessons
-from methods.plenoctree.method import OctreeLessons
-from methods.plenoctree.octree import Extraction
-from methods.students.fields import FieldLessons
 from methods.training import loop
-from tests.methods.small_students import LEAVES, SMALL, budget, fitted
+from tests.methods.small_students import SMALL, budget, extraction, fitted
 from tests.methods.trainings import (
     EXACT_TEACHER,
     PIXEL,
     goes_on_after_a_kill,
     shows_the_ball,
 )
+from tests.methods.usual import lessons
 
 names = pytest.mark.parametrize("name", SMALL)
 
@@ -102,20 +98,20 @@ REFUSED: list[tuple[Callable[..., Any], str, Any]] = [
     (SMALL["nsvf"], "resolution", 40),
     (SMALL["nsvf"], "step", 0.0),
     (SMALL["plenoctree"], "stored", "fp8"),
-    (DiverLessons, "corner_rate", 0.0),
-    (DiverLessons, "prune_at", 2.0),
-    (DiverLessons, "prune_below", 1.0),
-    *((FieldLessons, "share", x) for x in (0.0, 1.5)),
-    (FieldLessons, "points", 2.0),
-    (KiloLessons, "points_each", 0),
-    (KiloLessons, "view_cost", -1.0),
-    (OctreeLessons, "density_rate", -1.0),
-    (OctreeLessons, "samples", 0),
-    *((partial(Extraction, **LEAVES), "resolution", x) for x in (100, 192, 4096)),
-    (partial(Extraction, **LEAVES), "degree", 4),
-    (partial(Extraction, **LEAVES), "directions", 3),
-    (partial(Extraction, **LEAVES), "rays", 0),
-    (partial(Extraction, **LEAVES), "least_weight", float("nan")),
+    (partial(lessons, "diver"), "corner_rate", 0.0),
+    (partial(lessons, "diver"), "prune_at", 2.0),
+    (partial(lessons, "diver"), "prune_below", 1.0),
+    *((partial(lessons, "nerf"), "share", x) for x in (0.0, 1.5)),
+    (partial(lessons, "nerf"), "points", 2.0),
+    (partial(lessons, "kilonerf"), "points_each", 0),
+    (partial(lessons, "kilonerf"), "view_cost", -1.0),
+    (partial(lessons, "plenoctree"), "density_rate", -1.0),
+    (partial(lessons, "plenoctree"), "samples", 0),
+    *((extraction, "resolution", x) for x in (100, 192, 4096)),
+    (extraction, "degree", 4),
+    (extraction, "directions", 3),
+    (extraction, "rays", 0),
+    (extraction, "least_weight", float("nan")),
 ]
 
 
