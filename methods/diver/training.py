@@ -116,6 +116,9 @@ class DiverTraining(PixelTraining):
         self.moments = AdamState(moments.first[rows], moments.second[rows], moments.steps[rows])
         self.grad = torch.zeros_like(model.table)
 
+    def optimisers(self) -> checkpoint.Optimisers:
+        return {"adam": self.networks, "moments": self.moments}
+
     def _update(self) -> None:
         rate = self.learning_rate()
         step_at(self.networks, rate)
@@ -133,14 +136,4 @@ class DiverTraining(PixelTraining):
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
         self.model.restore(tensors)
-
-    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        tensors, figures = super().state()
-        tensors |= self.moments.tensors("moments.")
-        return tensors | checkpoint.optimiser_tensors(self.networks, "adam."), figures
-
-    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        super().restore(tensors, figures)
-        self.moments = AdamState.of(tensors, "moments.", self.model.table.device)
         self.grad = torch.zeros_like(self.model.table)
-        checkpoint.restore_optimiser(self.networks, tensors, "adam.")

@@ -152,11 +152,11 @@ class GaussianTraining:
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
         views = torch.tensor(self.views, dtype=torch.int64)
         more = {"generator": self.generator.get_state(), "views": views}
-        return checkpoint.optimiser_tensors(self.optimiser, "adam.") | more, {}
+        return checkpoint.of_optimisers({"adam": self.optimiser}) | more, {}
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
         self.restore_result(tensors)
-        checkpoint.restore_optimiser(self.optimiser, tensors, "adam.")
+        checkpoint.restore_optimisers({"adam": self.optimiser}, tensors)
         self.generator.set_state(tensors["generator"].cpu())
         self.views = tensors["views"].tolist()
 

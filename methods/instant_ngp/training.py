@@ -123,8 +123,12 @@ class PixelTraining(loop.Training, ABC):
         samples that were composited. `jitter` [R] in [0, 1) is the phase of the samples."""
 
     @abstractmethod
+    def optimisers(self) -> checkpoint.Optimisers:
+        """The optimisers, which a checkpoint keeps."""
+
+    @abstractmethod
     def _update(self) -> None:
-        """Take a step of the optimiser and clear the gradients."""
+        """Take a step of the optimisers and clear the gradients."""
 
     def learning_rate(self) -> float:
         """The learning rate of the next step."""
@@ -178,14 +182,16 @@ class PixelTraining(loop.Training, ABC):
         self.rays = min(max(int(self.rays * change), MIN_RAYS), self.options.max_rays)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """Random numbers, number of rays, error map."""
-        tensors = {"generator": self.generator.get_state()}
+        """Optimisers, random numbers, number of rays, error map."""
+        tensors = checkpoint.of_optimisers(self.optimisers())
+        tensors["generator"] = self.generator.get_state()
         if self.errors is not None:
             tensors |= {"errors": self.errors.errors, "error_ends": self.errors.ends}
         return tensors, {"rays": self.rays}
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
         self.restore_result(tensors)
+        checkpoint.restore_optimisers(self.optimisers(), tensors)
         self.rays = int(figures["rays"])
         self.generator.set_state(tensors["generator"].cpu())
         if self.errors is not None:
@@ -219,6 +225,9 @@ class FieldTraining(PixelTraining):
         field, cells, how = self.field, self.grid.occupancy, self.sampling
         return render_batch(field, rays, cells, how, jitter=jitter, background=background)
 
+    def optimisers(self) -> checkpoint.Optimisers:
+        return self.optimiser.parts
+
     def _update(self) -> None:
         self.optimiser.step(self.learning_rate())
 
@@ -228,8 +237,9 @@ class FieldTraining(PixelTraining):
 
     def watched(self) -> dict[str, Tensor]:
         """Table and its moments, networks."""
-        moments = self.optimiser.table_moments
-        return {"table": self.field.table, "table moments": moments, **self.field.layers}
+        moments = self.optimiser.table
+        both = moments.first + moments.second
+        return {"table": self.field.table, "table moments": both, **self.field.layers}
 
     def result(self) -> dict[str, Tensor]:
         """Field and density grid."""
@@ -238,15 +248,6 @@ class FieldTraining(PixelTraining):
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
         restore_field(self.field, self.grid, tensors)
-
-    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """Also the optimisers."""
-        tensors, figures = super().state()
-        return self.optimiser.tensors() | tensors, figures
-
-    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        super().restore(tensors, figures)
-        self.optimiser.restore(tensors)
 
 
 def restore_field(field: HashField, grid: DensityGrid, tensors: Mapping[str, Tensor]) -> None:
@@ -264,7 +265,7 @@ class FieldOptimiser:
 
     def __init__(self, field: HashField) -> None:
         self._field = field
-        self._table = AdamState.like(field.table.detach())
+        self.table = AdamState.like(field.table.detach())
         field.gradients = SampleGradients()
 
     @cached_property
@@ -282,24 +283,13 @@ class FieldOptimiser:
             field.table.detach(),
             field.gradients,
             field.grid,
-            self._table,
+            self.table,
             rate,
             packed=field.packed,
             backend=field.backend,
         )
 
     @property
-    def table_moments(self) -> Tensor:
-        """The sum of the table's moments, which is not finite where one of them is not."""
-        return self._table.first + self._table.second
-
-    def tensors(self) -> dict[str, Tensor]:
-        """The state, for a checkpoint."""
-        networks = checkpoint.optimiser_tensors(self._networks, "network.")
-        return self._table.tensors("adam.") | networks
-
-    def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore what `tensors` returned; gradients of a step that was not finished are lost."""
-        self._field.gradients = SampleGradients()
-        self._table = AdamState.of(tensors, "adam.", self._field.table.device)
-        checkpoint.restore_optimiser(self._networks, tensors, "network.")
+    def parts(self) -> checkpoint.Optimisers:
+        """Both, for a checkpoint."""
+        return {"table": self.table, "networks": self._networks}

@@ -26,6 +26,7 @@ from methods.rendering.compaction import to_host
 from methods.rendering.frame import Render
 from methods.rendering.sampling import Sampling
 from methods.students.method import Student
+from methods.training import checkpoint
 
 SIDE = "method.extraction.resolution"
 
@@ -80,6 +81,9 @@ class OctreeTraining(PixelTraining):
         pixels = composite(self._sigma.relu(), colours, crossings, stop=STOP, backend=backend)
         return pixels.over(background), len(crossings)
 
+    def optimisers(self) -> checkpoint.Optimisers:
+        return self.moments
+
     def _update(self) -> None:
         if self._sigma.grad is not None:
             self.gradients["density"].view(-1).index_add_(0, self.visited, self._sigma.grad)
@@ -100,17 +104,6 @@ class OctreeTraining(PixelTraining):
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
         self._take(Octree.of(tensors, self.octree.light.density.device))
-
-    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        tensors, figures = super().state()
-        for name, adam in self.moments.items():
-            tensors |= adam.tensors(f"{name}.")
-        return tensors, figures
-
-    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        super().restore(tensors, figures)
-        device = self.octree.light.density.device
-        self.moments = {name: AdamState.of(tensors, f"{name}.", device) for name in self.tables}
 
 
 @dataclass(kw_only=True, eq=False)

@@ -178,20 +178,19 @@ class JointTraining:
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
         """Optimisers, random numbers, and the examples that patches are cut from."""
         tensors = {f"patches.{name}": x for name, x in self.patches.state().items()}
-        for name, optimiser in self.optimisers.items():
-            tensors |= checkpoint.optimiser_tensors(optimiser, f"renderer_{name}.")
+        tensors |= checkpoint.of_optimisers(self.optimisers)
         tensors["generator"] = self.generator.get_state()
         if self.trained:
-            tensors |= {"visits": self._visits.get_state(), **self.field_optimiser.tensors()}
+            tensors |= checkpoint.of_optimisers(self.field_optimiser.parts)
+            tensors["visits"] = self._visits.get_state()
         return tensors, {}
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
         """Restore what `result` and `state` returned."""
         self.restore_result(tensors)
-        for name, optimiser in self.optimisers.items():
-            checkpoint.restore_optimiser(optimiser, tensors, f"renderer_{name}.")
+        checkpoint.restore_optimisers(self.optimisers, tensors)
         self.patches.restore(checkpoint.part(tensors, "patches."))
         self.generator.set_state(tensors["generator"].cpu())
         if self.trained:
-            self.field_optimiser.restore(tensors)
+            checkpoint.restore_optimisers(self.field_optimiser.parts, tensors)
             self._visits.set_state(tensors["visits"].cpu())

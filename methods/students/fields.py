@@ -173,6 +173,9 @@ class StudentTraining(PixelTraining):
             field, rays, cells, how, jitter=jitter, background=background, teacher=teacher
         )
 
+    def optimisers(self) -> checkpoint.Optimisers:
+        return {"adam": self.optimiser}
+
     def _update(self) -> None:
         loop.step_at(self.optimiser, self.learning_rate())
 
@@ -186,15 +189,6 @@ class StudentTraining(PixelTraining):
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
-
-    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """The optimiser, random numbers, size of the batch."""
-        tensors, figures = super().state()
-        return tensors | checkpoint.optimiser_tensors(self.optimiser, "adam."), figures
-
-    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        super().restore(tensors, figures)
-        checkpoint.restore_optimiser(self.optimiser, tensors, "adam.")
 
 
 def _seen(field: Field, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:

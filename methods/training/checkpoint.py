@@ -15,6 +15,7 @@ from torch import Tensor
 
 from bench.sharing import whole
 from bench.types import SteerbenchError
+from methods.kernels.adam import AdamState
 
 
 def write(path: Path, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
@@ -63,19 +64,36 @@ def part(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): tensors[name] for name in begun}
 
 
-def optimiser_tensors(optimiser: torch.optim.Optimizer, prefix: str) -> dict[str, Tensor]:
-    """The state of an optimiser, as `<prefix><parameter>.<slot>`."""
-    state = optimiser.state_dict()["state"]
-    return {f"{prefix}{n}.{slot}": x for n, slots in state.items() for slot, x in slots.items()}
+Optimisers = Mapping[str, torch.optim.Optimizer | AdamState]
+"""Those of a training, by name."""
 
 
-def restore_optimiser(
-    optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor], prefix: str
-) -> None:
-    """Restore what `optimiser_tensors` returned."""
+def of_optimisers(optimisers: Optimisers) -> dict[str, Tensor]:
+    """The state of `optimisers`, whose names begin its names."""
+    found: dict[str, Tensor] = {}
+    for name, one in optimisers.items():
+        if isinstance(one, AdamState):
+            found |= {f"{name}.{slot}": x for slot, x in one.tensors().items()}
+        else:
+            slots = one.state_dict()["state"].items()
+            found |= {f"{name}.{n}.{slot}": x for n, of in slots for slot, x in of.items()}
+    return found
+
+
+def restore_optimisers(optimisers: Optimisers, tensors: Mapping[str, Tensor]) -> None:
+    """Restore what `of_optimisers` returned."""
+    for name, one in optimisers.items():
+        own = part(tensors, f"{name}.")
+        if isinstance(one, AdamState):
+            one.restore(own)
+        else:
+            _restore(one, own)
+
+
+def _restore(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
     state = optimiser.state_dict()
     parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
-    for name, value in part(tensors, prefix).items():
+    for name, value in tensors.items():
         number, slot = name.split(".")
         parameter = parameters[int(number)]
         if value.shape == parameter.shape:

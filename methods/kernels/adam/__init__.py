@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cache
 
 import torch
@@ -39,14 +39,14 @@ class AdamState:
             torch.zeros(len(table), dtype=torch.int32, device=table.device),
         )
 
-    @classmethod
-    def of(cls, tensors: Mapping[str, Tensor], prefix: str, device: torch.device) -> AdamState:
-        """Restore the state from the result of `tensors` with the same prefix, on `device`."""
-        return cls(*(tensors[f"{prefix}{field.name}"].to(device) for field in fields(cls)))
+    def tensors(self) -> dict[str, Tensor]:
+        """The state, for a checkpoint."""
+        return dict(vars(self))
 
-    def tensors(self, prefix: str) -> dict[str, Tensor]:
-        """The state, for a checkpoint; names begin with `prefix`."""
-        return {f"{prefix}{name}": tensor for name, tensor in vars(self).items()}
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Restore what `tensors` returned."""
+        device = self.first.device
+        self.first, self.second, self.steps = (tensors[x].to(device) for x in vars(self))
 
 
 @cache

@@ -54,7 +54,7 @@ def test_the_step_of_collected_gradients_is_that_of_their_sum(backend: str, feat
         (total,) = torch.autograd.grad(encoded, asking, grad)
         sparse_adam_(tables[1], total, states[1], 0.1, backend=backend)
     assert torch.equal(*tables)
-    for moments in zip(*(state.tensors("").values() for state in states), strict=True):
+    for moments in zip(*(state.tensors().values() for state in states), strict=True):
         assert torch.equal(*moments)
     assert words is None or torch.equal(words, pack(tables[0]))
 
