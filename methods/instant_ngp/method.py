@@ -20,9 +20,9 @@ from methods.rendering.frame import everywhere, render_frame
 
 class InstantNgp:
     """Instant-NGP as a `bench.types.Method`: the field of a `Setup`, rendered with rays that end at
-    the transmittance `stop`, less than 1. `name` is shown in result rows."""
+    the transmittance `stop`, less than 1."""
 
-    memory = 0
+    name, memory = "ngp", 0
     study = Study(
         knobs={"stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3"))},
         trained={
@@ -47,11 +47,10 @@ class InstantNgp:
         backend: str,
         device: str,
         seed: int,
-        name: str = "ngp",
     ) -> None:
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
         check_stop(stop)
-        self.stop, self.name = stop, name
+        self.stop = stop
         self.train_s = 0.0
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
