@@ -43,9 +43,9 @@ def test_a_run_scores_what_it_did_not_learn_from(run, learned_from, tmp_path):
 @pytest.mark.parametrize("command", ["accuracy", "skips", "parity", "breakdown", "scaling"])
 def test_a_study_scores_what_it_did_not_learn_from(steerbench, learned_from, monkeypatch, command):
     monkeypatch.setattr("methods.checks.found", lambda name: [])
-    axis = ["--axis", "N"] if command == "scaling" else ["--repeats", "1"]
-    words = [*STAND_INS, "method=shades", "engine=torch", *SIXTEEN]
-    steerbench(command, "--frames", "8", *axis, *words).ok()
+    words = [*STAND_INS, "method=shades", "engine=torch", "protocol=study-1", "protocol.rounds=2"]
+    axis = ["--only", "N"] if command == "scaling" else []
+    steerbench(command, *axis, *words, *SIXTEEN).ok()
     assert learned_from
     for scene in learned_from:
         assert scene.splits["validation"].names == HELD_OUT
