@@ -198,13 +198,8 @@ class OffsetMethod:
         return {"offset": 4, "table": 100}
 
     def settings(self) -> dict[str, str]:
-        return {
-            "device": self._device,
-            "backend": "reference",
-            "engine": "none",
-            "precision": "none",
-            "field_precision": "fp32",
-        }
+        by = {"device": self._device, "backend": "reference", "field_precision": "fp32"}
+        return by | {"engine": "none", "precision": "none"}
 
 
 @pytest.fixture

@@ -20,7 +20,6 @@ from bench.trajectories import from_split
 from bench.types import Budget, Method, NullProbe, Scene, Split
 from bench.waits import device_waits
 from methods.checks import found
-from methods.diver.method import Diver
 from methods.diver.training import DiverLessons
 from methods.engines import torch_engine
 from methods.engines.torch_engine import TorchEngine
@@ -34,12 +33,10 @@ from methods.kernels import availability, multiplies_bf16
 from methods.kernels.encode import HashGrid
 from methods.kernels.march import longest_ray
 from methods.kilonerf.field import KiloField
-from methods.kilonerf.method import KiloLessons, KiloNerf
+from methods.kilonerf.method import KiloLessons
 from methods.nerf.field import NerfField
-from methods.nerf.method import Nerf
 from methods.nsvf.field import NsvfField
-from methods.nsvf.method import Nsvf
-from methods.plenoctree.method import OctreeLessons, PlenOctree
+from methods.plenoctree.method import OctreeLessons
 from methods.plenoctree.octree import Extraction
 from methods.rendering import field, frame
 from methods.rendering.occupancy import EVERY, STEP
@@ -58,6 +55,7 @@ from tests.methods.models import (
     small_motion,
     small_rendering,
 )
+from tests.methods.small_students import SMALL
 from tests.methods.trainings import killed
 from tests.pretended_gpu import PretendedGpu, pretended_gpu
 
@@ -87,14 +85,21 @@ def steernerf(field: str, **others: Any) -> Method:
     return SteerNerf(**given | others)
 
 
-def student(make: Callable[..., Method], device: str, backend: str, **options: Any) -> Method:
+def student(name: str, device: str, backend: str, **options: Any) -> Method:
     grid = replace(GRID, levels=16)
     teacher = Setup.resolved(grid, STAGE1, "fp32", backend, device, seed=0)
-    return make(teacher=teacher, **options)
+    return SMALL[name](teacher=teacher, **options)
 
 
 NETWORK = FieldLessons(max_rays=64)
 EXTRACTION = Extraction(resolution=128, degree=1, rays=200, points=1, directions=4)
+STUDENTS: dict[str, dict[str, Any]] = {
+    "plenoctree": {"extraction": EXTRACTION, "training": OctreeLessons(samples=512)},
+    "diver": {"training": DiverLessons(prune_rays=256)},
+    "kilonerf": {"training": KiloLessons(points_each=8, max_rays=64), "networks": 2},
+    "nsvf": {"training": NETWORK},
+    "nerf": {"training": NETWORK},
+}
 METHODS: Mapping[str, Callable[..., Method]] = {
     "ngp": partial(InstantNgp, grid=GRID, training=STAGE1),
     "steernerf": partial(steernerf, "joint"),
@@ -102,15 +107,7 @@ METHODS: Mapping[str, Callable[..., Method]] = {
     "gaussians": partial(
         GaussianSplatting, grid=GRID, training=STAGE1, count=40, fitting=Fitting()
     ),
-    "plenoctree": partial(
-        student, PlenOctree, extraction=EXTRACTION, training=OctreeLessons(samples=512)
-    ),
-    "diver": partial(student, Diver, resolution=32, training=DiverLessons(prune_rays=256)),
-    "kilonerf": partial(
-        student, KiloNerf, training=KiloLessons(points_each=8, max_rays=64), networks=2
-    ),
-    "nsvf": partial(student, Nsvf, training=NETWORK, resolution=32),
-    "nerf": partial(student, Nerf, training=NETWORK),
+    **{name: partial(student, name, **options) for name, options in STUDENTS.items()},
 }
 
 
