@@ -19,10 +19,7 @@ RUN = [
     *("budget=tiny", "budget.steps=200", "budget.samples=16384", "budget.renderer_steps=100"),
     *("budget.frames=0", "method.training.march_step=4"),
 ]
-METHODS = (
-    ["method=ngp"],
-    ["method=steernerf", "method.model.step=4"],
-)
+METHODS = (["method=ngp"], ["method=steernerf", "method.model.step=4"])
 METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "work.samples", "work.products")
 
 

@@ -49,15 +49,10 @@ from methods.students.fields import FieldLessons, StudentField
 from methods.training import loop
 from tests.conftest import QUICK
 from tests.methods.conftest import Work
-from tests.methods.models import (
-    small_joint,
-    small_model,
-    small_motion,
-    small_rendering,
-)
+from tests.methods.models import small_joint, small_model, small_motion, small_rendering
 from tests.methods.small_students import SMALL
 from tests.methods.trainings import killed
-from tests.pretended_gpu import PretendedGpu, pretended_gpu
+from tests.pretended_gpu import pretended_gpu
 
 pytestmark = pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
 needs_triton = pytest.mark.skipif(
@@ -166,14 +161,14 @@ def one_round(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_it_trains_and_renders_as_on_the_cpu(name: str, scene: Scene, tmp_path: Path) -> None:
+def test_it_trains_and_renders_as_on_the_cpu(name, scene, tmp_path):
     drawn = here_and_there(lambda device: frames(fitted(name, device, scene, tmp_path), scene))
     assert_alike(*drawn)
 
 
 def test_with_products_of_bfloat16_it_trains_and_renders_as_on_the_cpu(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    scene, tmp_path, monkeypatch
+):
     def drawn(device: str) -> list[torch.Tensor]:
         assert multiplies_bf16(device)
         return frames(fitted("steernerf", device, scene, tmp_path), scene)
@@ -187,7 +182,7 @@ def test_with_products_of_bfloat16_it_trains_and_renders_as_on_the_cpu(
         multiplies_bf16.cache_clear()
 
 
-def test_its_rows_are_those_of_the_cpu(scene: Scene, tmp_path: Path) -> None:
+def test_its_rows_are_those_of_the_cpu(scene, tmp_path):
     def rows(device: str) -> pd.DataFrame:
         """All but times and peak memory."""
         method = METHODS["ngp"](device=device, backend="reference")
@@ -203,9 +198,7 @@ def test_its_rows_are_those_of_the_cpu(scene: Scene, tmp_path: Path) -> None:
     assert set(there["device"]) == {"cuda"}
 
 
-def test_killed_in_stage_2_it_goes_on_as_if_it_had_not_been(
-    gpu: PretendedGpu, scene: Scene, tmp_path: Path
-) -> None:
+def test_killed_in_stage_2_it_goes_on_as_if_it_had_not_been(gpu, scene, tmp_path):
     whole = frames(fitted("steernerf", "cuda", scene, tmp_path / "whole"), scene)
     with killed(JointTraining, 1):
         fitted("steernerf", "cuda", scene, tmp_path / "killed")
@@ -214,9 +207,7 @@ def test_killed_in_stage_2_it_goes_on_as_if_it_had_not_been(
 
 
 @pytest.mark.parametrize("places", [("cuda", "cpu"), ("cpu", "cuda")])
-def test_what_was_trained_at_one_place_goes_on_at_the_other(
-    gpu: PretendedGpu, places: tuple[str, str], scene: Scene, tmp_path: Path
-) -> None:
+def test_what_was_trained_at_one_place_goes_on_at_the_other(gpu, places, scene, tmp_path):
     def training(device: str) -> FieldTraining:
         generator = torch.Generator().manual_seed(0)
         field = HashField(GRID, backend="reference", generator=generator).to(device)
@@ -237,9 +228,7 @@ MOST_WAITS = {"ngp": 2, "nsvf": 2, "steernerf": 2}
 
 
 @pytest.mark.parametrize("name", MOST_WAITS)
-def test_a_frame_waits_equally_often_whatever_its_rays(
-    gpu: PretendedGpu, name: str, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_frame_waits_equally_often_whatever_its_rays(gpu, name, scene, tmp_path, monkeypatch):
     method = fitted(name, "cuda", scene, tmp_path)
     monkeypatch.setattr(frame, "CHUNK_RAYS", 50)
     counts, marched = [], []
@@ -255,7 +244,7 @@ def test_a_frame_waits_equally_often_whatever_its_rays(
     assert counts[0] == counts[1] <= MOST_WAITS[name]
 
 
-def test_a_step_of_stage_1_waits_less_than_three_times(gpu: PretendedGpu, scene: Scene) -> None:
+def test_a_step_of_stage_1_waits_less_than_three_times(gpu, scene):
     field = HashField(GRID, backend="reference").to("cuda")
     training = FieldTraining(field, scene, BUDGET, STAGE1, seed=0)
     training.advance()
@@ -265,9 +254,7 @@ def test_a_step_of_stage_1_waits_less_than_three_times(gpu: PretendedGpu, scene:
     assert waits.total() < 3 * 2 * EVERY
 
 
-def test_a_step_of_stage_2_waits_a_few_times(
-    gpu: PretendedGpu, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_step_of_stage_2_waits_a_few_times(gpu, scene, tmp_path, monkeypatch):
     """For the rays, their samples, the visible ones and the errors."""
     advance, counts = JointTraining.advance, []
 
@@ -310,9 +297,7 @@ def smallest(name: str, **where: Any) -> Method:
 @pytest.mark.slow
 @needs_triton
 @pytest.mark.parametrize("name", ["ngp", "steernerf", "gaussians"])
-def test_by_triton_it_trains_and_renders_as_on_the_cpu(
-    name: str, ball_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_by_triton_it_trains_and_renders_as_on_the_cpu(name, ball_scene, tmp_path, monkeypatch):
     from triton.runtime.interpreter import interpreter_builder as builder
 
     # What takes half of the time, and is looked for by the tests of the kernels.
@@ -341,7 +326,7 @@ ROWS = {
 
 @needs_triton
 @pytest.mark.parametrize("name", ROWS)
-def test_rows_name_what_triton_does_not_compute(gpu: PretendedGpu, name: str) -> None:
+def test_rows_name_what_triton_does_not_compute(gpu, name):
     method = METHODS[name](device="cuda", backend="gpu")
     assert method.settings()["backend"] == ROWS[name]
     assert METHODS[name](device="cuda", backend="auto").settings()["backend"] == "reference"
@@ -362,9 +347,7 @@ WAIT = [("march", "limit 1")]
 
 @needs_triton
 @pytest.mark.parametrize("which", [*GO_ON, *WAIT], ids=" ".join)
-def test_a_case_of_a_kernel_of_triton_is_computed_there_as_on_the_cpu(
-    which: tuple[str, str],
-) -> None:
+def test_a_case_of_a_kernel_of_triton_is_computed_there_as_on_the_cpu(which):
     """And while it is computed, the host goes on."""
     case = next(case for case in found("cases") if (case.subject, case.name) == which)
     assert isinstance(case.error, Difference)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 from textwrap import dedent
 
 import pytest
@@ -108,7 +107,7 @@ def test_cameras_are_in_the_units_of_the_data_set(worker, external, moved_scene,
     assert torch.equal(shown, torch.cat((pose, torch.tensor([60.0, 60.0, 20.0, 16.0]))))
 
 
-def test_it_sees_only_training_pictures(worker, external, moved_scene, quiet_log, tmp_path: Path):
+def test_it_sees_only_training_pictures(worker, external, moved_scene, quiet_log, tmp_path):
     lines = f"""
     import json, shutil
 

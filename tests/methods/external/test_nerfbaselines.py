@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from bench.nerfbaselines import VERSION
-from bench.types import Budget, NullProbe, Scene, composite
+from bench.types import Budget, NullProbe, composite
 
 METHOD = '''
 """The mean colour of the training pictures, a share of it at each step."""
@@ -57,7 +57,7 @@ register({"id": "mean", "method_class": "mean_method:Mean"})
 
 @pytest.mark.slow
 def test_a_registered_method_trains_renders_and_is_loaded(
-    nerfbaselines, external, moved_scene: Scene, quiet_log, tmp_path, monkeypatch
+    nerfbaselines, external, moved_scene, quiet_log, tmp_path, monkeypatch
 ):
     (tmp_path / "mean_method.py").write_text(METHOD)
     (tmp_path / "mean_spec.py").write_text(SPEC)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -23,15 +21,13 @@ def fitted(scene: Scene, log: Log, budget: Budget = TAUGHT, **options) -> Gaussi
 
 
 @pytest.mark.slow
-def test_they_learn_a_ball(ball_scene: Scene, shared_log: Log) -> None:
+def test_they_learn_a_ball(ball_scene, shared_log):
     method = fitted(ball_scene, shared_log, replace(TAUGHT, renderer_steps=300))
     # Depth is that of the centres of Gaussians, which reach out of the ball.
     shows_the_ball(method, ball_scene, 24, 4 * PIXEL)
 
 
-def test_a_training_is_found_again_and_left_for_others(
-    ball_scene: Scene, quiet_log: Log, tmp_path: Path
-) -> None:
+def test_a_training_is_found_again_and_left_for_others(ball_scene, quiet_log, tmp_path):
     budget = Budget("test", steps=40, samples=1024, renderer_steps=20)
     first = fitted(ball_scene, quiet_log, budget)
     again = fitted(ball_scene, quiet_log, budget)
@@ -45,7 +41,7 @@ def test_a_training_is_found_again_and_left_for_others(
     assert shown.train_s == 0
 
 
-def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, shared_log: Log) -> None:
+def test_sizes_are_those_of_what_is_stored(ball_scene, shared_log):
     plain = fitted(ball_scene, shared_log)
     small = fitted(ball_scene, shared_log, stored="int8", stop=0.5)
     assert small.train_s == plain.train_s  # both are chosen after a training
@@ -56,7 +52,7 @@ def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, shared_log: Log) -
 
 
 @pytest.mark.parametrize("wrong", [{"count": 0}, {"degree": 4}, {"stop": 1.0}, {"stored": "fp8"}])
-def test_wrong_settings_are_refused(wrong: dict[str, Any]) -> None:
+def test_wrong_settings_are_refused(wrong):
     (name,) = wrong
     with pytest.raises(ValueError, match=f"^{name}: expected"):
         GaussianSplatting(grid=GRID, training=QUICK, fitting=Fitting(), **{"count": 10} | wrong)

@@ -19,7 +19,7 @@ def fitted(scene: Scene, log: Log, device: str, budget: Budget = BUDGET, **optio
     return method
 
 
-def test_it_learns_a_ball(ball_scene: Scene, shared_log: Log, device: str) -> None:
+def test_it_learns_a_ball(ball_scene, shared_log, device):
     method = fitted(ball_scene, shared_log, device, TAUGHT)
     shows_the_ball(method, ball_scene, 24, 2 * PIXEL)
     cameras = ball_scene.splits["test"].cameras
@@ -29,9 +29,7 @@ def test_it_learns_a_ball(ball_scene: Scene, shared_log: Log, device: str) -> No
     assert torch.equal(method.render(cameras[1], NullProbe()).rgb, frame.rgb)
 
 
-def test_another_precision_is_another_training_of_its_own_size(
-    ball_scene: Scene, quiet_log: Log
-) -> None:
+def test_another_precision_is_another_training_of_its_own_size(ball_scene, quiet_log):
     first = fitted(ball_scene, quiet_log, "cpu")
     second = fitted(ball_scene, quiet_log, "cpu", precision="fp32")
     assert second.trained.field.packed is None
@@ -42,9 +40,7 @@ def test_another_precision_is_another_training_of_its_own_size(
 
 
 @pytest.mark.parametrize(("has_products", "said"), [(True, "bf16"), (False, "bf16 in fp32")])
-def test_settings_say_in_which_precision_a_field_is_multiplied(
-    monkeypatch: pytest.MonkeyPatch, has_products: bool, said: str
-) -> None:
+def test_settings_say_in_which_precision_a_field_is_multiplied(monkeypatch, has_products, said):
     known = {"cpu": has_products}
     monkeypatch.setattr("methods.instant_ngp.stage1.multiplies_bf16", known.__getitem__)
     for precision, shown in (("bf16", said), ("fp32", "fp32")):
@@ -64,6 +60,6 @@ def test_settings_say_in_which_precision_a_field_is_multiplied(
         ),
     ],
 )
-def test_settings_that_make_no_sense_are_refused(wrong: dict, message: str) -> None:
+def test_settings_that_make_no_sense_are_refused(wrong, message):
     with pytest.raises(ValueError, match=message):
         InstantNgp(**{"grid": GRID, "training": QUICK, "device": "cpu", **wrong})

@@ -17,7 +17,7 @@ def pictures() -> tuple[torch.Tensor, torch.Tensor]:
     return one.contiguous(), other.contiguous()
 
 
-def test_it_is_the_ssim_of_scikit_image() -> None:
+def test_it_is_the_ssim_of_scikit_image():
     one, other = pictures()
     window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     how = window | {"data_range": 1.0, "channel_axis": -1, "full": True}
