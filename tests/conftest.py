@@ -1,7 +1,5 @@
 """What all tests share: devices, a poisoned `torch.empty`, a quiet log, tiny scene, method, run."""
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -1,7 +1,5 @@
 """The methods against recorded figures, on a scene that each of them learns in seconds."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What a new user does first: the demo, made small, as a process of its own."""
 
-from __future__ import annotations
-
 import random
 import signal
 import subprocess

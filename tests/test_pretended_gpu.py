@@ -3,8 +3,6 @@
 The last test plants a bug that only a GPU shows.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`import steerbench`: the names that are documented, and the tour that shows them."""
 
-from __future__ import annotations
-
 import ast
 import json
 import re

@@ -1,7 +1,5 @@
 """Cameras: projection undoes casting, and every change of grid or of units keeps the view."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

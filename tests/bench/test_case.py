@@ -1,7 +1,5 @@
 """The runner of cases: a crash is a fail, and a backend that is wrong gets no time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

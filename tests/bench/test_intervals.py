@@ -1,7 +1,5 @@
 """Intervals of means: Student's where values are independent, honest where neighbours are alike."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A measurement reports what really happened, and nothing it could not find out."""
 
-from __future__ import annotations
-
 import math
 import weakref
 from dataclasses import replace

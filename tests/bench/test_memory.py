@@ -1,7 +1,5 @@
 """Every region is metered; freed memory is kept until it is given back."""
 
-from __future__ import annotations
-
 import json
 import mmap
 import platform

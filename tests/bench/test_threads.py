@@ -1,7 +1,5 @@
 """Work in parallel: order, faults, torch's threads as they were."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """What a viewer draws, and for whom."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The methods that start from a trained field, as small as they can learn something."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

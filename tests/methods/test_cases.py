@@ -1,7 +1,5 @@
 """All cases but those that take more than a moment."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Muon for convolutions, against its definition by singular vectors."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """What studies make of runs: times that can be compared, the frontier, exponents."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """`steerbench check` and `compare`: exit statuses, what is missing, files that are no baseline."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,8 +1,6 @@
 """The commands that take a device, with the paper's method on a pretended GPU, from the command
 line to the page. `view` serves in threads, for which the pretence does not hold."""
 
-from __future__ import annotations
-
 import pytest
 
 pytestmark = pytest.mark.slow

@@ -1,7 +1,5 @@
 """Methods and scenes from elsewhere: a folder beside a package, and packages from pip."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

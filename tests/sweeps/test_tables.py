@@ -1,7 +1,5 @@
 """What experiments declare as tables, and what is refused in a declaration."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Boxes that never cut what is seen and fill the unit cube; pictures that are held out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Models of COLMAP: cameras, lenses, pictures of another size, and what is refused."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from pathlib import Path

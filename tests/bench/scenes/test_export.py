@@ -1,7 +1,5 @@
 """Scenes as files: what is written is what our own loaders, and others' by their names, read."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

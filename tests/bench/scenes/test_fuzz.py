@@ -1,7 +1,5 @@
 """Loaders on anything: a scene to be rendered, or a SteerbenchError. `make fuzz` runs long."""
 
-from __future__ import annotations
-
 import copy
 import json
 import math

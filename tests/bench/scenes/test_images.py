@@ -1,7 +1,5 @@
 """Area averaging, exact and weighed by alpha; pictures decoded when they are asked for."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path

@@ -1,7 +1,5 @@
 """NSVF's layout: both forms of intrinsics, the split prefixes, and what is refused by name."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

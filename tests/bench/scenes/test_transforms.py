@@ -1,7 +1,5 @@
 """Captures: intrinsics by frame, missing pictures, lens distortion, and what is refused."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

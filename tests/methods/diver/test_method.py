@@ -1,7 +1,5 @@
 """DIVeR as a method: how it begins, what it prunes, what a training leaves, what it refuses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """DIVeR's decoder: as many parameters as published, and the same after layers were merged."""
 
-from __future__ import annotations
-
 import torch
 
 from bench.types import NullProbe

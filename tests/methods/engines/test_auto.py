@@ -1,7 +1,5 @@
 """The engine that is chosen: the fastest whose pictures are as good, once and for all."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Engines: every one computes what the network does, as closely as its precision allows."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

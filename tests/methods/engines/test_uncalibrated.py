@@ -1,7 +1,5 @@
 """int8 without calibration: activations on fixed ranges, weights as ever, no frame for it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A renderer in another process as a method: what it learns from, and what comes back."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from textwrap import dedent

@@ -1,7 +1,5 @@
 """A method of NerfBaselines, in an environment that pip makes for it, as a method of ours."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Whatever a renderer's process does wrong is one line, and nothing is left of it."""
 
-from __future__ import annotations
-
 import os
 import re
 import select

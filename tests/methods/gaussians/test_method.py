@@ -1,7 +1,5 @@
 """3D Gaussians as a method: what they learn, what a training leaves, what is measured of others."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Gaussians in few bytes: how far values move, and how many bytes they take."""
 
-from __future__ import annotations
-
 from methods.gaussians.model import rounded, stored_bytes
 from tests.methods.gaussians.test_ply import some
 

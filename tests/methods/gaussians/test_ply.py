@@ -1,7 +1,5 @@
 """Gaussians as PLY: both ways, in the data set's coordinates, and files that are no good."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Where Gaussians start; relocation and noise: what stays the same when one becomes many."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

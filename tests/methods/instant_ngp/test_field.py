@@ -1,7 +1,5 @@
 """The hash-grid field."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

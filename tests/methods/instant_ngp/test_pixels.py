@@ -1,7 +1,5 @@
 """Pixels of the training pictures: their rays, which are drawn, and where the error is."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The training loop: what it learns, that it repeats, goes on after a kill, and stops on NaN."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn

@@ -1,7 +1,5 @@
 """The reference of the compositing against a plain loop, closed forms and finite differences."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

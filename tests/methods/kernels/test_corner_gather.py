@@ -1,7 +1,5 @@
 """Corner features: weights, gradients beside autograd, input that is refused."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

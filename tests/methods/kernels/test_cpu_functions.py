@@ -1,8 +1,6 @@
 """Functions of all kernels for the CPU: the exponential against float64, rounding against torch;
 which machine code is kept."""
 
-from __future__ import annotations
-
 import math
 import os
 import shutil

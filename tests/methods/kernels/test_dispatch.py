@@ -1,7 +1,5 @@
 """Which backend serves a call."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """The ray march against a plain loop over steps, and closed forms."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The small network: its formula, what it refuses, and that threads do not change it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Spherical harmonics by what defines them: orthonormal, of their degree, in their order."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

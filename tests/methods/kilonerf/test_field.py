@@ -1,7 +1,5 @@
 """Where networks are, and where their lessons are drawn."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import torch

@@ -1,7 +1,5 @@
 """NSVF as a method: its voxels, its network, and where its embeddings begin."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

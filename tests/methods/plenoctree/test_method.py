@@ -1,7 +1,5 @@
 """PlenOctree as a method: what is extracted, what it learns, what a training leaves."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Leaves: what they show against a loop over them all, what a file of them takes."""
 
-from __future__ import annotations
-
 import math
 
 import torch

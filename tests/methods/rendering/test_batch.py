@@ -1,7 +1,5 @@
 """Rendering rays all at once, to train."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Lists of what is left, and how often a GPU is waited for to make them."""
 
-from __future__ import annotations
-
 import torch
 
 from bench.waits import device_waits

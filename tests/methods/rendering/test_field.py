@@ -1,7 +1,5 @@
 """A radiance field that is no network: its rays, its density grid, padding."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Which rays of a frame are rendered, how, and what its pixels hold."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The density grid that tells where a field is empty."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,8 +1,6 @@
 """Preceding frames: what is kept of them, which pixels of another view show their points, and range
 reduction, on solids whose surface is known."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The method as the harness uses it: trained, loaded again, rendered in sequence."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What stage 2 learns from: distilled views, examples and how long they are used, patches."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A frame of the pipeline: views, cold start, what follows what, what is chosen afterwards."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Stage 2: the gradient of the whole chain, what is trained, killed trainings, the guard."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,7 +1,5 @@
 """The U-Net of the released code: its size, its base, what it is shown."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

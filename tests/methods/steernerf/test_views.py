@@ -1,7 +1,5 @@
 """TrainingViews that engines are built and compared on."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """What students that are networks share: encodings, layers, densities."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

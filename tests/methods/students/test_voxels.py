@@ -1,7 +1,5 @@
 """Sparse voxels: shared corners, eighths that fill a voxel, grids of another resolution."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

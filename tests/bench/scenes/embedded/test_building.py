@@ -1,7 +1,5 @@
 """Pieces of buildings are where their corners and ends say."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Embedded scenes: written once and whole, read back as they were rendered."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

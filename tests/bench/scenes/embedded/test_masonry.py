@@ -1,7 +1,5 @@
 """Textures of buildings: shares of joints, tones of pieces, patterns that go on."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The mill: a building with thin parts that is as hard to enlarge as one."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Exact pictures: closed forms of spheres and media, culling that changes nothing, shadows."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

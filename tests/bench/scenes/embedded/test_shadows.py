@@ -1,7 +1,5 @@
 """Tiles: no point that a box may keep from the light is left out."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

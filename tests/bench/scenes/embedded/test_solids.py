@@ -1,7 +1,5 @@
 """Shapes: the hit is the first place where the distance changes sign, the normal its gradient."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

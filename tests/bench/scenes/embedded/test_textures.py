@@ -1,7 +1,5 @@
 """Noise, and the patterns of the stacked solids, where they can be told beforehand."""
 
-from __future__ import annotations
-
 import torch
 
 from bench.scenes.embedded.textures import checker, lattice, noise, pips, polar_checker, spiral

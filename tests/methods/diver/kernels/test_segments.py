@@ -1,7 +1,5 @@
 """Pixels of corner features: counts, chunks, types and shapes; accuracy is in its cases."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

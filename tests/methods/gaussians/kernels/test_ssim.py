@@ -1,7 +1,5 @@
 """SSIM as a loss: that of scikit-image. The backends agree by its cases."""
 
-from __future__ import annotations
-
 import torch
 from skimage.metrics import structural_similarity
 from torch.nn import functional

@@ -1,7 +1,5 @@
 """Small networks against torch.nn, one by one, and what must not depend on what."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

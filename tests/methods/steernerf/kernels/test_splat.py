@@ -1,7 +1,5 @@
 """The splatting against a plain loop over the points."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
