@@ -159,7 +159,6 @@ def test_autocast_lowers_products(gpu, enabled):
         product = x @ x
     product.float().sum().backward()
     assert product.dtype == (torch.bfloat16 if enabled else torch.float32)
-    assert x.grad is not None
     assert x.grad.dtype == torch.float32
 
 

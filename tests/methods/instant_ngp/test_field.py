@@ -89,7 +89,6 @@ def test_the_gradient_of_a_huge_density_is_clamped():
     sigma = _ClampedExp.apply(log_density)
     sigma.sum().backward()
     edge = torch.tensor(LOG_DENSITY_CLAMP).exp()
-    assert log_density.grad is not None
     torch.testing.assert_close(log_density.grad, torch.stack((1 / edge, edge / edge, edge)))
 
 

@@ -54,7 +54,6 @@ def unlit(ball_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> FieldTraining:
 
 
 def test_the_error_shown_is_that_of_pixels_drawn_alike(unlit):
-    assert unlit.errors is not None
     generator = unlit.generator.clone_state()
     _, colours = unlit.batches.at(unlit.batches.choose(unlit.rays // 2, generator))
     wrong = unlit.errors.draw(unlit.rays // 2, generator)
@@ -73,7 +72,7 @@ def test_an_error_that_is_not_finite_stops_it(unlit):
         last[-1] = torch.nan
         return replace(pixels, values=pixels.values + last), samples
 
-    unlit._render = render  # type: ignore[method-assign]
+    unlit._render = render
     with pytest.raises(SteerbenchError, match="rendered pixels"):
         unlit.advance()
 

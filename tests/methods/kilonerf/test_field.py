@@ -77,7 +77,6 @@ def test_layers_that_see_directions_are_drawn_to_zero_by_the_gradient_of_their_n
     KiloTraining._smooth_views(SimpleNamespace(field=field, options=KiloLessons(view_cost=0.25)))
     seeing = (field.weights["direction"], field.weights["colour"])
     for parameter in seeing:
-        assert parameter.grad is not None
         torch.testing.assert_close(parameter.grad, 0.25 * parameter / parameter.norm())
     others = (field.weights[name].grad for name in ("in", "mid", "density", "feature"))
     assert not any(grad.any() for grad in others if grad is not None)

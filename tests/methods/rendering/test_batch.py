@@ -37,7 +37,7 @@ def thick(cloud: Cloud, device: str) -> Thick:
         sigma, geometry = thin(positions, known)
         return 100 * sigma, geometry
 
-    field.density = density  # type: ignore[method-assign]
+    field.density = density
     return field, occupancy, rays_on(device)
 
 
@@ -123,11 +123,11 @@ def test_a_teacher_tells_which_samples_are_hidden(cloud, device):
             self.density = lambda places: (torch.full_like(places[:, 0], sigma), places)
 
     own, most = render_batch(field, rays, occupancy, Sampling(stop=0))
-    clear, all_ = render_batch(field, rays, occupancy, Sampling(stop=0), teacher=Teacher(0.0))  # type: ignore[arg-type]
+    clear, all_ = render_batch(field, rays, occupancy, Sampling(stop=0), teacher=Teacher(0.0))
     assert all_ == most
     assert torch.equal(own.values, clear.values)
     # Opaque at once: only the first sample of every ray is seen.
-    wall, few = render_batch(field, rays, occupancy, Sampling(), teacher=Teacher(1e6))  # type: ignore[arg-type]
+    wall, few = render_batch(field, rays, occupancy, Sampling(), teacher=Teacher(1e6))
     offsets = march(rays, occupancy, STEP).offsets
     assert few == int((offsets.diff() > 0).sum())
     assert (wall.alpha <= own.alpha + 1e-6).all()
@@ -138,5 +138,4 @@ def test_the_entropy_of_opacities_is_smallest_where_rays_are_opaque_or_empty():
     assert opacity_entropy(torch.tensor([0.0, 1.0])).item() == pytest.approx(0, abs=1e-4)
     opacity = torch.tensor([0.2, 0.6], requires_grad=True)  # on both sides of the largest, 1 / e
     opacity_entropy(opacity).backward()
-    assert opacity.grad is not None
     assert opacity.grad[0] > 0 > opacity.grad[1]

@@ -131,7 +131,7 @@ def test_faint_samples_are_black_and_not_looked_at_in_rounds(cloud, compacts, mo
     assert work.done["shaded_samples"] > 0
     assert (work.done["shaded_samples"] < work.done["samples"]) == compacts
     # Of a field whose features are 1 everywhere, what is shown is the sum of the weights seen.
-    field.features = lambda geometry, directions: torch.ones(  # type: ignore[method-assign]
+    field.features = lambda geometry, directions: torch.ones(
         len(geometry), field.channels, device=geometry.device
     )
     seen = render_rays(field, rays, occupancy, NullProbe(), Sampling(stop=stop))
