@@ -1,5 +1,7 @@
 """Methods and a scene that take no time, for tests of what happens around a measurement."""
 
+from __future__ import annotations
+
 import os
 import time
 from collections.abc import Mapping
