@@ -5,8 +5,6 @@ always ends at the same place; 0 lets it end by itself and prints how many there
 leave a checkpoint behind at every step.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

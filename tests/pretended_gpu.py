@@ -49,7 +49,7 @@ class GpuTensor(Tensor):
     """A tensor that says it is on `cuda:0`, around the CPU tensor `held`."""
 
     held: Tensor
-    device, is_cuda, is_cpu = GPU, True, False  # type: ignore[assignment]
+    device, is_cuda, is_cpu = GPU, True, False
 
     @staticmethod
     def __new__(cls, held: Tensor) -> GpuTensor:
@@ -100,7 +100,7 @@ class GpuTensor(Tensor):
     def untyped_storage(self) -> torch.UntypedStorage:
         return self.held.untyped_storage()
 
-    def __repr__(self) -> str:  # type: ignore[override]
+    def __repr__(self) -> str:
         return f"GpuTensor({self.held})"
 
 

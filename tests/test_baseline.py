@@ -1,7 +1,5 @@
 """The methods against recorded figures, on a scene that each of them learns in seconds."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -19,10 +17,7 @@ RUN = [
     *("budget=tiny", "budget.steps=200", "budget.samples=16384", "budget.renderer_steps=100"),
     *("budget.frames=0", "method.training.march_step=4"),
 ]
-METHODS = (
-    ["method=ngp"],
-    ["method=steernerf", "method.model.step=4"],
-)
+METHODS = (["method=ngp"], ["method=steernerf", "method.model.step=4"])
 METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "work.samples", "work.products")
 
 

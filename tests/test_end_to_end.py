@@ -1,8 +1,5 @@
 """What a new user does first: the demo, made small, as a process of its own."""
 
-from __future__ import annotations
-
-import json
 import random
 import signal
 import subprocess
@@ -12,9 +9,9 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from sweeps.commands.breakdown import DENSE
 
 from bench.results import Store
+from tests.sweeps.test_studies import page
 
 pytestmark = pytest.mark.slow
 
@@ -34,14 +31,6 @@ def demo(folder: Path, weights: Path, *more: str) -> subprocess.CompletedProcess
     chosen = "engine=torch"  # the demo chooses the fastest, which may be another one next time
     words = (*SMALL, chosen, f"weights_dir={weights}", *more)
     return called(folder, "run", "+experiment=demo", *words)
-
-
-def study(folder: Path, command: str, *words: str) -> tuple[dict[str, dict], str]:
-    """The rows of a study by their first column, and what else it said."""
-    done = called(folder, command, "--repeats", "1", *words)
-    assert done.returncode == 0, done.stderr
-    rows = json.loads(done.stdout.splitlines()[-1])
-    return {next(iter(row.values())): row for row in rows}, done.stderr
 
 
 def rows(folder: Path) -> pd.DataFrame:
@@ -127,27 +116,14 @@ def test_wherever_it_is_killed_again_and_again_a_sweep_ends_with_the_same_rows(t
     pd.testing.assert_frame_equal(*map(repeatable, (whole, killed)), check_exact=True)
 
 
-def test_parity_compares_every_engine_with_torch_in_fp32(tmp_path):
-    words = ("--frames", "4", *SMALLEST, "scene.test=3", "budget.frames=0")
-    found, _ = study(tmp_path, "parity", *words)
-    standard = found["torch, fp32"]
-    assert standard["lost"] == 0
-    assert standard["apart"] is None  # there is no difference
-    apart = found["openvino, fp32"]["apart"]
-    assert apart is None or apart > 60  # the same in 8 bits, but for one here and there
-    assert abs(found["openvino, int8"]["lost"]) < 1
-    assert found["openvino, int8"]["bytes"] < 0.5 * standard["bytes"]
-    for row in found.values():
-        assert 0 < row["network_ms"] < row["frame_ms"]
-
-
-def test_breakdown_divides_the_frame_and_names_every_line(first):
-    words = ("--frames", "3", "engine=torch", "device=cpu", "scene=totem", *SMALL)
-    found, said = study(first[0], "breakdown", *words, "budget.renderer_steps=9")  # others train 8
-    assert "torch, fp16: " in said  # and why it cannot be had
-    precisions = ("torch, fp32", "torch, bf16")
-    endings = ("", DENSE)
-    lines = [f"{precision}{ending}" for ending in endings for precision in precisions]
-    assert [line for line in found if "Instant-NGP" not in line] == lines
-    assert "Instant-NGP" in found
-    assert {"field", "network"} <= set(found["torch, fp32"]["parts"])
+def test_parity_compares_every_engine_that_is_here_with_torch_in_fp32(tmp_path, monkeypatch):
+    done = called(tmp_path, "parity", *SMALLEST, "scene.test=3", "budget.frames=0")
+    assert done.returncode == 0, done.stderr
+    monkeypatch.chdir(tmp_path)
+    shown = page("parity")
+    apart = shown.loc["openvino, fp32", "PSNR to the first, dB ↑"]
+    assert apart == "the same" or float(apart) > 60  # in 8 bits, but for one here and there
+    assert shown.loc["torch, fp32", "lost, dB ↓"] == "0.000"
+    assert abs(float(shown.loc["openvino, int8", "lost, dB ↓"])) < 1
+    network, frame = (shown[f"{of}, ms ↓"].astype(float) for of in ("network", "frame"))
+    assert ((network > 0) & (network < frame)).all()

@@ -1,7 +1,5 @@
 """The documents show what the commands of docs/figures.toml wrote, all from one commit."""
 
-from __future__ import annotations
-
 import csv
 import importlib.util
 import re

@@ -1,7 +1,5 @@
 """Who may import whom, read from the sources: the ruler knows nothing of what it measures."""
 
-from __future__ import annotations
-
 import ast
 from collections import Counter
 from collections.abc import Iterator

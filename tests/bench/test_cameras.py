@@ -1,7 +1,5 @@
 """Cameras: projection undoes casting, and every change of grid or of units keeps the view."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -30,7 +28,7 @@ def camera_at(eye: tuple[float, float, float]) -> Camera:
     return Camera(c2w, fx=60.0, fy=55.0, cx=27.5, cy=16.25, width=52, height=36)
 
 
-def test_a_quarter_is_undone_exactly_and_its_pixels_look_through_the_middle_of_blocks() -> None:
+def test_a_quarter_is_undone_exactly_and_its_pixels_look_through_the_middle_of_blocks():
     camera = camera_at((2.0, 2.0, 2.0))
     odd = replace(camera, fx=0.1, cx=1 / 3)
     # Dictionaries take the same tensor as equal; cameras would compare its elements.
@@ -40,7 +38,7 @@ def test_a_quarter_is_undone_exactly_and_its_pixels_look_through_the_middle_of_b
     torch.testing.assert_close(low, high, rtol=0, atol=16 * FLOAT32)
 
 
-def test_pixels_keep_their_rays_in_a_crop_and_in_the_middle_of_a_wider_frame() -> None:
+def test_pixels_keep_their_rays_in_a_crop_and_in_the_middle_of_a_wider_frame():
     camera = camera_at((2.0, 2.0, 2.0))
     whole = cast(camera).directions.reshape(36, 52, 3)
     part = cast(crop_camera(camera, left=5, top=7, width=20, height=11)).directions
@@ -50,7 +48,7 @@ def test_pixels_keep_their_rays_in_a_crop_and_in_the_middle_of_a_wider_frame() -
     assert vars(frame_camera(camera, 104, 72)) == vars(scale_camera(camera, 104, 72))
 
 
-def test_look_at_centres_the_target_with_up_upward() -> None:
+def test_look_at_centres_the_target_with_up_upward():
     camera = camera_at((3.0, -2.0, 1.0))
     pixels, depth = project(camera, torch.tensor([[0.5, 0.5, 0.5], [0.5, 0.5, 0.7]]))
     assert pixels[0].tolist() == pytest.approx([camera.cx, camera.cy], abs=1e-4)
@@ -60,7 +58,7 @@ def test_look_at_centres_the_target_with_up_upward() -> None:
     assert torch.linalg.det(rotation).item() == pytest.approx(1, abs=1e-6)
 
 
-def test_a_packed_camera_comes_back_to_the_last_bit() -> None:
+def test_a_packed_camera_comes_back_to_the_last_bit():
     c2w = torch.randn(3, 4, generator=torch.Generator().manual_seed(0))
     camera = Camera(c2w, 1 / 3, 700.1, -2.7, 1e-9, 4097, 3)
     again = unpack_camera(pack_camera(camera))

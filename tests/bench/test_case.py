@@ -1,7 +1,5 @@
 """The runner of cases: a crash is a fail, and a backend that is wrong gets no time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 
@@ -9,7 +7,7 @@ import pytest
 import torch
 
 from bench.case import Bound, Case, Operation, failed, largest_error, nearest, run_cases, timed_rows
-from bench.types import Log, Unavailable
+from bench.types import Unavailable
 
 CELLS = {("cpu", "fp32"): 1e-6, ("reference", "fp64"): 1e-15}
 
@@ -41,7 +39,7 @@ def test_an_error_is_held_against_the_tolerance_of_its_cell(seen, status, error)
     assert failed(row) == status.startswith("failed")
 
 
-def test_every_cell_of_every_case_gets_a_row(quiet_log: Log):
+def test_every_cell_of_every_case_gets_a_row(quiet_log):
     asked = []
 
     def worst(backend: str, device: str, precision: str) -> float:
@@ -94,7 +92,7 @@ def test_each_result_of_an_operation_has_its_own_tolerance(wrong, forward, backw
     assert not inputs["y"].requires_grad
 
 
-def test_the_number_nearest_to_its_tolerance_is_reported() -> None:
+def test_the_number_nearest_to_its_tolerance_is_reported():
     zero, off = torch.zeros(3), torch.tensor([0.5, 0.02, 0.0])
     tolerance = torch.tensor([1.0, 0.01, 0.0])
     assert nearest((off,), (zero,), (tolerance,)) == pytest.approx((0.02, 0.01))
@@ -114,7 +112,7 @@ def fake(subject: str, *backends: str) -> Operation:
 
 
 @pytest.mark.parametrize("items", [None, 10])
-def test_a_backend_that_is_wrong_on_any_case_of_a_kernel_gets_no_time(items, quiet_log: Log):
+def test_a_backend_that_is_wrong_on_any_case_of_a_kernel_gets_no_time(items, quiet_log):
     kernel = fake("fake", "reference", "cpu", "gpu")
     other = fake("other", "reference", "cpu")
     right, wrong = ({"off": torch.full((1,), off)} for off in (0.0, 1.0))

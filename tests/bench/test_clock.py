@@ -1,7 +1,5 @@
 """Every nanosecond of a frame is charged once."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable
 

@@ -1,7 +1,5 @@
 """What a person sees on standard error, and where trained stages go."""
 
-from __future__ import annotations
-
 import re
 import threading
 from types import SimpleNamespace

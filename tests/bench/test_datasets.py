@@ -3,8 +3,6 @@
 The publisher is a server on the loopback address.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import socket

@@ -1,7 +1,5 @@
 """What is exported for other programs, our own loaders read back as it was."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """A measurement reports what really happened, and nothing it could not find out."""
 
-from __future__ import annotations
-
 import math
 import weakref
 from dataclasses import replace
@@ -22,7 +20,7 @@ from bench.protocol import EvaluationProtocol
 from bench.results import COLUMNS
 from bench.trajectories import from_split
 from bench.types import Budget, Frame, SteerbenchError, composite
-from tests.conftest import QUICK, STEERBENCH_1
+from tests.conftest import QUICK, STEERBENCH_1, OffsetMethod
 
 PROTOCOL = replace(QUICK, warmup=2)
 BUDGET = Budget("tiny", steps=1, samples=1)
@@ -316,12 +314,11 @@ def test_of_several_methods_the_one_that_failed_is_named(where, run, offset_meth
 IN_ROUNDS = replace(PROTOCOL, warmup=0, rounds=3, compared=True)
 
 
-class Brighter:
+class Brighter(OffsetMethod):
     """Renders half the ground truth, brighter by some 8-bit levels; notes its turn in `turns`."""
 
-    name, train_s = "brighter", 0.0
-
     def __init__(self, scene, levels: float, turns: list, memory: int = 0) -> None:
+        super().__init__("cpu", 0.0)
         self.levels, self.turns, self.memory = levels, turns, memory
         self.split, self.background = scene.splits["test"], scene.background
 
@@ -337,13 +334,6 @@ class Brighter:
         dark = composite(self.split.images[number], self.background) / 2
         picture = dark + self.levels / 255
         return Frame(picture, torch.ones_like(picture[..., 0]), torch.ones_like(picture[..., 0]))
-
-    def sizes(self) -> dict[str, int]:
-        return {}
-
-    def settings(self) -> dict[str, str]:
-        by = {"device": "cpu", "backend": "none", "field_precision": "fp32"}
-        return by | {"engine": "none", "precision": "none"}
 
 
 @pytest.fixture

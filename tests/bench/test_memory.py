@@ -1,7 +1,5 @@
 """Every region is metered; freed memory is kept until it is given back."""
 
-from __future__ import annotations
-
 import json
 import mmap
 import platform
@@ -80,7 +78,7 @@ print(json.dumps(faults))
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
-def test_freed_memory_is_kept_for_any_thread_until_it_is_given_back() -> None:
+def test_freed_memory_is_kept_for_any_thread_until_it_is_given_back():
     done = subprocess.run([sys.executable, "-c", ROUNDS], capture_output=True, check=True)
     first, *again, after = json.loads(done.stdout)
     assert max(again) < first / 2

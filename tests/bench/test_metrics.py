@@ -1,7 +1,5 @@
 """Metrics against closed forms, plain re-computations and the identities they must obey."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Random motions keep what they promise: the target in view, the speed, the distance, the seed."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """What other processes do beside a measurement, with accounts of the kernel that are made up."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time

@@ -1,7 +1,5 @@
 """Files of paths are read as their tools mean them, and come back as they were written."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Pictures of other programs: matched with their truth, read, and scored as frames are."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A protocol is what its name says, and scores as it says, one frame at a time."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The digest of a thing follows the files it stands on; commit and machine are as they are."""
 
-from __future__ import annotations
-
 import importlib
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """The store shows whole runs only, and gives back exactly what was put in."""
 
-from __future__ import annotations
-
 import errno
 import json
 import math

@@ -1,7 +1,5 @@
 """Frames are scored one at a time, and against the frame before them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

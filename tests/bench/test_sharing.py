@@ -1,7 +1,5 @@
 """Of several processes one has a lock, and a killed one has none; what is missing is made once."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import re

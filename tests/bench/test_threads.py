@@ -1,19 +1,17 @@
 """Work in parallel: order, faults, torch's threads as they were."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
 from bench.threads import in_parallel
 
 
-def test_results_keep_their_order_and_are_counted(log) -> None:
+def test_results_keep_their_order_and_are_counted(log):
     assert in_parallel(lambda x: x * x, range(100), "square", log) == [x * x for x in range(100)]
     assert log.done == 100
 
 
-def test_the_first_fault_ends_it_and_torch_has_its_threads_back(log) -> None:
+def test_the_first_fault_ends_it_and_torch_has_its_threads_back(log):
     before, inside = torch.get_num_threads(), []
     torch.set_num_threads(2)
 

@@ -1,7 +1,5 @@
 """Trajectories go through the cameras of their split or file as they promise."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import chain, pairwise

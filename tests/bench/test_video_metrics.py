@@ -1,7 +1,5 @@
 """Metrics of a path against closed forms, and against what their own programs print."""
 
-from __future__ import annotations
-
 import math
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """What a viewer draws, and for whom."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import replace
 
@@ -34,7 +32,7 @@ class Counting:
         return {"device": "cpu"}
 
 
-def test_only_the_newest_camera_of_a_browser_is_drawn_and_a_still_picture_gives_way() -> None:
+def test_only_the_newest_camera_of_a_browser_is_drawn_and_a_still_picture_gives_way():
     turns = Turns()
     older, newer = Ask(CAMERA), Ask(replace(CAMERA, fx=50.0))
     turns.want("a", older)
@@ -55,7 +53,7 @@ def test_only_the_newest_camera_of_a_browser_is_drawn_and_a_still_picture_gives_
     assert turns.next(0) is None
 
 
-def test_who_waits_for_an_ask_wakes_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_waits_for_an_ask_wakes_up(monkeypatch):
     turns, woken = Turns(), []
     wait = turns._changed.wait
 
@@ -68,7 +66,7 @@ def test_who_waits_for_an_ask_wakes_up(monkeypatch: pytest.MonkeyPatch) -> None:
     assert woken == [True]  # not by the end of its time
 
 
-def test_frames_are_timed_and_forgotten_for_another_browser_and_another_size() -> None:
+def test_frames_are_timed_and_forgotten_for_another_browser_and_another_size():
     painter = Painter([Counting()])
     small = replace(CAMERA, width=16)
     asked = [("a", CAMERA), ("a", CAMERA), ("b", CAMERA), ("a", CAMERA), ("a", small)]
@@ -82,7 +80,7 @@ def test_frames_are_timed_and_forgotten_for_another_browser_and_another_size() -
     assert drawn.ms == pytest.approx(sum(drawn.stages_ms.values()), rel=1e-12)
 
 
-def test_only_a_slow_method_draws_coarsely_and_only_while_the_camera_moves() -> None:
+def test_only_a_slow_method_draws_coarsely_and_only_while_the_camera_moves():
     painter = Painter([Counting()])
     painter._full_ms[CAMERA.width * CAMERA.height] = FLUENT_MS
     assert painter.sized(Ask(CAMERA)) is CAMERA
@@ -93,7 +91,7 @@ def test_only_a_slow_method_draws_coarsely_and_only_while_the_camera_moves() -> 
     assert painter.sized(Ask(CAMERA, still=True)) is CAMERA
 
 
-def test_a_divided_picture_has_one_method_on_either_side_and_a_difference_shows_both() -> None:
+def test_a_divided_picture_has_one_method_on_either_side_and_a_difference_shows_both():
     left, right = torch.zeros(4, 10, 3), torch.full((4, 10, 3), 0.1)
     both = divided(left, right, 0.3)
     assert (both[:, :2] == 0).all()
@@ -104,7 +102,7 @@ def test_a_divided_picture_has_one_method_on_either_side_and_a_difference_shows_
     assert (shown[:, :2] == 0).all()
 
 
-def test_the_camera_of_a_browser_is_the_pinhole_camera_of_its_pose() -> None:
+def test_the_camera_of_a_browser_is_the_pinhole_camera_of_its_pose():
     pose = look_at(*(torch.tensor(x) for x in ([0.5, -1.0, 0.5], [0.5] * 3, [0.0, 0.0, 1.0])))
     rotation, position = pose[:, :3].numpy(), pose[:, 3].numpy()
     camera = seen_from(rotation, position, fov=np.pi / 2, width=40, height=20)

@@ -1,7 +1,5 @@
 """Every wait for the GPU has its line."""
 
-from __future__ import annotations
-
 import linecache
 import warnings
 from typing import Any

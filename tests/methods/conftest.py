@@ -1,7 +1,5 @@
 """A scene that a field can learn in seconds, and a field that has learned nothing."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections import Counter

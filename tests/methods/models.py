@@ -1,7 +1,5 @@
 """Small models, fields and pipelines: a test names only what it is about."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

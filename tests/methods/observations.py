@@ -1,7 +1,5 @@
 """What a 2D renderer is shown, made up at random."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -1,7 +1,5 @@
 """Fields whose surface is known, in place of a trained one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -1,7 +1,5 @@
 """All cases but those that take more than a moment."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 from collections.abc import Iterator
@@ -10,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from bench.case import Case, Cell, Difference, nearest
+from bench.case import Difference, nearest
 from methods.checks import found, kernels, modules
 from methods.kernels import availability, dispatch
 
@@ -36,7 +34,7 @@ KERNELS = kernels("cpu")
 
 
 @pytest.mark.parametrize(("case", "cell"), list(cells()))
-def test_it_holds(case: Case, cell: Cell, device: str) -> None:
+def test_it_holds(case, cell, device):
     row = case.check(cell, device)
     if row["status"].startswith("unavailable"):
         pytest.skip(row["status"])
@@ -61,7 +59,7 @@ def blocks_of_a_gpu() -> Iterator[None]:
 @pytest.mark.skipif(torch.cuda.is_available(), reason="here all cases have them")
 @pytest.mark.skipif(bool(availability()["gpu"]), reason="Triton has no build for this platform")
 @pytest.mark.usefixtures("blocks_of_a_gpu")
-def test_it_holds_in_the_blocks_of_a_gpu() -> None:
+def test_it_holds_in_the_blocks_of_a_gpu():
     (case,) = (x for x in CASES if (x.subject, x.name) == ("march", "inside and outside"))
     row = case.check(("gpu", "fp32"), "cpu")
     assert row["status"] == "ok", row
@@ -72,7 +70,7 @@ def test_it_holds_in_the_blocks_of_a_gpu() -> None:
     [case for case in QUICK if isinstance(case.error, Difference)],
     ids=lambda case: f"{case.subject}: {case.name}",
 )
-def test_zeros_for_any_result_exceed_the_tolerance(case: Case) -> None:
+def test_zeros_for_any_result_exceed_the_tolerance(case):
     right = case.error.prepare("cpu")("reference")
     for index, result in enumerate(right):
         if result.count_nonzero():
@@ -81,27 +79,27 @@ def test_zeros_for_any_result_exceed_the_tolerance(case: Case) -> None:
             assert error > tolerance, index
 
 
-def test_no_two_cases_have_the_same_name() -> None:
+def test_no_two_cases_have_the_same_name():
     names = [(case.subject, case.name) for case in CASES]
     assert len(set(names)) == len(names)
 
 
 @pytest.mark.parametrize("name", ["cases", "experiments"])
-def test_every_file_of_checks_has_some(name: str) -> None:
+def test_every_file_of_checks_has_some(name):
     files = modules(name)
     assert files
     assert all(getattr(importlib.import_module(module), name)() for module in files)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_every_kernel_has_cases_for_all_its_backends(kernel: str) -> None:
+def test_every_kernel_has_cases_for_all_its_backends(kernel):
     module = importlib.import_module(f"{kernel}.cases")
     cells = {cell for case in module.cases() for cell in case.tolerances}
     assert {backend for backend, _ in cells} == set(dispatch.served(kernel))
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_backends_have_the_same_signatures(kernel: str) -> None:
+def test_backends_have_the_same_signatures(kernel):
     names = [name for name in dispatch.served(kernel) if not availability()[name]]
     versions = [vars(importlib.import_module(f"{kernel}.{name}")) for name in names]
     shared = set.intersection(*map(set, versions))

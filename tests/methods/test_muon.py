@@ -1,7 +1,5 @@
 """Muon for convolutions, against its definition by singular vectors."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -9,9 +7,7 @@ from methods.training.muon import Muon
 
 
 @pytest.mark.parametrize("shape", [(4, 3, 3, 3), (48, 2, 3, 3)])
-def test_the_first_step_is_the_gradient_with_all_singular_values_set_to_one(
-    shape: tuple[int, ...],
-) -> None:
+def test_the_first_step_is_the_gradient_with_all_singular_values_set_to_one(shape):
     """One row for each output channel. Torch iterates to singular values of 0.5 to 1.5, in
     bfloat16."""
     generator = torch.Generator().manual_seed(0)
@@ -35,7 +31,7 @@ def test_the_first_step_is_the_gradient_with_all_singular_values_set_to_one(
     assert off.abs().max() < 0.05
 
 
-def test_weights_in_another_memory_order_are_refused() -> None:
+def test_weights_in_another_memory_order_are_refused():
     """Their matrices would be copies, and steps without effect."""
     with pytest.raises(ValueError, match=r"^expected channels-last weights, got strides \(27, 9,"):
         Muon([torch.zeros(4, 3, 3, 3)], lr=0.1)

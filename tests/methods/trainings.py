@@ -1,8 +1,6 @@
 """The field that most tests begin with, and what is asked of every method that trains: what it
 learned, and that a kill changes nothing."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path

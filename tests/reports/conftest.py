@@ -1,7 +1,5 @@
 """Rows whose figures are known, several runs, and runs with other figures."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

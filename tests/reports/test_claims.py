@@ -1,7 +1,5 @@
 """Claims: the gap in the paper and here, its interval, and what may be concluded from them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Several runs in one table: a line each, the best in bold, and only among what is comparable."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

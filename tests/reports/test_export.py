@@ -1,7 +1,5 @@
 """The tables of the paper as LaTeX and as CSV."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The page for a browser: what Markdown has, in one file that loads nothing, and what clicks do."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

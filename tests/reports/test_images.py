@@ -1,7 +1,5 @@
 """The image of a frame: the right part enlarged, every run in it, nothing cut off."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

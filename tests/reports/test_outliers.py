@@ -1,7 +1,5 @@
 """Broken rows are found, each by the rule that is meant for it, and sound ones are left alone."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The page: complete, with pictures that are there, in both forms, and never half-written."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The page about the paper's tables: its pictures, its curves, its outliers."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

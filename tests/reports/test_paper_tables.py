@@ -1,7 +1,5 @@
 """Tables of measured figures, and distances beside published ones."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

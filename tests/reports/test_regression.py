@@ -1,7 +1,5 @@
 """What counts as worse: limits, directions, pairs of frames, chance, other machines."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

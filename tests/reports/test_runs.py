@@ -1,7 +1,5 @@
 """Runs over the frames that are steady in all of them, and means of runs of several scenes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What studies make of runs: times that can be compared, the frontier, exponents."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 
@@ -15,7 +13,7 @@ from reports.studies import Measured, StudyLine, best_instead, growth, on_fronti
 
 def line(group: str, label: str, ms: float, psnr: float = 30.0) -> Measured:
     run = SimpleNamespace(values={"psnr": psnr})
-    return Measured(StudyLine("ngp", group, label, (label,)), run, ms, 0.9 * ms, 1.2 * ms)  # type: ignore[arg-type]
+    return Measured(StudyLine("ngp", group, label, (label,)), run, ms, 0.9 * ms, 1.2 * ms)
 
 
 def test_times_of_groups_are_scaled_to_what_all_have():

@@ -1,7 +1,5 @@
 """Rows become tables whose every figure has its unit, its share or its `n/a`."""
 
-from __future__ import annotations
-
 import math
 
 import pandas as pd

@@ -1,8 +1,6 @@
 """What experiment trackers have of a run, read back with their own means. Nothing leaves the
 machine; a tracker that is not installed is not tested."""
 
-from __future__ import annotations
-
 from unittest.mock import Mock
 
 import pytest

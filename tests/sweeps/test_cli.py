@@ -1,7 +1,5 @@
 """The door: help, lists, results, and how the wrong word is answered."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,7 +1,5 @@
 """Settings are in the configurations, each once, and sizes and studies change what is there."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Iterator
 from dataclasses import MISSING, Field, fields, is_dataclass

@@ -1,7 +1,5 @@
 """What the documents tell a reader to write, to type and to open exists and does what they say."""
 
-from __future__ import annotations
-
 import ast
 import re
 import shlex

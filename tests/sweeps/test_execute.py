@@ -1,7 +1,5 @@
 """How jobs end and what they leave behind; methods in turns; trainings side by side."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Programs in other processes, from the command line: their rows, and their ends."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """Settings of any kind: something to be built, or a SteerbenchError. `make fuzz` runs long."""
 
-from __future__ import annotations
-
 import contextlib
 
 import pytest

@@ -1,7 +1,5 @@
 """`steerbench kernels`, `compile` and `stress`: a table, then JSON; what is wrong fails them."""
 
-from __future__ import annotations
-
 import fcntl
 import sys
 from functools import partial

@@ -1,7 +1,5 @@
 """Runs go to NerfBaselines and come back; its own reader accepts them, its own files are read."""
 
-from __future__ import annotations
-
 import base64
 import json
 import os

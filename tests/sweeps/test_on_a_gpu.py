@@ -1,8 +1,6 @@
 """The commands that take a device, with the paper's method on a pretended GPU, from the command
 line to the page. `view` serves in threads, for which the pretence does not hold."""
 
-from __future__ import annotations
-
 import pytest
 
 pytestmark = pytest.mark.slow
@@ -15,7 +13,7 @@ SMALLEST = [
     *("method.grid.levels=2", "method.grid.log2_table=10"),
     *("protocol.name=quick", "protocol.lpips=[]", "protocol.warmup=0"),
 ]
-FRAMES = ["--frames", "3", "--repeats", "1"]
+ROUNDS = "protocol.rounds=2"
 
 
 @pytest.mark.parametrize(
@@ -24,12 +22,11 @@ FRAMES = ["--frames", "3", "--repeats", "1"]
         ["run", "report=page"],
         ["run", "protocol.stages=false"],
         ["render", "trajectory=orbit"],
-        ["breakdown", *FRAMES],
-        ["breakdown", *FRAMES, "--device-waits"],
-        ["parity", *FRAMES],
-        ["skips", *FRAMES],
-        ["accuracy", *FRAMES, "--filter", "stop"],
-        ["scaling", "--frames", "3", "--axis", "L"],
+        ["breakdown", ROUNDS, "protocol.waits=true"],
+        ["parity", ROUNDS],
+        ["skips", ROUNDS],
+        ["accuracy", ROUNDS, "--only", "stop"],
+        ["scaling", ROUNDS, "--only", "L"],
         ["paper", "--table", "table2"],
         ["kernels", "--filter", "adam"],
     ],

@@ -1,7 +1,5 @@
 """Wrong settings: one line that names what was typed, the nearest names, and what exists."""
 
-from __future__ import annotations
-
 import pytest
 
 UNKNOWN = [

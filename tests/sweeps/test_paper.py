@@ -1,7 +1,5 @@
 """`steerbench paper` and `report`: the runs in a line, their means, what failed jobs leave."""
 
-from __future__ import annotations
-
 import math
 import re
 import shutil

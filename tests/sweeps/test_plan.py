@@ -1,7 +1,5 @@
 """The jobs of the paper's tables, and the scenes of a data set that they are means over."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from functools import cache

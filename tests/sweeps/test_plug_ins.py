@@ -1,7 +1,5 @@
 """Methods and scenes from elsewhere: a folder beside a package, and packages from pip."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
@@ -101,7 +99,7 @@ def called(*words: str | Path, **more: str) -> str:
 
 
 @pytest.mark.slow
-def test_the_package_of_the_document_is_installed_listed_and_measured(mine: Path) -> None:  # noqa: F811
+def test_the_package_of_the_document_is_installed_listed_and_measured(mine):  # noqa: F811
     bin_ = Path(sys.executable).parent
     offline = ("--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--target", "site")
     called(sys.executable, "-m", "pip", "install", *offline, ".")

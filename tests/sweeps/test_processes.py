@@ -1,7 +1,5 @@
 """One process at a time measures on a device; sweeps run through Hydra's launchers alike."""
 
-from __future__ import annotations
-
 import os
 import queue
 import select

@@ -1,7 +1,5 @@
 """`steerbench render`: the pictures of a path, again from its own file, next to another method."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`steerbench run`: from overrides to a table, a stored run and a page, and how it is ended."""
 
-from __future__ import annotations
-
 import json
 import signal
 from pathlib import Path

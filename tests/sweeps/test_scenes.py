@@ -1,7 +1,5 @@
 """`steerbench scenes`: exit status and what is printed; the web server is a stand-in."""
 
-from __future__ import annotations
-
 from tests.bench.test_datasets import publish
 
 

@@ -1,7 +1,5 @@
 """`steerbench score`: rows like any other, of two folders or of a scene."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Studies: their lines are runs of the store, of what methods declare; each shows them its way."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What experiments declare as tables, and what is refused in a declaration."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -83,14 +81,8 @@ def test_a_table_of_ones_own_has_a_line_for_each_job_of_its_grid(tmp_path):
 
 
 def test_several_axes_have_a_line_for_each_combination(tmp_path):
-    two = (
-        MINE.replace("seed: 0,1", "method.shade: a,b")
-        .replace("psnr", "psnr")
-        .replace(
-            "title: Mine",
-            "title: Mine\n  label: '{} in {}'\n  lines: {'0.5, b': {published: [30, 20]}}",
-        )
-    )
+    lines = "  label: '{} in {}'\n  lines: {'0.5, b': {published: [30, 20]}}\n"
+    two = MINE.replace("seed: 0,1", "method.shade: a,b") + lines
     (table,) = chosen("mine", declared(tmp_path, "  published_on: there\n", two))
     labels = [line.label for line in table.lines.values()]
     assert labels == ["0.25 in a", "0.25 in b", "0.5 in a", "0.5 in b"]

@@ -1,7 +1,5 @@
 """split=validation: no command trains on the pictures that it scores, or scores test pictures."""
 
-from __future__ import annotations
-
 import pytest
 
 from bench.results import Store

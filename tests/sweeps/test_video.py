@@ -1,7 +1,5 @@
 """Videos: as many pictures as were given, of their size and colours; missing libraries."""
 
-from __future__ import annotations
-
 import re
 import sys
 

@@ -1,7 +1,5 @@
 """`steerbench view`, by a stand-in for a browser that speaks viser's protocol."""
 
-from __future__ import annotations
-
 import io
 import json
 import threading

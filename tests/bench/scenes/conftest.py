@@ -1,7 +1,5 @@
 """Pictures, poses, and a small NeRF-Synthetic folder to break."""
 
-from __future__ import annotations
-
 import io
 import json
 import struct

@@ -1,7 +1,5 @@
 """NeRF-Synthetic's layout: what is read, and what is refused by name."""
 
-from __future__ import annotations
-
 import math
 import shutil
 import struct

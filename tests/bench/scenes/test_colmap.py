@@ -1,7 +1,5 @@
 """Models of COLMAP: cameras, lenses, pictures of another size, and what is refused."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -48,7 +46,7 @@ def folder(tmp_path: Path) -> Callable[..., Path]:
     return make
 
 
-def test_cameras_see_the_points_where_colmap_does(folder, log) -> None:
+def test_cameras_see_the_points_where_colmap_does(folder, log):
     root = folder()
     scene = colmap.load(root, log=log)
     found = pycolmap.Reconstruction(root / "sparse" / "0")
@@ -66,7 +64,7 @@ def test_cameras_see_the_points_where_colmap_does(folder, log) -> None:
         )
 
 
-def test_the_box_holds_all_points_but_the_outermost(folder, log) -> None:
+def test_the_box_holds_all_points_but_the_outermost(folder, log):
     scene = colmap.load(folder(), log=log)
     low = scene.origin + scene.unit_length * scene.bounds[0]
     high = scene.origin + scene.unit_length * scene.bounds[1]
@@ -75,7 +73,7 @@ def test_the_box_holds_all_points_but_the_outermost(folder, log) -> None:
     assert scene.unit_length < 1.06 * 6
 
 
-def test_smaller_pictures_have_smaller_cameras(folder, log) -> None:
+def test_smaller_pictures_have_smaller_cameras(folder, log):
     root = folder()
     (root / "images_2").mkdir()
     for number in range(10):
@@ -104,15 +102,13 @@ GRID = (pixel_grid(8, 6).double() - torch.tensor([4.0, 3.0])) / torch.tensor([9.
         ("OPENCV_FISHEYE", Fisheye(LENSES["OPENCV_FISHEYE"][4:])),
     ],
 )
-def test_our_lenses_are_those_of_colmap(model: str, ours: object) -> None:
+def test_our_lenses_are_those_of_colmap(model, ours):
     theirs = colmap.ColmapLens(model, LENSES[model])
     torch.testing.assert_close(ours(GRID), theirs(GRID), rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_pictures_of_every_lens_are_of_a_pinhole_of_the_same_focal_length(
-    model: str, folder, log
-) -> None:
+def test_pictures_of_every_lens_are_of_a_pinhole_of_the_same_focal_length(model, folder, log):
     plain = colmap.load(folder(kind="text"), log=log)
     bent = colmap.load(folder(model, LENSES[model]), log=log)
     first, second = (scene.splits["test"].images[0] for scene in (plain, bent))
@@ -122,7 +118,7 @@ def test_pictures_of_every_lens_are_of_a_pinhole_of_the_same_focal_length(
     assert camera.fx == pytest.approx(9.0)
 
 
-def test_what_does_not_fit_is_named(folder, log) -> None:
+def test_what_does_not_fit_is_named(folder, log):
     with pytest.raises(SteerbenchError, match=r"\.png: expected a camera model with a focal"):
         colmap.load(folder("EQUIRECTANGULAR", (8.0, 6.0), "text"), log=log)
     root = folder()
@@ -135,7 +131,7 @@ def test_what_does_not_fit_is_named(folder, log) -> None:
 
 @pytest.mark.parametrize("kind", ["binary", "text"])
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_a_damaged_model_is_an_error_that_names_it(folder, log, kind: str, name: str) -> None:
+def test_a_damaged_model_is_an_error_that_names_it(folder, log, kind, name):
     root = folder(kind=kind)
     (path,) = (root / "sparse" / "0").glob(f"{name}.*")
     content = path.read_bytes()
@@ -145,7 +141,7 @@ def test_a_damaged_model_is_an_error_that_names_it(folder, log, kind: str, name:
         colmap.load(root, log=log)
 
 
-def test_without_points_the_box_must_be_given(folder, log) -> None:
+def test_without_points_the_box_must_be_given(folder, log):
     root = folder(kind="text")
     (root / "sparse" / "0" / "points3D.txt").write_text("")
     with pytest.raises(SteerbenchError, match=r"expected points, or scene\.bounds"):
@@ -154,7 +150,7 @@ def test_without_points_the_box_must_be_given(folder, log) -> None:
     assert scene.unit_length == 4
 
 
-def test_without_pycolmap_it_says_what_to_install(folder, log, monkeypatch) -> None:
+def test_without_pycolmap_it_says_what_to_install(folder, log, monkeypatch):
     root = folder()
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(Unavailable, match=r"pip install .*\[colmap\]"):

@@ -1,10 +1,7 @@
 """Scenes as files: what is written is what our own loaders, and others' by their names, read."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -14,7 +11,7 @@ from bench.scenes import blender, transforms
 from bench.scenes.export import write_blender
 
 
-def test_a_scene_that_was_written_is_read_bit_by_bit(moved_scene, quiet_log, tmp_path: Path):
+def test_a_scene_that_was_written_is_read_bit_by_bit(moved_scene, quiet_log, tmp_path):
     write_blender(moved_scene, tmp_path, {"train": "train", "test": "test"}, quiet_log)
     found = blender.load(tmp_path, bounds="full", log=quiet_log)
     assert found.splits.keys() == {"train", "test"}
@@ -30,7 +27,7 @@ def test_a_scene_that_was_written_is_read_bit_by_bit(moved_scene, quiet_log, tmp
 
 
 def test_pictures_without_alpha_are_opaque_and_a_split_not_named_has_none(
-    moved_scene, quiet_log, tmp_path: Path
+    moved_scene, quiet_log, tmp_path
 ):
     train = moved_scene.splits["train"]
     opaque = replace(train, images=[image[..., :3] for image in train.images])
@@ -48,7 +45,7 @@ def test_pictures_without_alpha_are_opaque_and_a_split_not_named_has_none(
     "lens", [{"fy": 61.0}, {"cx": 19.0}, {"fx": 70.0, "fy": 70.0}], ids=["fy", "cx", "one"]
 )
 def test_lenses_that_one_angle_does_not_describe_are_in_other_fields(
-    lens, moved_scene, quiet_log, tmp_path: Path
+    lens, moved_scene, quiet_log, tmp_path
 ):
     train = moved_scene.splits["train"]
     count = len(train) if len(lens) == 1 else 1

@@ -1,7 +1,5 @@
 """Loaders on anything: a scene to be rendered, or a SteerbenchError. `make fuzz` runs long."""
 
-from __future__ import annotations
-
 import copy
 import json
 import math
@@ -179,7 +177,7 @@ FILES = {
 @pytest.mark.parametrize("file", FILES)
 @IN_ONE_FOLDER
 @given(records().map(json.dumps).map(str.encode) | changed(json.dumps(RECORD).encode()))
-def test_a_camera_file_of_any_structure_or_bytes(folder: Path, file: str, content: bytes) -> None:
+def test_a_camera_file_of_any_structure_or_bytes(folder, file, content):
     (folder / file).write_bytes(content)
     loads_or_refuses(lambda: FILES[file](folder, downscale=len(content) % 2 + 1, log=QUIET))
 
@@ -199,14 +197,14 @@ def texts(draw: st.DrawFn) -> tuple[str, str]:
 
 @IN_ONE_FOLDER
 @given(texts())
-def test_an_nsvf_scene_of_any_text(folder: Path, changed_file: tuple[str, str]) -> None:
+def test_an_nsvf_scene_of_any_text(folder, changed_file):
     for name, text in (*TEXTS.items(), changed_file):
         (folder / name).write_text(text, errors="replace")
     loads_or_refuses(lambda: nsvf.load(folder, log=QUIET))
 
 
 @given(st.sampled_from(PICTURES).flatmap(changed) | headers())
-def test_a_picture_of_any_bytes(content: bytes) -> None:
+def test_a_picture_of_any_bytes(content):
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow's, of things it puts up with

@@ -1,7 +1,5 @@
 """Area averaging, exact and weighed by alpha; pictures decoded when they are asked for."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
@@ -38,7 +36,7 @@ def half_up(value: Fraction) -> int:
 
 
 @pytest.mark.parametrize("factor", [2, 3, 5])
-def test_shrink_is_the_exact_mean_weighted_by_alpha(factor) -> None:
+def test_shrink_is_the_exact_mean_weighted_by_alpha(factor):
     image = torch.from_numpy(picture(factor, 17, 11))
     image[:factor, :factor, 3] = 0  # a block that nothing is seen in
     small = shrink(image, factor)
@@ -57,7 +55,7 @@ def test_shrink_is_the_exact_mean_weighted_by_alpha(factor) -> None:
             assert small[row, column].tolist() == expected
 
 
-def test_what_fills_no_block_is_left_out_and_the_camera_stays_exact() -> None:
+def test_what_fills_no_block_is_left_out_and_the_camera_stays_exact():
     image = torch.tensor([[0, 1], [1, 1]], dtype=torch.uint8)[..., None].expand(2, 2, 3)
     assert shrink(image, 2).tolist() == [[[1, 1, 1]]]  # the mean of an opaque picture
     assert shrink(torch.zeros(11, 17, 3, dtype=torch.uint8), 4).shape == (2, 4, 3)
@@ -69,14 +67,14 @@ def test_what_fills_no_block_is_left_out_and_the_camera_stays_exact() -> None:
 @pytest.mark.parametrize(
     ("mode", "channels"), [("RGB", 3), ("RGBA", 4), ("L", 3), ("LA", 4), ("P", 3), ("1", 3)]
 )
-def test_every_8_bit_mode_becomes_rgb_or_rgba(mode, channels) -> None:
+def test_every_8_bit_mode_becomes_rgb_or_rgba(mode, channels):
     colour = 1 if mode in "1LP" else tuple(range(1, len(mode) + 1))
     image = decode_bytes(encoded(mode, size=(5, 4), colour=colour), HERE)
     assert image.dtype == torch.uint8
     assert image.shape == (4, 5, channels)
 
 
-def test_a_palette_that_is_missing_is_named() -> None:
+def test_a_palette_that_is_missing_is_named():
     content = encoded("P")
     chunk = content.index(b"PLTE") - 4  # its length, its name, colours, a checksum
     end = chunk + 12 + int.from_bytes(content[chunk : chunk + 4], "big")
@@ -84,7 +82,7 @@ def test_a_palette_that_is_missing_is_named() -> None:
         decode_bytes(content[:chunk] + content[end:], HERE)
 
 
-def test_a_header_that_announces_more_than_memory_holds_is_refused(tmp_path: Path) -> None:
+def test_a_header_that_announces_more_than_memory_holds_is_refused(tmp_path):
     path = tmp_path / "large.png"
     path.write_bytes(encoded("1", size=(1 << 14, (MOST_PIXELS >> 14) + 1)))
     assert path.stat().st_size < 1 << 15
@@ -108,7 +106,7 @@ def pictures(files: list[Path], log) -> Pictures:
     return Pictures([describe(view, 1) for view in views], log)
 
 
-def test_only_pictures_that_are_asked_for_are_decoded_and_once(files, log, monkeypatch) -> None:
+def test_only_pictures_that_are_asked_for_are_decoded_and_once(files, log, monkeypatch):
     opened = []
 
     def decode(picture: ScaledView) -> torch.Tensor:
@@ -126,7 +124,7 @@ def test_only_pictures_that_are_asked_for_are_decoded_and_once(files, log, monke
     assert sorted(opened) == ["0.png", "1.png", "2.png", "3.png"]
 
 
-def test_threads_that_ask_for_pictures_at_once_get_them_in_order(files, log) -> None:
+def test_threads_that_ask_for_pictures_at_once_get_them_in_order(files, log):
     expected = [decode_bytes(path.read_bytes(), path) for path in files]
     lazy = pictures(files, log)
     with ThreadPoolExecutor(4) as pool:
@@ -134,7 +132,7 @@ def test_threads_that_ask_for_pictures_at_once_get_them_in_order(files, log) -> 
             assert all(map(torch.equal, found, expected))
 
 
-def test_files_that_were_damaged_or_change_before_they_are_decoded_are_refused(files, log) -> None:
+def test_files_that_were_damaged_or_change_before_they_are_decoded_are_refused(files, log):
     files[1].write_bytes(files[1].read_bytes()[:-40])
     lazy = pictures(files, log)
     files[2].write_bytes(files[2].read_bytes() + b" ")

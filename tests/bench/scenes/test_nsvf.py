@@ -1,7 +1,5 @@
 """NSVF's layout: both forms of intrinsics, the split prefixes, and what is refused by name."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +31,7 @@ def folder(tmp_path: Path) -> Path:
     return root
 
 
-def test_prefixes_are_splits_poses_opencv_and_the_box_fills_the_unit_cube(folder, log) -> None:
+def test_prefixes_are_splits_poses_opencv_and_the_box_fills_the_unit_cube(folder, log):
     scene = nsvf.load(folder, log=log)
     names = {split: list(views.names) for split, views in scene.splits.items()}
     assert names == {
@@ -51,7 +49,7 @@ def test_prefixes_are_splits_poses_opencv_and_the_box_fills_the_unit_cube(folder
     torch.testing.assert_close(scene.bounds, bounds)
 
 
-def test_without_2_the_1_are_the_test_split(folder, log) -> None:
+def test_without_2_the_1_are_the_test_split(folder, log):
     (folder / "rgb" / "2_003.png").unlink()
     scene = nsvf.load(folder, log=log)
     assert {split: len(views) for split, views in scene.splits.items()} == {"train": 2, "test": 1}
@@ -59,7 +57,7 @@ def test_without_2_the_1_are_the_test_split(folder, log) -> None:
 
 
 @pytest.mark.parametrize(("name", "further"), [("Mic", 1.2), ("Lego", 1.1), ("Chair", 1.0)])
-def test_boxes_that_are_too_small_are_enlarged_further(folder, log, name, further) -> None:
+def test_boxes_that_are_too_small_are_enlarged_further(folder, log, name, further):
     scene = nsvf.load(folder.rename(folder.with_name(name)), log=log)
     assert scene.unit_length == pytest.approx(4 * 1.05 * further)
 
@@ -72,7 +70,7 @@ def test_boxes_that_are_too_small_are_enlarged_further(folder, log, name, furthe
         ("9. 4.5 2.5 0.\n0. 0. 0.\n0.\n1.\n6 8\n", (9, 9, 4.5, 2.5)),
     ],
 )
-def test_every_form_of_intrinsics(folder, log, text, expected) -> None:
+def test_every_form_of_intrinsics(folder, log, text, expected):
     (folder / "intrinsics.txt").write_text(text)
     camera = nsvf.load(folder, log=log).splits["train"].cameras[0]
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == expected
@@ -96,14 +94,14 @@ def test_every_form_of_intrinsics(folder, log, text, expected) -> None:
         ("rgb/*.png", None, r"rgb: expected pictures named 0_\*"),
     ],
 )
-def test_what_is_wrong_or_missing_is_named(folder, log, files, text, message) -> None:
+def test_what_is_wrong_or_missing_is_named(folder, log, files, text, message):
     for path in folder.glob(files):
         path.unlink() if text is None else path.write_text(text)
     with pytest.raises(SteerbenchError, match=message):
         nsvf.load(folder, log=log)
 
 
-def test_a_scene_far_from_its_origin_keeps_its_cameras(folder, log) -> None:
+def test_a_scene_far_from_its_origin_keeps_its_cameras(folder, log):
     near = nsvf.load(folder, log=log).splits["train"].cameras
     far = 1e6
     (folder / "bbox.txt").write_text(f"{far - 1} {far - 2} {far - 1} {far + 1} {far + 2} {far + 1}")

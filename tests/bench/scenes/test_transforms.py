@@ -1,7 +1,5 @@
 """Captures: intrinsics by frame, missing pictures, lens distortion, and what is refused."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -40,7 +38,7 @@ def of_picture(number: int, **settings: object) -> Callable[[dict], object]:
     return lambda record: record["frames"][9 - number].update(settings)
 
 
-def test_every_nth_picture_by_name_is_a_test(folder, log) -> None:
+def test_every_nth_picture_by_name_is_a_test(folder, log):
     scene = transforms.load(folder, split_every=4, log=log)
     assert list(scene.splits["test"].names) == [f"images/{k:03}.png" for k in (0, 4, 8)]
     assert len(scene.splits["train"]) == 7
@@ -50,21 +48,21 @@ def test_every_nth_picture_by_name_is_a_test(folder, log) -> None:
 @pytest.mark.parametrize(
     ("focal", "fx"), [({"fl_x": 7.0}, 7), ({"camera_angle_x": 2 * np.arctan(0.25)}, 8 / 2 / 0.25)]
 )
-def test_intrinsics_of_a_frame_go_first(folder, log, focal, fx) -> None:
+def test_intrinsics_of_a_frame_go_first(folder, log, focal, fx):
     edit_json(folder / "transforms.json", of_picture(8, cx=4.0, **focal))
     first, second = transforms.load(folder, log=log).splits["test"].cameras
     assert (first.fx, first.fy, first.cx, first.cy) == (9, 8, 4.5, 2.5)
     assert (second.fx, second.fy, second.cx, second.cy) == pytest.approx((fx, 8, 4, 2.5))
 
 
-def test_pictures_of_several_sizes(folder, log) -> None:
+def test_pictures_of_several_sizes(folder, log):
     Image.fromarray(picture(0, 12, 10, 3)).save(folder / "images" / "000.png")
     edit_json(folder / "transforms.json", of_picture(0, w=12, h=10))
     first, second = transforms.load(folder, log=log).splits["test"].images
     assert (tuple(first.shape), tuple(second.shape)) == ((10, 12, 3), (6, 8, 3))
 
 
-def test_focal_from_the_angle_and_the_rest_from_the_picture(folder, log) -> None:
+def test_focal_from_the_angle_and_the_rest_from_the_picture(folder, log):
     def change(record: dict) -> None:
         for name in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
             del record[name]
@@ -76,7 +74,7 @@ def test_focal_from_the_angle_and_the_rest_from_the_picture(folder, log) -> None
     assert (camera.cx, camera.cy, camera.width, camera.height) == (4, 3, 8, 6)
 
 
-def test_missing_pictures_are_named_once_and_left_out(folder, log) -> None:
+def test_missing_pictures_are_named_once_and_left_out(folder, log):
     for k in (3, 7):
         (folder / "images" / f"{k:03}.png").unlink()
     scene = transforms.load(folder, log=log)
@@ -93,7 +91,7 @@ MAPPED = {"scale": 0.1, "offset": [0.5, 0.7, 0.5]}
     ("given", "override", "side", "y"),
     [({}, None, 2 / 0.33, 0.5), ({}, 4, 4 / 0.33, 0.5), (MAPPED, 1, 1 / 0.1, 0.7)],
 )
-def test_the_cube_is_that_of_instant_ngp(folder, log, given, override, side, y) -> None:
+def test_the_cube_is_that_of_instant_ngp(folder, log, given, override, side, y):
     edit_json(folder / "transforms.json", lambda record: record.update(given))
     scene = transforms.load(folder, aabb_scale=override, log=log)
     assert scene.unit_length == pytest.approx(side)
@@ -141,13 +139,13 @@ FAR = [[1, 0, 0, 1e308], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         (first(transform_matrix=FAR), r"images/009.png: expected lengths of"),
     ],
 )
-def test_a_bad_field_and_what_float32_cannot_hold_are_named(folder, log, change, message) -> None:
+def test_a_bad_field_and_what_float32_cannot_hold_are_named(folder, log, change, message):
     edit_json(folder / "transforms.json", change)
     with pytest.raises(SteerbenchError, match=message):
         transforms.load(folder, log=log)
 
 
-def test_too_few_pictures_and_a_bad_split_are_refused(folder, log) -> None:
+def test_too_few_pictures_and_a_bad_split_are_refused(folder, log):
     for value in (0, 1, 2.5, "8"):
         with pytest.raises(SteerbenchError, match=r"split_every: expected a whole number from 2"):
             transforms.load(folder, split_every=value, log=log)
@@ -181,7 +179,7 @@ def wave(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_undistortion_recovers_the_pinhole_picture(name) -> None:
+def test_undistortion_recovers_the_pinhole_picture(name):
     camera, lens = pinhole(), LENSES[name]
     matrix = torch.tensor(
         [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float64
@@ -204,7 +202,7 @@ def test_undistortion_recovers_the_pinhole_picture(name) -> None:
     assert error <= bilinear + 1
 
 
-def test_colours_between_pixels_weigh_by_their_alpha() -> None:
+def test_colours_between_pixels_weigh_by_their_alpha():
     image = torch.zeros(76, 100, 4, dtype=torch.uint8)
     image[..., 0] = 200
     image[:, 50:, 3] = 255
@@ -214,7 +212,7 @@ def test_colours_between_pixels_weigh_by_their_alpha() -> None:
     assert (colours.float() - torch.tensor([200.0, 0, 0])).abs().max() <= 1
 
 
-def test_a_capture_with_a_lens_is_cropped_alike_everywhere(folder, log) -> None:
+def test_a_capture_with_a_lens_is_cropped_alike_everywhere(folder, log):
     for k in range(10):
         Image.fromarray(picture(k, 100, 76, 3)).save(folder / "images" / f"{k:03}.png")
     record = {"w": 100, "h": 76, "fl_x": 90, "fl_y": 84, "cx": 52.3, "cy": 37.1, "k1": 0.06}
@@ -241,5 +239,5 @@ def test_a_capture_with_a_lens_is_cropped_alike_everywhere(folder, log) -> None:
         ({"is_fisheye": True}, Fisheye((0.0, 0.0, 0.0, 0.0))),
     ],
 )
-def test_the_lens_is_that_of_the_camera_model(settings: dict, expected: object) -> None:
+def test_the_lens_is_that_of_the_camera_model(settings, expected):
     assert transforms.read_lens(settings, "here") == expected

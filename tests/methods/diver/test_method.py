@@ -1,14 +1,10 @@
 """DIVeR as a method: how it begins, what it prunes, what a training leaves, what it refuses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
 import torch
 
-from bench.types import Log, Scene
-from methods.instant_ngp.stage1 import TrainedField
 from methods.students.voxels import corners_of
 from tests.methods.small_students import SMALL, fitted
 from tests.methods.trainings import GRID, TAUGHT, TEACHER, quality
@@ -16,9 +12,7 @@ from tests.methods.trainings import GRID, TAUGHT, TEACHER, quality
 new = SMALL["diver"]
 
 
-def test_it_begins_with_the_encoding_of_the_teacher(
-    ball_scene: Scene, teacher: TrainedField
-) -> None:
+def test_it_begins_with_the_encoding_of_the_teacher(ball_scene, teacher):
     model = new().begin(teacher, ball_scene, TAUGHT).model
     cells = model.voxels.coordinates.long() * 4  # the teacher's grid is four times as fine
     near = teacher.occupancy.cells.unfold(0, 4, 4).unfold(1, 4, 4).unfold(2, 4, 4)
@@ -27,9 +21,7 @@ def test_it_begins_with_the_encoding_of_the_teacher(
     assert (model.table[:, GRID.channels :] == 0).all()
 
 
-def test_sparsity_draws_a_negative_density_back_to_zero(
-    ball_scene: Scene, teacher: TrainedField
-) -> None:
+def test_sparsity_draws_a_negative_density_back_to_zero(ball_scene, teacher):
     """Its slope is 4 s / (1 + 2 s^2) of the mean, of the first `count` densities alone."""
     training = new().begin(teacher, ball_scene, TAUGHT)
     raw = torch.tensor([-2.0, 0.0, 0.5, 3.0], requires_grad=True)
@@ -39,7 +31,7 @@ def test_sparsity_draws_a_negative_density_back_to_zero(
     torch.testing.assert_close(raw.grad, wanted)
 
 
-def test_pruning_leaves_what_shows(ball_scene: Scene, teacher: TrainedField) -> None:
+def test_pruning_leaves_what_shows(ball_scene, teacher):
     late = replace(new().training, prune_at=1.0)
     method = new(stored="fp32", stop=1e-4, faint=0.0, training=late)
     method.background = ball_scene.background
@@ -56,7 +48,7 @@ def test_pruning_leaves_what_shows(ball_scene: Scene, teacher: TrainedField) -> 
     training.advance()  # moments and gradients have the rows that are left
 
 
-def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, shared_log: Log) -> None:
+def test_sizes_are_those_of_what_is_stored(ball_scene, shared_log):
     half, single = (
         fitted("diver", ball_scene, shared_log, 40, stored=kind) for kind in ("bf16", "fp32")
     )
@@ -68,9 +60,7 @@ def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, shared_log: Log) -
     assert abs(quality(half, ball_scene) - quality(single, ball_scene)) < 0.1
 
 
-def test_a_teacher_with_more_features_than_a_corner_is_refused(
-    ball_scene: Scene, shared_log: Log
-) -> None:
+def test_a_teacher_with_more_features_than_a_corner_is_refused(ball_scene, shared_log):
     setup = replace(TEACHER, grid=replace(GRID, levels=17))
     with pytest.raises(ValueError, match="expected at most the 32 channels of a corner"):
         new(teacher=setup).fit(ball_scene, replace(TAUGHT, steps=1), shared_log)

@@ -1,7 +1,5 @@
 """DIVeR's decoder: as many parameters as published, and the same after layers were merged."""
 
-from __future__ import annotations
-
 import torch
 
 from bench.types import NullProbe
@@ -16,11 +14,11 @@ from methods.students.networks import encode_directions
 SIZE = 16
 
 
-def test_it_has_the_parameters_of_the_published_one() -> None:
+def test_it_has_the_parameters_of_the_published_one():
     assert sum(parameter.numel() for parameter in Decoder().parameters()) == 5220
 
 
-def test_rendered_rays_are_those_of_the_trained_model() -> None:
+def test_rendered_rays_are_those_of_the_trained_model():
     """The baked model, in rounds, with merged layers, against the layers as they were trained; all
     voxels of a small grid, with random features."""
     generator, rays = torch.Generator().manual_seed(0), some_rays(200)

@@ -1,7 +1,5 @@
 """What the tests of engines share."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -1,16 +1,12 @@
 """The engine that is chosen: the fastest whose pictures are as good, once and for all."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
-from pathlib import Path
 
 import pytest
 import torch
 
 from bench.errors import SteerbenchError, Unavailable
-from bench.types import Log
 from methods.engines import Engine, auto
 from methods.engines.auto import Auto, EngineFigures
 
@@ -53,25 +49,22 @@ def measured(engines: Sequence[Engine]) -> list[EngineFigures]:
 
 
 @pytest.mark.parametrize(
-    ("loss", "chosen"),
-    [(0.0, "exact, fp32"), (0.05, "exact, bf16"), (0.07, "quick, int8")],
+    ("loss", "chosen"), [(0.0, "exact, fp32"), (0.05, "exact, bf16"), (0.07, "quick, int8")]
 )
 def test_the_fastest_is_chosen_whose_pictures_lose_no_more_than_they_may(
-    loss: float, chosen: str, tmp_path: Path, quiet_log: Log
-) -> None:
+    loss, chosen, tmp_path, quiet_log
+):
     assert str(Auto(loss).chosen(CPU, measured, tmp_path, quiet_log)) == chosen
 
 
-def test_what_was_measured_is_remembered(tmp_path: Path, quiet_log: Log) -> None:
+def test_what_was_measured_is_remembered(tmp_path, quiet_log):
     first = Auto(0.07).chosen(CPU, measured, tmp_path, quiet_log)
     again = Auto(0.07).chosen(CPU, lambda engines: pytest.fail("again"), tmp_path, quiet_log)
     assert str(again) == str(first)
 
 
 @pytest.mark.parametrize("psnr", [math.nan, -math.inf])
-def test_pictures_that_are_not_finite_are_an_error_and_not_remembered(
-    psnr: float, tmp_path: Path, quiet_log: Log
-) -> None:
+def test_pictures_that_are_not_finite_are_an_error_and_not_remembered(psnr, tmp_path, quiet_log):
     def broken(engines: Sequence[Engine]) -> list[EngineFigures]:
         return [EngineFigures(psnr, 9.0) for _ in engines]
 
@@ -80,7 +73,7 @@ def test_pictures_that_are_not_finite_are_an_error_and_not_remembered(
     assert str(Auto(0.07).chosen(CPU, measured, tmp_path, quiet_log)) == "quick, int8"
 
 
-def test_a_choice_depends_on_what_there_is_to_choose_from(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_choice_depends_on_what_there_is_to_choose_from(monkeypatch):
     before = Auto(0.05).key(CPU)
     assert Auto(0.05).key(CPU) == before
     monkeypatch.setattr(auto, "KINDS", (Exact,))

@@ -1,14 +1,12 @@
 """Engines: every one computes what the network does, as closely as its precision allows."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest
 import torch
 
 from bench.errors import Unavailable
-from methods.engines import Built, Engine, Inputs, Network
+from methods.engines import Inputs, Network
 from methods.engines.openvino_engine import OpenVino, _capabilities
 from methods.engines.torch_engine import Replay, Replayed, TorchEngine
 from methods.steernerf.unet import UNet
@@ -49,9 +47,7 @@ def assert_close(got: Inputs, want: Inputs, tolerance: float) -> None:
 
 
 @pytest.mark.parametrize(("kind", "precision"), ENGINES)
-def test_an_engine_computes_what_the_network_does(
-    kind: Callable[[str], Engine], precision: str, build: Callable[..., Built]
-) -> None:
+def test_an_engine_computes_what_the_network_does(kind, precision, build):
     network, inputs = unet()
     built = build(kind(precision), network, inputs)
     with torch.no_grad():
@@ -60,9 +56,7 @@ def test_an_engine_computes_what_the_network_does(
 
 
 @pytest.mark.parametrize("precision", ["fp32", "int8"])
-def test_pictures_may_differ_in_size_from_the_samples_and_from_one_another(
-    precision: str, build: Callable[..., Built]
-) -> None:
+def test_pictures_may_differ_in_size_from_the_samples_and_from_one_another(precision, build):
     network, ((picture,), *_) = unet()
     for _ in range(2):  # built, and found again
         built = build(OpenVino(precision), network, [(picture,), (picture[..., :32, :40],)])
@@ -72,7 +66,7 @@ def test_pictures_may_differ_in_size_from_the_samples_and_from_one_another(
                 assert_close(built.run(cropped), network(cropped), TOLERANCE[precision])
 
 
-def test_int8_weights_take_a_quarter(build: Callable[..., Built]) -> None:
+def test_int8_weights_take_a_quarter(build):
     network, inputs = unet()
     whole, quarter = (build(OpenVino(p), network, inputs, p).size for p in ("fp32", "int8"))
     exact = 4 * sum(weight.numel() for weight in network.parameters())
@@ -80,7 +74,7 @@ def test_int8_weights_take_a_quarter(build: Callable[..., Built]) -> None:
     assert 0.25 * exact <= quarter < 0.27 * exact  # biases and scales stay as they are
 
 
-def test_what_an_engine_lacks_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_an_engine_lacks_is_refused_by_name(monkeypatch):
     with pytest.raises(Unavailable, match="expected one of fp32, bf16, int8, which engine=openv"):
         OpenVino("fp16")
     with pytest.raises(Unavailable, match="on a CPU use bf16"):
@@ -93,9 +87,7 @@ def test_what_an_engine_lacks_is_refused_by_name(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize(("capabilities", "rest"), [(["BF16", "INT8"], "bf16"), (["INT8"], "fp32")])
-def test_rows_say_what_openvino_computes_beside_int8(
-    capabilities: list[str], rest: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rows_say_what_openvino_computes_beside_int8(capabilities, rest, monkeypatch):
     monkeypatch.setattr(
         "methods.engines.openvino_engine._capabilities", lambda openvino: capabilities
     )
@@ -103,9 +95,7 @@ def test_rows_say_what_openvino_computes_beside_int8(
 
 
 @pytest.mark.parametrize(("products", "computed"), [(True, "bf16"), (False, "bf16 in fp32")])
-def test_rows_say_what_torch_multiplies_in_bfloat16(
-    products: bool, computed: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rows_say_what_torch_multiplies_in_bfloat16(products, computed, monkeypatch):
     monkeypatch.setattr("methods.engines.torch_engine.multiplies_bf16", lambda kind: products)
     assert TorchEngine("bf16").computed(CPU) == computed
     assert TorchEngine("fp32").computed(CPU) == "fp32"
@@ -127,7 +117,7 @@ class ReplayedHere(Replayed):
         return replay, outputs
 
 
-def test_a_replay_gives_the_outputs_of_the_network_and_leaves_the_inputs_alone() -> None:
+def test_a_replay_gives_the_outputs_of_the_network_and_leaves_the_inputs_alone():
     network, pictures = unet()
     replayed = ReplayedHere(network)
     for (whole,) in pictures:
@@ -141,9 +131,7 @@ def test_a_replay_gives_the_outputs_of_the_network_and_leaves_the_inputs_alone()
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="for a machine with a GPU")
 @pytest.mark.parametrize("precision", TorchEngine.precisions)
-def test_a_gpu_replays_the_outputs_of_the_network(
-    precision: str, build: Callable[..., Built]
-) -> None:
+def test_a_gpu_replays_the_outputs_of_the_network(precision, build):
     network, inputs = unet()
     wanted = [network(*some) for some in inputs]
     seen = [tuple(x.cuda() for x in some) for some in inputs]

@@ -3,8 +3,6 @@
 What TensorRT itself makes of the models is not tested here; see `tensorrt_double`.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 

@@ -1,7 +1,5 @@
 """int8 without calibration: activations on fixed ranges, weights as ever, no frame for it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
@@ -85,9 +83,7 @@ def adds_products_exactly() -> bool:
     return any(can.get(name) for name in ("avx512_vnni", "avx_vnni", "amx_int8"))
 
 
-def test_activations_are_rounded_on_the_ranges_of_trtexec(
-    kind: Kind, build: Build, tmp_path: Path
-) -> None:
+def test_activations_are_rounded_on_the_ranges_of_trtexec(kind, build, tmp_path):
     if kind is OpenVino and not adds_products_exactly():
         pytest.skip("this CPU has no VNNI: sums of 8-bit products saturate")
     module, inputs = Layers(), (3 * noise(1)[0],)  # beyond all three ranges
@@ -109,7 +105,7 @@ def test_activations_are_rounded_on_the_ranges_of_trtexec(
     assert (got[1] - want).abs().max() < step + 1e-5
 
 
-def test_weights_are_those_of_int8_on_frames(kind: Kind, build: Build, tmp_path: Path) -> None:
+def test_weights_are_those_of_int8_on_frames(kind, build, tmp_path):
     found = {}
     for calibration in ("frames", "none"):
         build(kind("int8", calibration), Layers(), [noise(0)], calibration)
@@ -123,7 +119,7 @@ def test_weights_are_those_of_int8_on_frames(kind: Kind, build: Build, tmp_path:
             assert (np.abs(q.astype(int)).reshape(len(q), -1).max(1) == 127).all()
 
 
-def test_no_number_of_a_frame_is_read(kind: Kind, build: Build) -> None:
+def test_no_number_of_a_frame_is_read(kind, build):
     samples = {"once": noise(0), "again": (9 * noise(1)[0],)}
     once, again = (
         build(kind("int8", "none"), Layers(), [some], folder).run(*noise(2))
@@ -133,19 +129,19 @@ def test_no_number_of_a_frame_is_read(kind: Kind, build: Build) -> None:
         assert torch.equal(a, b)
 
 
-def test_networks_are_computed_within_half_a_step(kind: Kind, build: Build) -> None:
+def test_networks_are_computed_within_half_a_step(kind, build):
     module, inputs = unet()
     run = build(kind("int8", "none"), module, inputs[:1]).run
     for got, want in zip(run(*inputs[0]), module(*inputs[0]), strict=True):
         assert (got - want).square().mean().sqrt() < 4 / 127 / 2
 
 
-def test_no_more_frames_are_needed_than_without_int8(kind: Kind) -> None:
+def test_no_more_frames_are_needed_than_without_int8(kind):
     assert kind("int8", "none").samples == kind("fp32", "frames").samples == 1
     assert kind("int8", "frames").samples == CALIBRATION
 
 
-def test_only_int8_depends_on_the_calibration(kind: Kind) -> None:
+def test_only_int8_depends_on_the_calibration(kind):
     assert kind("int8", "none").key() != kind("int8", "frames").key()
     assert kind("int8", "none").computed(CPU) == "int8 uncalibrated+fp32"
     assert kind("fp32", "none").key() == kind("fp32", "frames").key()

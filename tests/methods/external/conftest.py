@@ -1,7 +1,5 @@
 """Workers: programs in a folder of their own, with a copy of `steerbench_worker.py` beside them."""
 
-from __future__ import annotations
-
 import gc
 import shutil
 from collections.abc import Callable, Iterator

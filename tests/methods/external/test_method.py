@@ -1,10 +1,7 @@
 """A renderer in another process as a method: what it learns from, and what comes back."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
-from pathlib import Path
 from textwrap import dedent
 
 import pytest
@@ -108,7 +105,7 @@ def test_cameras_are_in_the_units_of_the_data_set(worker, external, moved_scene,
     assert torch.equal(shown, torch.cat((pose, torch.tensor([60.0, 60.0, 20.0, 16.0]))))
 
 
-def test_it_sees_only_training_pictures(worker, external, moved_scene, quiet_log, tmp_path: Path):
+def test_it_sees_only_training_pictures(worker, external, moved_scene, quiet_log, tmp_path):
     lines = f"""
     import json, shutil
 

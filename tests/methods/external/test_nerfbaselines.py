@@ -1,12 +1,10 @@
 """A method of NerfBaselines, in an environment that pip makes for it, as a method of ours."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
 from bench.nerfbaselines import VERSION
-from bench.types import Budget, NullProbe, Scene, composite
+from bench.types import Budget, NullProbe, composite
 
 METHOD = '''
 """The mean colour of the training pictures, a share of it at each step."""
@@ -57,7 +55,7 @@ register({"id": "mean", "method_class": "mean_method:Mean"})
 
 @pytest.mark.slow
 def test_a_registered_method_trains_renders_and_is_loaded(
-    nerfbaselines, external, moved_scene: Scene, quiet_log, tmp_path, monkeypatch
+    nerfbaselines, external, moved_scene, quiet_log, tmp_path, monkeypatch
 ):
     (tmp_path / "mean_method.py").write_text(METHOD)
     (tmp_path / "mean_spec.py").write_text(SPEC)

@@ -1,7 +1,5 @@
 """The messages of docs/external.md, both ways."""
 
-from __future__ import annotations
-
 import json
 import socket
 import struct

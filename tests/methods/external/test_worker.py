@@ -1,11 +1,8 @@
 """Whatever a renderer's process does wrong is one line, and nothing is left of it."""
 
-from __future__ import annotations
-
 import os
 import re
 import select
-from pathlib import Path
 
 import psutil
 import pytest
@@ -193,7 +190,7 @@ def test_what_is_no_program_is_an_error_about_the_command(external):
 
 
 def test_what_it_prints_disturbs_nothing_and_is_kept(
-    worker, external, tiny_scene, quiet_log, tmp_path: Path
+    worker, external, tiny_scene, quiet_log, tmp_path
 ):
     lines = """
     import os

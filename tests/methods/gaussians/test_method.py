@@ -1,10 +1,6 @@
 """3D Gaussians as a method: what they learn, what a training leaves, what is measured of others."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -22,15 +18,13 @@ def fitted(scene: Scene, log: Log, budget: Budget = TAUGHT, **options) -> Gaussi
 
 
 @pytest.mark.slow
-def test_they_learn_a_ball(ball_scene: Scene, shared_log: Log) -> None:
+def test_they_learn_a_ball(ball_scene, shared_log):
     method = fitted(ball_scene, shared_log, replace(TAUGHT, renderer_steps=300))
     # Depth is that of the centres of Gaussians, which reach out of the ball.
     shows_the_ball(method, ball_scene, 24, 4 * PIXEL)
 
 
-def test_a_training_is_found_again_and_left_for_others(
-    ball_scene: Scene, quiet_log: Log, tmp_path: Path
-) -> None:
+def test_a_training_is_found_again_and_left_for_others(ball_scene, quiet_log, tmp_path):
     budget = Budget("test", steps=40, samples=1024, renderer_steps=20)
     first = fitted(ball_scene, quiet_log, budget)
     again = fitted(ball_scene, quiet_log, budget)
@@ -44,7 +38,7 @@ def test_a_training_is_found_again_and_left_for_others(
     assert shown.train_s == 0
 
 
-def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, shared_log: Log) -> None:
+def test_sizes_are_those_of_what_is_stored(ball_scene, shared_log):
     plain = fitted(ball_scene, shared_log)
     small = fitted(ball_scene, shared_log, stored="int8", stop=0.5)
     assert small.train_s == plain.train_s  # both are chosen after a training
@@ -55,7 +49,7 @@ def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, shared_log: Log) -
 
 
 @pytest.mark.parametrize("wrong", [{"count": 0}, {"degree": 4}, {"stop": 1.0}, {"stored": "fp8"}])
-def test_wrong_settings_are_refused(wrong: dict[str, Any]) -> None:
+def test_wrong_settings_are_refused(wrong):
     (name,) = wrong
     with pytest.raises(ValueError, match=f"^{name}: expected"):
         new_gaussians(grid=GRID, training=QUICK, **wrong)

@@ -1,11 +1,8 @@
 """Gaussians as PLY: both ways, in the data set's coordinates, and files that are no good."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -44,8 +41,8 @@ def some(count: int = 50, degree: int = 3) -> Gaussians:
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_what_is_written_is_read_and_holds_the_coordinates_of_the_data_set(
-    degree: int, moved_scene: Scene, tmp_path: Path
-) -> None:
+    degree, moved_scene, tmp_path
+):
     path = tmp_path / "a.ply"
     given = some(degree=degree)
     ply.write(given, moved_scene, path)
@@ -59,9 +56,7 @@ def test_what_is_written_is_read_and_holds_the_coordinates_of_the_data_set(
     assert vertex["scale_1"] == pytest.approx(given.log_scales[0, 1].item() + math.log(3))
 
 
-def test_harmonics_of_a_file_have_the_condon_shortley_phase(
-    moved_scene: Scene, tmp_path: Path
-) -> None:
+def test_harmonics_of_a_file_have_the_condon_shortley_phase(moved_scene, tmp_path):
     """Colours by the polynomials of degree 2 as the release of 3D Gaussians has them."""
     path = tmp_path / "a.ply"
     given = some(1, degree=2)
@@ -107,9 +102,7 @@ def vertices_of(scene: Scene, path: Path, **changes: float) -> np.ndarray:
         (slice(0), "it has none"),
     ],
 )
-def test_bad_vertices_are_refused(
-    changes: Any, complaint: str, tiny_scene: Scene, tmp_path: Path
-) -> None:
+def test_bad_vertices_are_refused(changes, complaint, tiny_scene, tmp_path):
     path = tmp_path / "a.ply"
     if isinstance(changes, dict):
         vertices = vertices_of(tiny_scene, path, **changes)
@@ -120,9 +113,7 @@ def test_bad_vertices_are_refused(
         ply.read(path, tiny_scene)
 
 
-def test_a_missing_or_damaged_file_and_one_of_another_place_are_refused(
-    tiny_scene: Scene, tmp_path: Path
-) -> None:
+def test_a_missing_or_damaged_file_and_one_of_another_place_are_refused(tiny_scene, tmp_path):
     path = tmp_path / "a.ply"
     with pytest.raises(SteerbenchError, match="there is none"):
         ply.read(path, tiny_scene)

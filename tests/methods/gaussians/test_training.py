@@ -1,17 +1,14 @@
 """Where Gaussians start; relocation and noise: what stays the same when one becomes many."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
-from bench.types import Rays, Scene
+from bench.types import Rays
 from methods.gaussians import training
 from methods.gaussians.model import Gaussians
 from methods.gaussians.training import (
@@ -24,15 +21,12 @@ from methods.gaussians.training import (
     shared_between,
     spacing,
 )
-from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.types import Pixels
 from tests.methods.trainings import TEACHER, goes_on_after_a_kill
 from tests.methods.usual import usual
 
 
-def test_they_begin_on_surfaces_with_their_colours(
-    ball_scene: Scene, teacher: TrainedField
-) -> None:
+def test_they_begin_on_surfaces_with_their_colours(ball_scene, teacher):
     generator = torch.Generator().manual_seed(0)
     points, colours = on_surfaces(teacher, ball_scene, 500, generator)
     radius = (points - 0.5).norm(dim=1)
@@ -42,9 +36,7 @@ def test_they_begin_on_surfaces_with_their_colours(
     assert error.abs().median() < 0.1  # two colours drawn at random are 0.3 apart
 
 
-def test_points_come_from_all_pictures_alike(
-    ball_scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_points_come_from_all_pictures_alike(ball_scene, monkeypatch):
     """Three of five pixels show matter, at their camera."""
 
     def render(field: Any, rays: Rays, *_: Any) -> Pixels:
@@ -62,7 +54,7 @@ def test_points_come_from_all_pictures_alike(
     assert found == pytest.approx([each] * len(cameras), abs=4)
 
 
-def test_spacing_is_the_distance_of_neighbours(ball_scene: Scene) -> None:
+def test_spacing_is_the_distance_of_neighbours(ball_scene):
     lattice = torch.cartesian_prod(*[0.1 * torch.arange(4.0)] * 3)
     torch.testing.assert_close(spacing(lattice), torch.full((64,), 0.1))
     assert (spacing(torch.zeros(10, 3)) > 0).all()  # all in one place
@@ -70,7 +62,7 @@ def test_spacing_is_the_distance_of_neighbours(ball_scene: Scene) -> None:
     assert ((points >= 0.1) & (points <= 0.9)).all()
 
 
-def test_a_killed_training_goes_on_as_if_it_had_not_been(ball_scene: Scene, tmp_path: Path) -> None:
+def test_a_killed_training_goes_on_as_if_it_had_not_been(ball_scene, tmp_path):
     def new() -> GaussianTraining:
         points, colours = anywhere(ball_scene, 200, torch.Generator().manual_seed(0))
         gaussians = Gaussians.at(points, colours, 0.5 * spacing(points), 0.5, degree=3)
@@ -97,7 +89,7 @@ def some(opacities: list[float]) -> tuple[Gaussians, torch.optim.Adam]:
 
 @pytest.mark.parametrize("copies", [1, 2, 3, 7])
 @pytest.mark.parametrize("opacity", [0.05, 0.6, 0.99])
-def test_copies_are_together_as_opaque_as_the_one_they_replace(opacity: float, copies: int) -> None:
+def test_copies_are_together_as_opaque_as_the_one_they_replace(opacity, copies):
     new, shrink = shared_between(torch.tensor([opacity]), torch.tensor([copies]))
     assert 1 - (1 - new.item()) ** copies == pytest.approx(opacity, rel=1e-5)
     # Along a line through the centre, by quadrature; sigma is 1 before and `shrink` after.
@@ -107,7 +99,7 @@ def test_copies_are_together_as_opaque_as_the_one_they_replace(opacity: float, c
     assert whole == pytest.approx(opacity * math.sqrt(2 * math.pi), rel=1e-5)
 
 
-def test_the_dead_move_to_the_living() -> None:
+def test_the_dead_move_to_the_living():
     gaussians, optimiser = some([0.9, DEAD / 2, 0.3, DEAD / 5])
     before = gaussians.means.detach().clone()
     assert relocate(gaussians, optimiser, torch.Generator().manual_seed(0)) == 2
@@ -118,7 +110,7 @@ def test_the_dead_move_to_the_living() -> None:
     assert (gaussians.opacities > DEAD).all()
 
 
-def test_what_moved_and_what_it_moved_to_forget_their_moments() -> None:
+def test_what_moved_and_what_it_moved_to_forget_their_moments():
     gaussians, optimiser = some([0.9, DEAD / 2, 1e-9])  # nothing else to move to
     gaussians.logits.data[2] = gaussians.logits.data[0]
     assert relocate(gaussians, optimiser, torch.Generator().manual_seed(1)) == 1
@@ -129,14 +121,14 @@ def test_what_moved_and_what_it_moved_to_forget_their_moments() -> None:
 
 
 @pytest.mark.parametrize("opacities", [[0.5, 0.6], [DEAD / 2, DEAD / 3]], ids=["none", "all"])
-def test_nothing_moves_if_none_or_all_are_dead(opacities: list[float]) -> None:
+def test_nothing_moves_if_none_or_all_are_dead(opacities):
     gaussians, optimiser = some(opacities)
     before = [parameter.detach().clone() for parameter in gaussians.parameters()]
     assert relocate(gaussians, optimiser, torch.Generator()) == 0
     assert all(map(torch.equal, gaussians.parameters(), before))
 
 
-def test_noise_moves_the_faint_along_their_shape_and_leaves_the_opaque() -> None:
+def test_noise_moves_the_faint_along_their_shape_and_leaves_the_opaque():
     gaussians, _ = some([0.9] + [DEAD / 10] * 999)
     before = gaussians.means.detach().clone()
     gaussians.log_scales.data[:] = torch.tensor([0.1, 0.01, 0.001]).log()

@@ -1,20 +1,18 @@
 """Pixels of the training pictures: their rays, which are drawn, and where the error is."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
 import torch
 
 from bench.cameras import cast
-from bench.types import Scene, Split
+from bench.types import Split
 from methods.instant_ngp.pixels import RUN, STRIP, UNSEEN, ErrorMap, PixelBatches
 
 CPU = torch.device("cpu")
 
 
-def test_rays_of_pictures_of_several_sizes_are_those_of_their_cameras(ball_scene: Scene) -> None:
+def test_rays_of_pictures_of_several_sizes_are_those_of_their_cameras(ball_scene):
     split = ball_scene.splits["train"]
     whole, other = split.cameras[:2]
     # The last strip of the second picture is 3 wide; the third is narrower than a strip.
@@ -39,13 +37,13 @@ def test_rays_of_pictures_of_several_sizes_are_those_of_their_cameras(ball_scene
         torch.testing.assert_close(found, torch.cat(strips))
 
 
-def test_every_pixel_is_drawn_once_if_as_many_are_drawn_as_there_are(ball_scene: Scene) -> None:
+def test_every_pixel_is_drawn_once_if_as_many_are_drawn_as_there_are(ball_scene):
     batches = PixelBatches(ball_scene.splits["train"], CPU)
     drawn = batches.choose(len(batches), torch.Generator().manual_seed(0))
     assert torch.equal(drawn, torch.arange(len(batches)))
 
 
-def test_any_pixel_can_be_drawn(ball_scene: Scene) -> None:
+def test_any_pixel_can_be_drawn(ball_scene):
     batches = PixelBatches(ball_scene.splits["train"], CPU)
     generator = torch.Generator().manual_seed(0)
     # Each has a chance of 1/4: one of N is missed 200 times with a probability below 1e-20 N.
@@ -53,7 +51,7 @@ def test_any_pixel_can_be_drawn(ball_scene: Scene) -> None:
     assert len(drawn.unique()) == len(batches)
 
 
-def test_an_opaque_picture_among_transparent_ones_is_opaque(ball_scene: Scene) -> None:
+def test_an_opaque_picture_among_transparent_ones_is_opaque(ball_scene):
     split = ball_scene.splits["train"]
     images = [split.images[0][..., :3], split.images[1]]
     mixed = Split(split.cameras[:2], images, split.names[:2])
@@ -62,7 +60,7 @@ def test_an_opaque_picture_among_transparent_ones_is_opaque(ball_scene: Scene) -
     assert (colours[:, 3] == 0).float().mean().item() == pytest.approx(transparent, abs=0.05)
 
 
-def test_runs_are_drawn_in_proportion_to_the_root_of_their_error() -> None:
+def test_runs_are_drawn_in_proportion_to_the_root_of_their_error():
     chances = ErrorMap(3 * RUN, CPU)
     chances.errors.copy_(torch.tensor([0.04, 0.0, 0.36]))
     chances.refresh()
@@ -72,14 +70,14 @@ def test_runs_are_drawn_in_proportion_to_the_root_of_their_error() -> None:
     assert torch.bincount(drawn, minlength=3).tolist() == pytest.approx([100, 0, 300], abs=1)
 
 
-def test_all_pixels_of_a_run_can_be_drawn_and_none_beyond_the_last() -> None:
+def test_all_pixels_of_a_run_can_be_drawn_and_none_beyond_the_last():
     pixels = RUN + 3
     chances = ErrorMap(pixels, CPU)
     drawn = chances.draw(100 * RUN, torch.Generator().manual_seed(0))
     assert torch.equal(drawn.unique(), torch.arange(pixels))
 
 
-def test_a_new_error_counts_as_much_as_the_estimate() -> None:
+def test_a_new_error_counts_as_much_as_the_estimate():
     chances = ErrorMap(2 * RUN, CPU)
     chances.learn(torch.tensor([0, RUN - 1]), torch.tensor([0.5, 0.3]))
     first = (UNSEEN + 0.5 + 0.3) / 3

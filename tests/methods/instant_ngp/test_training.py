@@ -1,7 +1,5 @@
 """The training loop: what it learns, that it repeats, goes on after a kill, and stops on NaN."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -56,8 +54,7 @@ def unlit(ball_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> FieldTraining:
     return training
 
 
-def test_the_error_shown_is_that_of_pixels_drawn_alike(unlit: FieldTraining) -> None:
-    assert unlit.errors is not None
+def test_the_error_shown_is_that_of_pixels_drawn_alike(unlit):
     generator = unlit.generator.clone_state()
     _, colours = unlit.batches.at(unlit.batches.choose(unlit.rays // 2, generator))
     wrong = unlit.errors.draw(unlit.rays // 2, generator)
@@ -67,7 +64,7 @@ def test_the_error_shown_is_that_of_pixels_drawn_alike(unlit: FieldTraining) -> 
     assert (unlit.errors.errors[wrong // RUN] != UNSEEN).all()
 
 
-def test_an_error_that_is_not_finite_stops_it(unlit: FieldTraining) -> None:
+def test_an_error_that_is_not_finite_stops_it(unlit):
     dark = unlit._render
 
     def render(rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
@@ -76,12 +73,12 @@ def test_an_error_that_is_not_finite_stops_it(unlit: FieldTraining) -> None:
         last[-1] = torch.nan
         return replace(pixels, values=pixels.values + last), samples
 
-    unlit._render = render  # type: ignore[method-assign]
+    unlit._render = render
     with pytest.raises(SteerbenchError, match="rendered pixels"):
         unlit.advance()
 
 
-def test_the_batch_grows_to_its_share_of_the_samples(ball_scene: Scene) -> None:
+def test_the_batch_grows_to_its_share_of_the_samples(ball_scene):
     training = new_training(ball_scene, share=0.25)
     training.rays = 100
     for wanted in (50, 50, 50):  # each ray brought half a sample: the batch may grow by a quarter
@@ -91,7 +88,7 @@ def test_the_batch_grows_to_its_share_of_the_samples(ball_scene: Scene) -> None:
     assert training.rays == 195 * 4 // 5
 
 
-def test_the_learning_rate_falls_from_the_first_to_the_last_step(ball_scene: Scene) -> None:
+def test_the_learning_rate_falls_from_the_first_to_the_last_step(ball_scene):
     training, rates = new_training(ball_scene), []
     for training.step in range(BUDGET.steps + 1):
         rates.append(training.learning_rate())
@@ -99,7 +96,7 @@ def test_the_learning_rate_falls_from_the_first_to_the_last_step(ball_scene: Sce
     assert (rates[0], rates[-1]) == pytest.approx((1e-2, 1e-2 / 30))
 
 
-def test_the_step_of_the_rays_suits_the_length_of_the_training_or_is_given() -> None:
+def test_the_step_of_the_rays_suits_the_length_of_the_training_or_is_given():
     def step(steps: int, march_step: float | None = None) -> float:
         return field_options(march_step=march_step).sampling(replace(BUDGET, steps=steps)).step
 
@@ -110,8 +107,8 @@ def test_the_step_of_the_rays_suits_the_length_of_the_training_or_is_given() -> 
 
 
 def test_a_killed_training_ends_as_if_it_had_never_stopped_and_is_then_loaded(
-    ball_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    ball_scene, tmp_path, monkeypatch
+):
     whole, root = trained(ball_scene, tmp_path / "whole"), tmp_path / "killed"
     with killed(FieldTraining, 23):
         trained(ball_scene, root)
@@ -129,8 +126,8 @@ def test_a_killed_training_ends_as_if_it_had_never_stopped_and_is_then_loaded(
 
 
 def test_a_loss_that_is_no_number_stops_and_keeps_the_last_good_checkpoint(
-    ball_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    ball_scene, tmp_path, monkeypatch
+):
     monkeypatch.setattr(loop, "CHECKPOINT_S", -1.0)
     advance = FieldTraining.advance
 
@@ -150,8 +147,8 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_last_good_checkpoint(
 
 
 def test_a_training_that_went_bad_in_its_last_step_is_not_finished(
-    ball_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    ball_scene, tmp_path, monkeypatch
+):
     update = FieldTraining._update
 
     def spoiled(training: FieldTraining) -> None:
@@ -168,8 +165,8 @@ def test_a_training_that_went_bad_in_its_last_step_is_not_finished(
 
 @pytest.mark.parametrize("name", ["field", "checkpoint"])
 def test_a_file_that_is_damaged_or_of_another_training_is_named_with_what_to_do(
-    ball_scene: Scene, tmp_path: Path, name: str
-) -> None:
+    ball_scene, tmp_path, name
+):
     path = stage(ball_scene, tmp_path) / f"{name}.safetensors"
     path.write_bytes(b"half a file")
     with pytest.raises(SteerbenchError, match=rf"{name}\.safetensors.*remove it, and it is made"):
@@ -181,7 +178,7 @@ def test_a_file_that_is_damaged_or_of_another_training_is_named_with_what_to_do(
 
 
 @pytest.mark.parametrize("setting", ["max_rays", "rays"])
-def test_a_step_has_the_rays_that_were_asked_for(setting: str, ball_scene: Scene) -> None:
+def test_a_step_has_the_rays_that_were_asked_for(setting, ball_scene):
     """Though 64 rays bring far fewer samples than the budget."""
     training = new_training(ball_scene, **{setting: MIN_RAYS})
     for _ in range(3):
@@ -189,7 +186,7 @@ def test_a_step_has_the_rays_that_were_asked_for(setting: str, ball_scene: Scene
         training.advance()
 
 
-def test_pictures_that_do_not_overlap_are_refused(ball_scene: Scene) -> None:
+def test_pictures_that_do_not_overlap_are_refused(ball_scene):
     train = ball_scene.splits["train"]
     alone = Split(train.cameras[:1], train.images[:1], train.names[:1])
     with pytest.raises(SteerbenchError, match="no part of the unit cube is seen by 2 training"):
@@ -204,17 +201,17 @@ def test_pictures_that_do_not_overlap_are_refused(ball_scene: Scene) -> None:
         *(("grid_samples", 1), ("stop", 1.0), ("thin", -1.0)),
     ],
 )
-def test_options_that_make_no_sense_are_refused(name: str, value: float) -> None:
+def test_options_that_make_no_sense_are_refused(name, value):
     with pytest.raises(ValueError, match=f"^{name}: expected"):
         field_options(**{name: value})
 
 
-def test_a_checkpoint_that_cannot_be_written_says_so(tmp_path: Path) -> None:
+def test_a_checkpoint_that_cannot_be_written_says_so(tmp_path):
     with pytest.raises(SteerbenchError, match=r"gone.*cannot write the checkpoint"):
         checkpoint.write(tmp_path / "gone" / "field.safetensors", {}, {})
 
 
-def test_pictures_without_alpha_are_trained_on_as_they_are(ball_scene: Scene) -> None:
+def test_pictures_without_alpha_are_trained_on_as_they_are(ball_scene):
     split = ball_scene.splits["train"]
     opaque = replace(split, images=[image[..., :3] for image in split.images])
     training = new_training(replace(ball_scene, splits={"train": opaque}))
@@ -224,7 +221,7 @@ def test_pictures_without_alpha_are_trained_on_as_they_are(ball_scene: Scene) ->
     assert torch.equal(background, ball_scene.background)
 
 
-def test_a_random_background_is_one_colour_for_a_ray_and_its_truth(ball_scene: Scene) -> None:
+def test_a_random_background_is_one_colour_for_a_ray_and_its_truth(ball_scene):
     training = new_training(ball_scene)
     clear = torch.cat((torch.rand(9, 3), torch.zeros(9, 1)), dim=1)
     target, background = training._target(clear)
@@ -238,7 +235,7 @@ STRESS = [case for case in cases() if case.subject == "training"]
 
 
 @pytest.mark.parametrize("case", STRESS, ids=lambda case: case.name)
-def test_in_a_stress_case_what_is_not_there_is_no_answer(case, monkeypatch) -> None:
+def test_in_a_stress_case_what_is_not_there_is_no_answer(case, monkeypatch):
     def density(*_: object) -> NoReturn:
         raise Unavailable("not on this machine")
 

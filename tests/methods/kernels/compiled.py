@@ -3,8 +3,6 @@ cases of the kernels give, one line each; with the last of them also for Ampere 
 test_gpu.py as a program of its own, in which nothing is interpreted.
 """
 
-from __future__ import annotations
-
 import importlib
 import os
 from typing import Any

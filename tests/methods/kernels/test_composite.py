@@ -1,7 +1,5 @@
 """The reference of the compositing against a plain loop, closed forms and finite differences."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -50,7 +48,7 @@ def plain_composite(rows: list[list[float]], stop: float) -> list[float]:
 
 
 @pytest.mark.parametrize("stop", [0.0, 0.3])
-def test_reference_is_the_definition(stop: float) -> None:
+def test_reference_is_the_definition(stop):
     sigma, values, where = inputs = samples([4, 0, 1, 9], dtype=torch.float64)
     pixels = composite(*inputs, stop=stop, backend="reference")
     summed = torch.column_stack((values, where.t, torch.ones_like(sigma)))
@@ -75,9 +73,7 @@ CHANNELS_APART, RAYS_APART, SPLIT = "channels apart", "rays apart", "behind a fr
 @hypothesis.given(
     counts=st.lists(st.integers(1, 64), min_size=1, max_size=12), seed=st.integers(0, 2**31)
 )
-def test_pixels_composited_in_parts_are_those_of_one_go(
-    how: str, backend: str, counts: list[int], seed: int
-) -> None:
+def test_pixels_composited_in_parts_are_those_of_one_go(how, backend, counts, seed):
     sigma, values, where = inputs = samples(counts, seed=seed)
     ray = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))
     whole = composite(*inputs, stop=0.0, backend=backend)
@@ -105,9 +101,7 @@ def test_pixels_composited_in_parts_are_those_of_one_go(
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_visible_samples_are_those_with_a_weight_which_is_the_gradient_of_their_value(
-    backend: str,
-) -> None:
+def test_visible_samples_are_those_with_a_weight_which_is_the_gradient_of_their_value(backend):
     """Behind pixels in front, which stay as they were."""
     sigma, values, where = samples([40, 0, 1, 25], channels=1)
     alpha = torch.tensor([0.0, 0.5, 0.9, 0.2])
@@ -125,7 +119,7 @@ def test_visible_samples_are_those_with_a_weight_which_is_the_gradient_of_their_
     assert all((part[:count] > 0).all() and not part[count:].any() for part, count in ends)
 
 
-def test_wrong_arguments_are_named() -> None:
+def test_wrong_arguments_are_named():
     sigma, values, where = samples([5])
     with pytest.raises(ValueError, match="values: expected shape"):
         composite(sigma, values[1:], where)
@@ -137,7 +131,7 @@ def test_wrong_arguments_are_named() -> None:
 
 @pytest.mark.parametrize(("quantity", "power"), [("alpha", 0), ("depth_sum", 1)])
 @pytest.mark.parametrize("y", [0.0, 0.3, 1.0])
-def test_the_experiments_know_the_rendering_integral(quantity: str, power: int, y: float) -> None:
+def test_the_experiments_know_the_rendering_integral(quantity, power, y):
     place = torch.tensor(y, dtype=torch.float64)
     s = slope(place).item()
     want, _ = integrate.quad(lambda x: x**power * s * x * math.exp(-s * x * x / 2), 0, 1)

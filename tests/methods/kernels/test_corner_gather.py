@@ -1,7 +1,5 @@
 """Corner features: weights, gradients beside autograd, input that is refused."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -15,7 +13,7 @@ CORNERS = torch.randint(20, (4, 8), generator=RANDOM).int()
 DIRECTIONS = torch.nn.functional.normalize(torch.randn(4, 3, generator=RANDOM), dim=1)
 
 
-def test_weights_have_a_gradient_by_the_reference_only() -> None:
+def test_weights_have_a_gradient_by_the_reference_only():
     table, weights = torch.arange(80.0).view(20, 4), WEIGHTS.clone().requires_grad_()
     corner_gather(table, CORNERS, VOXEL, weights, backend="reference").sum().backward()
     torch.testing.assert_close(weights.grad, table.sum(dim=1)[CORNERS.long()][VOXEL.long()])
@@ -33,7 +31,7 @@ def test_weights_have_a_gradient_by_the_reference_only() -> None:
 )
 def test_a_buffer_gets_the_gradient_whether_or_not_the_table_asks_for_one(
     read, rest, shape, backend
-) -> None:
+):
     table = torch.rand(shape, generator=torch.Generator().manual_seed(1)).requires_grad_()
     (gradient,) = torch.autograd.grad(read(table, *rest, backend=backend).sum(), table)
     for asked in (False, True):
@@ -53,7 +51,7 @@ def test_a_buffer_gets_the_gradient_whether_or_not_the_table_asks_for_one(
         ({"grad_buffer": torch.zeros(3, 3)}, "grad_buffer"),
     ],
 )
-def test_wrong_input_is_refused(changed: dict[str, torch.Tensor], message: str) -> None:
+def test_wrong_input_is_refused(changed, message):
     given = {"table": torch.zeros(20, 3), "corners": CORNERS, "voxel": VOXEL, "weights": WEIGHTS}
     with pytest.raises(ValueError, match=message):
         corner_gather(**given | changed, backend="cpu")

@@ -1,8 +1,6 @@
 """Functions of all kernels for the CPU: the exponential against float64, rounding against torch;
 which machine code is kept."""
 
-from __future__ import annotations
-
 import math
 import os
 import shutil
@@ -25,7 +23,7 @@ def _all(x: np.ndarray, out: np.ndarray) -> None:
         out[i] = exp(x[i])
 
 
-def test_it_is_exact_to_three_roundings_between_its_ends_and_held_beyond_them() -> None:
+def test_it_is_exact_to_three_roundings_between_its_ends_and_held_beyond_them():
     x = np.linspace(-EDGE, EDGE, 100_001, dtype=np.float32)
     x = np.concatenate((x, np.float32([-math.inf, math.inf, math.nan])))
     out = np.empty_like(x)
@@ -40,7 +38,7 @@ BITS = [0x7FFFFFFF, 0xFFFFFFFF, 0x7F800001, 0x7FC00000, 0x7F800000, 0xFF800000, 
 
 
 @pytest.mark.parametrize("bits", [*BITS, 0x3F808000, 0x3F818000, 0x3F808001, 0x80000000, 1])
-def test_numbers_are_rounded_to_bfloat16_as_torch_does(bits: int) -> None:
+def test_numbers_are_rounded_to_bfloat16_as_torch_does(bits):
     number = torch.tensor([bits]).to(torch.uint32).view(torch.float32)
     other = torch.tensor([1.0])
     for pair in ((number, other), (other, number)):
@@ -63,7 +61,7 @@ print(round(called(np.float32(2))), *called.stats.cache_hits.values())
 
 
 @pytest.mark.slow
-def test_machine_code_is_used_until_a_file_changes_that_it_comes_from(tmp_path: Path) -> None:
+def test_machine_code_is_used_until_a_file_changes_that_it_comes_from(tmp_path):
     root, apart = Path(__file__).parents[3], shutil.ignore_patterns("__pycache__", "scenes")
     for package in ("bench", "methods/kernels"):
         shutil.copytree(root / package, tmp_path / package, ignore=apart)

@@ -1,7 +1,5 @@
 """Which backend serves a call."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 
@@ -13,12 +11,12 @@ from methods.kernels import availability, dispatch, resolve
 from methods.kernels.spherical import spherical_harmonics
 
 
-def test_auto_goes_by_the_device() -> None:
+def test_auto_goes_by_the_device():
     assert resolve("auto", "cpu") == "cpu"
     assert resolve("auto", "cuda:0") == "reference"
 
 
-def test_a_backend_that_is_unknown_or_of_another_device_is_refused() -> None:
+def test_a_backend_that_is_unknown_or_of_another_device_is_refused():
     with pytest.raises(Unavailable, match=r"'refrence'.*did you mean 'reference'"):
         resolve("refrence", "cpu")
     with pytest.raises(Unavailable, match="serves CPU tensors, these are on 'cuda'"):
@@ -26,7 +24,7 @@ def test_a_backend_that_is_unknown_or_of_another_device_is_refused() -> None:
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="here it can be used")
-def test_backend_that_cannot_be_used_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_backend_that_cannot_be_used_says_why(monkeypatch):
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
     availability.cache_clear()
     with pytest.raises(Unavailable, match=r"sees no GPU|not installed"):
@@ -35,15 +33,13 @@ def test_backend_that_cannot_be_used_says_why(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("backend", ["auto", "cpu"])
-def test_a_kernel_without_a_version_is_computed_by_its_reference(
-    backend: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kernel_without_a_version_is_computed_by_its_reference(backend, monkeypatch):
     monkeypatch.setattr(dispatch, "served", lambda kernel: ("reference",))
     kernel, device = "methods.kernels.spherical", torch.device("cpu")
     assert dispatch.implementation(kernel, backend, device).__name__ == f"{kernel}.reference"
 
 
-def test_for_a_while_a_kernel_is_computed_by_its_reference_whatever_is_asked_for() -> None:
+def test_for_a_while_a_kernel_is_computed_by_its_reference_whatever_is_asked_for():
     """The reference alone gives a gradient for directions."""
     directions = torch.rand(3, 3, requires_grad=True)
     kernel = "methods.kernels.spherical"
@@ -54,7 +50,7 @@ def test_for_a_while_a_kernel_is_computed_by_its_reference_whatever_is_asked_for
         spherical_harmonics(directions, backend="cpu")
 
 
-def test_an_interpreted_backend_is_not_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interpreted_backend_is_not_compiled(monkeypatch):
     monkeypatch.setattr(dispatch, "resolve", lambda backend, device: backend)
     monkeypatch.setenv("TRITON_INTERPRET", "1")
     assert dispatch.compiled("cpu") == ["reference", "cpu"]
@@ -62,7 +58,7 @@ def test_an_interpreted_backend_is_not_compiled(monkeypatch: pytest.MonkeyPatch)
     assert dispatch.compiled("cpu") == ["reference", "cpu", "gpu"]
 
 
-def test_torch_keeps_its_threads_when_the_first_kernel_starts_its_own() -> None:
+def test_torch_keeps_its_threads_when_the_first_kernel_starts_its_own():
     program = """
 import torch
 from methods.kernels.spherical import spherical_harmonics

@@ -1,12 +1,9 @@
 """The ray march against a plain loop over steps, and closed forms."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
 import torch
-from torch import Tensor
 
 from bench.types import Rays
 from methods.kernels.march import extents, march
@@ -50,7 +47,7 @@ def plain_march(
 
 
 @pytest.mark.parametrize("jitter", [None, torch.linspace(0, 0.99, 40)])
-def test_samples_are_the_steps_in_occupied_cells(jitter: Tensor | None) -> None:
+def test_samples_are_the_steps_in_occupied_cells(jitter):
     """In the middle of a step, or at its share that is asked for."""
     grid, rays = dust(0), rays_through_the_cube(40)
     phases = torch.full((40,), 0.5) if jitter is None else jitter
@@ -72,7 +69,7 @@ def test_samples_are_the_steps_in_occupied_cells(jitter: Tensor | None) -> None:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_extents_are_those_of_what_is_marched_and_change_nothing(backend: str) -> None:
+def test_extents_are_those_of_what_is_marched_and_change_nothing(backend):
     rays, grid = rays_through_the_cube(50), dust(4)
     samples = march(rays, grid, STEP, backend=backend)
     parts = samples.offsets.diff().split(20)
@@ -88,7 +85,7 @@ def test_extents_are_those_of_what_is_marched_and_change_nothing(backend: str) -
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("limit", [1, 40, 1024])
-def test_a_window_leaves_samples_out_and_moves_none(backend: str, limit: int) -> None:
+def test_a_window_leaves_samples_out_and_moves_none(backend, limit):
     grid = dust(4)
     rays = rays_through_the_cube(80)
     generator = torch.Generator().manual_seed(6)
@@ -115,7 +112,7 @@ def test_a_window_leaves_samples_out_and_moves_none(backend: str, limit: int) ->
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_rays_that_miss_or_make_no_sense_have_no_samples(backend: str) -> None:
+def test_rays_that_miss_or_make_no_sense_have_no_samples(backend):
     nan, inf = math.nan, math.inf
     origins = torch.tensor([[2.0, 2, 2], [0.5, 0.5, 0.5], [nan, 0, 0], [0.5, 0.5, 0.5], [0.5] * 3])
     directions = torch.tensor([[1.0, 0, 0], [0, 0, 0], [1, 0, 0], [nan, 1, 0], [inf, 1, 0]])
@@ -124,7 +121,7 @@ def test_rays_that_miss_or_make_no_sense_have_no_samples(backend: str) -> None:
     assert samples.resume.tolist() == [-1] * 5
 
 
-def test_clearance_is_the_distance_to_the_nearest_brick_along_the_farthest_axis() -> None:
+def test_clearance_is_the_distance_to_the_nearest_brick_along_the_farthest_axis():
     cells = torch.zeros(32, 32, 32, dtype=torch.bool)
     cells[3, 17, 30] = cells[21, 20, 31] = True  # in the bricks (0, 4, 7) and (5, 5, 7)
     brick = torch.cartesian_prod(*3 * [torch.arange(8)])
@@ -133,7 +130,7 @@ def test_clearance_is_the_distance_to_the_nearest_brick_along_the_farthest_axis(
     assert (Occupancy(torch.zeros_like(cells)).clearance == 8).all()
 
 
-def test_wrong_arguments_are_named() -> None:
+def test_wrong_arguments_are_named():
     origins = torch.zeros(2, 3)
     with pytest.raises(ValueError, match="directions: expected shape"):
         march(Rays(origins, torch.zeros(3, 3)), full(), STEP)

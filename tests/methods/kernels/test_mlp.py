@@ -1,7 +1,5 @@
 """The small network: its formula, what it refuses, and that threads do not change it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -19,7 +17,7 @@ def network(count: int, dtype: torch.dtype = torch.float32) -> tuple[list[Tensor
     return inputs, [layer.requires_grad_() for layer in layers]
 
 
-def test_the_reference_is_the_formula() -> None:
+def test_the_reference_is_the_formula():
     inputs, layers = network(50, torch.float64)
     first, last = (layer.detach().numpy() for layer in layers)
     x = np.concatenate([part.numpy() for part in inputs], axis=1)
@@ -28,7 +26,7 @@ def test_the_reference_is_the_formula() -> None:
     np.testing.assert_allclose(got, want, rtol=0, atol=1e-12)
 
 
-def test_results_depend_on_neither_the_number_of_threads_nor_a_need_for_gradients() -> None:
+def test_results_depend_on_neither_the_number_of_threads_nor_a_need_for_gradients():
     inputs, layers = network(5000)
 
     def gradients(threads: int) -> tuple[Tensor, ...]:
@@ -42,7 +40,7 @@ def test_results_depend_on_neither_the_number_of_threads_nor_a_need_for_gradient
     assert torch.equal(mlp(inputs, layers, backend="cpu"), plain)
 
 
-def test_other_types_numbers_and_shapes_are_refused() -> None:
+def test_other_types_numbers_and_shapes_are_refused():
     inputs, layers = network(3)
     with pytest.raises(ValueError, match="float64"):
         mlp(*network(3, torch.float64), backend="cpu")
@@ -58,7 +56,7 @@ def test_other_types_numbers_and_shapes_are_refused() -> None:
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 @pytest.mark.parametrize("sign", [1, -1])
-def test_nan_passes_the_relu_whatever_its_sign(backend: str, sign: int) -> None:
+def test_nan_passes_the_relu_whatever_its_sign(backend, sign):
     x = torch.tensor([[sign * torch.nan], [-torch.inf], [-0.0], [torch.inf]]).bfloat16()
     one = torch.ones(1, 1, dtype=torch.bfloat16)
     got = mlp([x], [one, one], backend=backend)[:, 0]

@@ -1,7 +1,5 @@
 """Spherical harmonics by what defines them: orthonormal, of their degree, in their order."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -21,14 +19,14 @@ def sphere_quadrature() -> tuple[Tensor, Tensor]:
     return directions, torch.tensor(weights).repeat_interleave(16) * (2 * math.pi / 16)
 
 
-def test_they_are_orthonormal() -> None:
+def test_they_are_orthonormal():
     directions, weights = sphere_quadrature()
     values = spherical_harmonics(directions, backend="reference")
     gram = (values * weights[:, None]).T @ values
     torch.testing.assert_close(gram, torch.eye(CHANNELS).double(), rtol=0, atol=1e-12)
 
 
-def test_degree_by_parity_and_order_by_rotation() -> None:
+def test_degree_by_parity_and_order_by_rotation():
     directions, _ = sphere_quadrature()
     values = spherical_harmonics(directions, backend="reference")
     degree = torch.tensor([0] + [1] * 3 + [2] * 5 + [3] * 7)

@@ -1,7 +1,5 @@
 """NSVF as a method: its voxels, its network, and where its embeddings begin."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -9,7 +7,6 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from bench.types import Log, Scene
 from methods.instant_ngp.stage1 import train_field
 from methods.kernels.encode import encode
 from methods.kernels.types import Occupancy
@@ -29,7 +26,7 @@ def two_thirds(backend: str = "reference") -> NsvfField:
     return NsvfField(occupancy, "fp32", backend, generator).double()
 
 
-def test_embeddings_are_those_of_grid_sample() -> None:
+def test_embeddings_are_those_of_grid_sample():
     field = two_thirds()
     dense = torch.full((17, 17, 17, 32), torch.nan, dtype=torch.float64)
     x, y, z = field.vertices.long().unbind(dim=1)
@@ -45,7 +42,7 @@ def test_embeddings_are_those_of_grid_sample() -> None:
     torch.testing.assert_close(found[inside], wanted[inside], rtol=0, atol=1e-12)
 
 
-def test_density_is_zero_outside_voxels() -> None:
+def test_density_is_zero_outside_voxels():
     field = two_thirds()
     nn.init.constant_(field.opacity[-1].bias, 10.0)
     axis = (torch.arange(16, dtype=torch.float64) + 0.5) / 16
@@ -53,7 +50,7 @@ def test_density_is_zero_outside_voxels() -> None:
     assert torch.equal(sigma.view(16, 16, 16) > 0, field.index >= 0)
 
 
-def test_the_network_is_that_of_the_publication() -> None:
+def test_the_network_is_that_of_the_publication():
     """And its encodings those of the release, in which only that of angles goes without pi."""
     field = two_thirds().float()
     network = sum(p.numel() for name, p in field.named_parameters() if name != "embeddings")
@@ -85,17 +82,16 @@ def test_the_network_is_that_of_the_publication() -> None:
     torch.testing.assert_close(2 * shown - 1, colour(torch.cat((feature, seen), dim=1)), **close)
 
 
-def test_its_step_is_in_voxels(ball_scene: Scene, shared_log: Log) -> None:
+def test_its_step_is_in_voxels(ball_scene, shared_log):
     method = fitted("nsvf", ball_scene, shared_log)
     assert method.how.step == 0.5 / 32
     assert SMALL["nsvf"](step=0.25).sampling(BUDGET).step == 0.25 / 32
 
 
-def test_embeddings_begin_as_the_teachers_features(ball_scene: Scene, shared_log: Log) -> None:
+def test_embeddings_begin_as_the_teachers_features(ball_scene, shared_log):
     method = SMALL["nsvf"]()
     teacher = train_field(method.teacher, ball_scene, BUDGET, shared_log)
     field = method.begin(teacher, ball_scene, BUDGET).field
-    assert isinstance(field, NsvfField)
     embeddings = field.embeddings.detach()
     assert embeddings.std().item() == pytest.approx(32**-0.5 / math.pi, rel=1e-5)
     places = field.vertices / 32
@@ -105,6 +101,6 @@ def test_embeddings_begin_as_the_teachers_features(ball_scene: Scene, shared_log
     torch.testing.assert_close(embeddings, scale * learned, rtol=1e-4, atol=1e-5)
 
 
-def test_a_teacher_of_other_channels_is_refused() -> None:
+def test_a_teacher_of_other_channels_is_refused():
     with pytest.raises(ValueError, match=r"^teacher.grid: expected 32 channels .* got 16"):
         SMALL["nsvf"](teacher=TEACHER)

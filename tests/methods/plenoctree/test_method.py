@@ -1,13 +1,11 @@
 """PlenOctree as a method: what is extracted, what it learns, what a training leaves."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
 import torch
 
-from bench.types import Log, Scene, SteerbenchError
+from bench.types import Scene, SteerbenchError
 from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.types import Pixels
@@ -31,7 +29,7 @@ def extracted(teacher: TrainedField, scene: Scene, **others: float) -> tuple[Oct
     return octree, (octree.voxels.coordinates + 0.5) / 128
 
 
-def test_a_ray_that_ends_is_opaque_and_keeps_its_colour_and_depth() -> None:
+def test_a_ray_that_ends_is_opaque_and_keeps_its_colour_and_depth():
     alpha = torch.tensor([0.0, 0.5, 0.98, 0.995, 1.0])
     depth, colour = 3.0, torch.tensor([0.2, 0.4, 0.8])
     shown = opaque_at_end(Pixels(alpha[:, None] * colour, alpha * depth, alpha), stop=0.01)
@@ -40,7 +38,7 @@ def test_a_ray_that_ends_is_opaque_and_keeps_its_colour_and_depth() -> None:
     torch.testing.assert_close(shown.depth_sum, shown.alpha * depth)
 
 
-def test_leaves_stand_where_the_ball_is(ball_scene: Scene, teacher: TrainedField) -> None:
+def test_leaves_stand_where_the_ball_is(ball_scene, teacher):
     octree, centres = extracted(teacher, ball_scene)
     assert teacher.occupancy.holds(centres).all()
     # Pixels are 1.6 / 40 wide: half of the leaves are not farther than two from the surface.
@@ -51,7 +49,7 @@ def test_leaves_stand_where_the_ball_is(ball_scene: Scene, teacher: TrainedField
 
 
 @torch.no_grad()
-def test_densities_are_means_of_the_teacher(ball_scene: Scene, teacher: TrainedField) -> None:
+def test_densities_are_means_of_the_teacher(ball_scene, teacher):
     octree, centres = extracted(teacher, ball_scene, points=16)
     axis = (torch.arange(4) + 0.5) / 4 - 0.5
     inner = torch.cartesian_prod(axis, axis, axis) / 128
@@ -64,7 +62,7 @@ def test_densities_are_means_of_the_teacher(ball_scene: Scene, teacher: TrainedF
 
 
 @torch.no_grad()
-def test_harmonics_of_degree_0_are_the_mean_logit(ball_scene: Scene, teacher: TrainedField) -> None:
+def test_harmonics_of_degree_0_are_the_mean_logit(ball_scene, teacher):
     octree, centres = extracted(teacher, ball_scene, degree=0)
     field = teacher.field
     _, geometry = field.density(centres[:100])
@@ -76,7 +74,7 @@ def test_harmonics_of_degree_0_are_the_mean_logit(ball_scene: Scene, teacher: Tr
     assert (got - logits).abs().median() < 0.02
 
 
-def test_directions_are_spread_evenly() -> None:
+def test_directions_are_spread_evenly():
     directions = fibonacci_sphere(64)
     torch.testing.assert_close(directions.norm(dim=1), torch.ones(64))
     nearest = torch.cdist(directions, directions).fill_diagonal_(9).amin(dim=1)
@@ -91,15 +89,13 @@ def test_directions_are_spread_evenly() -> None:
         ({"least_weight": 2.0}, "no leaf has a weight of 2"),
     ],
 )
-def test_too_many_leaves_and_none_are_refused(
-    options: dict[str, float], complaint: str, ball_scene: Scene, teacher: TrainedField
-) -> None:
+def test_too_many_leaves_and_none_are_refused(options, complaint, ball_scene, teacher):
     with pytest.raises(SteerbenchError, match=complaint):
         extracted(teacher, ball_scene, **options)
 
 
 @pytest.mark.slow
-def test_it_learns_a_ball(ball_scene: Scene, shared_log: Log) -> None:
+def test_it_learns_a_ball(ball_scene, shared_log):
     before, after = (fitted("plenoctree", ball_scene, shared_log, steps) for steps in (1, 60))
     assert mean_quality(after, ball_scene, "train") > mean_quality(before, ball_scene, "train") + 1
     # From the front of the ball, 1.6 - 0.3 from the camera, to its middle: after so few steps the
@@ -107,7 +103,7 @@ def test_it_learns_a_ball(ball_scene: Scene, shared_log: Log) -> None:
     shows_the_ball(after, ball_scene, 21, off=0.3)
 
 
-def test_only_what_rays_meet_is_changed(ball_scene: Scene, teacher: TrainedField) -> None:
+def test_only_what_rays_meet_is_changed(ball_scene, teacher):
     octree, _ = extracted(teacher, ball_scene)
     before = octree.light.density.clone(), octree.light.harmonics.clone()
     options = lessons("plenoctree", max_rays=64)
@@ -122,7 +118,7 @@ def test_only_what_rays_meet_is_changed(ball_scene: Scene, teacher: TrainedField
     assert not ((octree.light.density != before[0]) & ~met).any()
 
 
-def test_what_is_stored_is_chosen_afterwards(ball_scene: Scene, shared_log: Log) -> None:
+def test_what_is_stored_is_chosen_afterwards(ball_scene, shared_log):
     half, full = (
         fitted("plenoctree", ball_scene, shared_log, 20, stored=kind) for kind in ("fp16", "fp32")
     )

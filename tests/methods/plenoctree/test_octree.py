@@ -1,7 +1,5 @@
 """Leaves: what they show against a loop over them all, what a file of them takes."""
 
-from __future__ import annotations
-
 import math
 
 import torch
@@ -25,7 +23,7 @@ def some_octree(leaves: int = 60, size: int = 16) -> Octree:
     return Octree(Voxels(chosen, size), Light(density, harmonics))
 
 
-def test_the_picture_of_the_visible_leaves_is_that_of_a_plain_loop_over_all() -> None:
+def test_the_picture_of_the_visible_leaves_is_that_of_a_plain_loop_over_all():
     octree = some_octree()
     visible = octree.visible()
     assert len(visible.voxels) == (octree.light.density > 0).sum() < 60
@@ -51,14 +49,14 @@ def test_the_picture_of_the_visible_leaves_is_that_of_a_plain_loop_over_all() ->
         assert abs(pixels.alpha[ray].item() - (1 - light)) < 1e-4
 
 
-def test_the_occupancy_has_every_leaf_and_no_other_cell() -> None:
+def test_the_occupancy_has_every_leaf_and_no_other_cell():
     octree = some_octree(size=64)
     found = octree.occupancy.cells.nonzero()
     assert octree.occupancy.resolution == 16
     assert torch.equal(found, (octree.voxels.coordinates // 4).unique(dim=0))
 
 
-def test_rounded_leaves_are_16_bit_numbers_and_positive() -> None:
+def test_rounded_leaves_are_16_bit_numbers_and_positive():
     octree = some_octree()
     octree.light.density[:2] = torch.tensor([1e6, 1e-9])  # opaque, and 0 with 16 bits
     rounded = octree.visible("fp16").light
@@ -70,7 +68,7 @@ def test_rounded_leaves_are_16_bit_numbers_and_positive() -> None:
     torch.testing.assert_close(rounded.density[1:], wanted, rtol=2**-11, atol=0)
 
 
-def test_where_no_leaf_is_visible_there_is_nothing_to_see() -> None:
+def test_where_no_leaf_is_visible_there_is_nothing_to_see():
     octree = some_octree(size=64)
     octree.light.density[:] = -1
     camera = look_at_the_middle(0.13, 0.4)
@@ -81,7 +79,7 @@ def test_where_no_leaf_is_visible_there_is_nothing_to_see() -> None:
     assert (pixels.alpha == 0).all()
 
 
-def test_sizes_are_values_and_what_finds_them() -> None:
+def test_sizes_are_values_and_what_finds_them():
     octree = some_octree()
     bricks = len((octree.voxels.coordinates // 8).unique(dim=0))
     index = 4 * 2**3 + bricks * (64 + 4)

@@ -1,7 +1,5 @@
 """Rendering rays all at once, to train."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -39,7 +37,7 @@ def thick(cloud: Cloud, device: str) -> Thick:
         sigma, geometry = thin(positions, known)
         return 100 * sigma, geometry
 
-    field.density = density  # type: ignore[method-assign]
+    field.density = density
     return field, occupancy, rays_on(device)
 
 
@@ -53,7 +51,7 @@ def learned(pixels: Pixels, field: HashField) -> list[Tensor]:
     return list(torch.autograd.grad(pixels.values.square().sum(), list(field.parameters())))
 
 
-def test_leaving_out_hidden_samples_changes_no_gradient(thick: Thick, device: str) -> None:
+def test_leaving_out_hidden_samples_changes_no_gradient(thick, device):
     field, occupancy, rays = thick
     jitter = torch.rand(len(rays.origins), generator=torch.Generator().manual_seed(0)).to(device)
     white = torch.ones(3, device=device)
@@ -73,7 +71,7 @@ def test_leaving_out_hidden_samples_changes_no_gradient(thick: Thick, device: st
         torch.testing.assert_close(some, want, rtol=1e-3, atol=atol)
 
 
-def test_thin_samples_are_kept_in_turn_for_the_others(cloud: Cloud, device: str) -> None:
+def test_thin_samples_are_kept_in_turn_for_the_others(cloud, device):
     field, occupancy = cloud
     rays = rays_on(device)
     jitter = torch.full((len(rays.origins),), 0.5, device=device)
@@ -97,7 +95,7 @@ def test_thin_samples_are_kept_in_turn_for_the_others(cloud: Cloud, device: str)
     torch.testing.assert_close(length, expected, rtol=1024 * 2**-24, atol=0)
 
 
-def test_rounds_change_no_sample(thick: Thick, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rounds_change_no_sample(thick, monkeypatch):
     """But for a transmittance that reaches `stop` just where a round ends: it is rounded there."""
     field, occupancy, rays = thick
     jitter = torch.full((len(rays.origins),), 0.7, device=rays.origins.device)
@@ -114,7 +112,7 @@ def test_rounds_change_no_sample(thick: Thick, monkeypatch: pytest.MonkeyPatch) 
     assert 0 < len(found[0][1]) < len(found[0][0])
 
 
-def test_a_teacher_tells_which_samples_are_hidden(cloud: Cloud, device: str) -> None:
+def test_a_teacher_tells_which_samples_are_hidden(cloud, device):
     field, occupancy = cloud
     rays = rays_on(device)
 
@@ -125,20 +123,19 @@ def test_a_teacher_tells_which_samples_are_hidden(cloud: Cloud, device: str) -> 
             self.density = lambda places: (torch.full_like(places[:, 0], sigma), places)
 
     own, most = render_batch(field, rays, occupancy, Sampling(stop=0))
-    clear, all_ = render_batch(field, rays, occupancy, Sampling(stop=0), teacher=Teacher(0.0))  # type: ignore[arg-type]
+    clear, all_ = render_batch(field, rays, occupancy, Sampling(stop=0), teacher=Teacher(0.0))
     assert all_ == most
     assert torch.equal(own.values, clear.values)
     # Opaque at once: only the first sample of every ray is seen.
-    wall, few = render_batch(field, rays, occupancy, Sampling(), teacher=Teacher(1e6))  # type: ignore[arg-type]
+    wall, few = render_batch(field, rays, occupancy, Sampling(), teacher=Teacher(1e6))
     offsets = march(rays, occupancy, STEP).offsets
     assert few == int((offsets.diff() > 0).sum())
     assert (wall.alpha <= own.alpha + 1e-6).all()
 
 
-def test_the_entropy_of_opacities_is_smallest_where_rays_are_opaque_or_empty() -> None:
+def test_the_entropy_of_opacities_is_smallest_where_rays_are_opaque_or_empty():
     assert opacity_entropy(torch.tensor([0.5])).item() == pytest.approx(0.5 * math.log(2))
     assert opacity_entropy(torch.tensor([0.0, 1.0])).item() == pytest.approx(0, abs=1e-4)
     opacity = torch.tensor([0.2, 0.6], requires_grad=True)  # on both sides of the largest, 1 / e
     opacity_entropy(opacity).backward()
-    assert opacity.grad is not None
     assert opacity.grad[0] > 0 > opacity.grad[1]

@@ -1,17 +1,14 @@
 """Lists of what is left, and how often a GPU is waited for to make them."""
 
-from __future__ import annotations
-
 import torch
 
 from bench.waits import device_waits
 from methods.rendering.compaction import indices_where
-from tests.pretended_gpu import PretendedGpu
 
 MASK = torch.tensor([False, True, True, False, True])
 
 
-def test_the_places_of_many_masks_are_waited_for_once(gpu: PretendedGpu) -> None:
+def test_the_places_of_many_masks_are_waited_for_once(gpu):
     masks = [MASK, ~MASK, torch.zeros(3, dtype=torch.bool), torch.zeros(0, dtype=torch.bool)]
     there = [mask.to("cuda") for mask in masks]
     with device_waits() as waits:

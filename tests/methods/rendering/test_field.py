@@ -1,7 +1,5 @@
 """A radiance field that is no network: its rays, its density grid, padding."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -18,7 +16,7 @@ from tests.methods.solids import DENSITY, Solid, ball
 EVERYWHERE = Occupancy(torch.ones(32, 32, 32, dtype=torch.bool))
 
 
-def test_rays_of_a_solid_end_at_its_surface() -> None:
+def test_rays_of_a_solid_end_at_its_surface():
     field, rays = Solid(ball()), cast(look_at_the_middle(0.1, 0.4))
     work = Work()
     pixels = render_rays(field, rays, EVERYWHERE, work, Sampling())
@@ -33,7 +31,7 @@ def test_rays_of_a_solid_end_at_its_surface() -> None:
     assert used > 0
 
 
-def test_the_density_grid_finds_a_solid() -> None:
+def test_the_density_grid_finds_a_solid():
     slice_ = torch.zeros(RESOLUTION, RESOLUTION, RESOLUTION, dtype=torch.bool)
     slice_[62:66] = True  # through the middle of the ball
     grid, generator = DensityGrid(slice_), torch.Generator().manual_seed(0)
@@ -50,7 +48,7 @@ def test_the_density_grid_finds_a_solid() -> None:
     assert not cells[~slice_].any()
 
 
-def test_padding_hides_behind_the_samples() -> None:
+def test_padding_hides_behind_the_samples():
     rows = torch.rand(BATCH_QUANTUM + 1, 3)
     padded = pad(rows)
     assert len(padded) == 2 * BATCH_QUANTUM

@@ -1,7 +1,5 @@
 """Which rays of a frame are rendered, how, and what its pixels hold."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -17,12 +15,12 @@ from methods.rendering.batch import render_batch
 from methods.rendering.frame import everywhere, rays_at_matter, render_frame, render_rays
 from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import FAINT, Sampling
-from tests.methods.conftest import GRID, Cloud, Work, look_at_the_middle
+from tests.methods.conftest import GRID, Work, look_at_the_middle
 from tests.methods.solids import Solid, wall
 
 
 @pytest.mark.parametrize(("turn", "lift"), [(0.0, 0.0), (0.13, 0.7), (0.6, -1.2)])
-def test_no_ray_that_has_samples_is_left_out(cloud: Cloud, turn: float, lift: float) -> None:
+def test_no_ray_that_has_samples_is_left_out(cloud, turn, lift):
     occupancy = Occupancy(cloud[1].cells.cpu())
     camera = look_at_the_middle(turn, lift)
     pixels, rays = rays_at_matter(camera, occupancy)
@@ -35,7 +33,7 @@ def test_no_ray_that_has_samples_is_left_out(cloud: Cloud, turn: float, lift: fl
     torch.testing.assert_close(rays.directions, every_ray.directions[pixels])
 
 
-def test_a_camera_inside_the_matter_sees_it_in_all_pixels() -> None:
+def test_a_camera_inside_the_matter_sees_it_in_all_pixels():
     camera = look_at_the_middle(0.0, 0.0)
     inside = replace(camera, c2w=camera.c2w.clone())
     inside.c2w[:, 3] = 0.5
@@ -43,7 +41,7 @@ def test_a_camera_inside_the_matter_sees_it_in_all_pixels() -> None:
     assert len(pixels) == camera.width * camera.height
 
 
-def test_a_frame_is_its_rays_on_the_background(cloud: Cloud) -> None:
+def test_a_frame_is_its_rays_on_the_background(cloud):
     field, occupancy = cloud
     camera = replace(place_camera(look_at_the_middle(0.1, 0.4), field.device), width=20)
     background, work = torch.tensor((0.25, 0.5, 1.0), device=field.device), Work()
@@ -64,7 +62,7 @@ def test_a_frame_is_its_rays_on_the_background(cloud: Cloud) -> None:
     assert work.done["rays"] == len(rays_at_matter(camera, occupancy)[0]) < 32 * 20
 
 
-def test_a_window_is_that_of_its_pixel(cloud: Cloud) -> None:
+def test_a_window_is_that_of_its_pixel(cloud):
     """Half of the pixels may look nowhere, though `render_frame` asks for some pixels only."""
     field, occupancy = cloud
     camera = place_camera(look_at_the_middle(0.1, 0.4), field.device)
@@ -80,7 +78,7 @@ def test_a_window_is_that_of_its_pixel(cloud: Cloud) -> None:
     torch.testing.assert_close(half.alpha[:, 16:], whole.alpha[:, 16:], rtol=0, atol=1e-6)
 
 
-def test_rounds_render_what_one_go_renders(cloud: Cloud, device: str) -> None:
+def test_rounds_render_what_one_go_renders(cloud, device):
     field, occupancy = cloud
     rays = cast(place_camera(look_at_the_middle(0.1, 0.4), device))
     half = torch.full((len(rays.origins),), 0.5, device=device)
@@ -94,9 +92,7 @@ def test_rounds_render_what_one_go_renders(cloud: Cloud, device: str) -> None:
     torch.testing.assert_close(rounds.alpha, whole.alpha, rtol=0, atol=1e-4)
 
 
-def test_at_once_rays_look_as_in_rounds(
-    cloud: Cloud, device: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_at_once_rays_look_as_in_rounds(cloud, device, monkeypatch):
     field, occupancy = cloud
     rays = cast(place_camera(look_at_the_middle(0.1, 0.4), device))
     window = torch.tensor((0.0, 1.7), device=device).expand(len(rays.origins), 2)
@@ -115,7 +111,7 @@ def test_at_once_rays_look_as_in_rounds(
         torch.testing.assert_close(c, d, rtol=0, atol=1e-6)
 
 
-def test_samples_behind_the_early_stop_are_hardly_evaluated() -> None:
+def test_samples_behind_the_early_stop_are_hardly_evaluated():
     field = Solid(wall(0.0), density=1e5)
     occupancy = Occupancy(torch.ones(32, 32, 32, dtype=torch.bool))
     rays, work = cast(look_at_the_middle(0.0, 0.0)), Work()
@@ -126,9 +122,7 @@ def test_samples_behind_the_early_stop_are_hardly_evaluated() -> None:
 
 
 @pytest.mark.parametrize("compacts", [True, False])
-def test_faint_samples_are_black_and_not_looked_at_in_rounds(
-    cloud: Cloud, compacts: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_faint_samples_are_black_and_not_looked_at_in_rounds(cloud, compacts, monkeypatch):
     monkeypatch.setattr(rendering, "compacts", lambda device: compacts)
     field, occupancy = cloud
     rays = cast(place_camera(look_at_the_middle(0.1, 0.4), field.device))
@@ -137,7 +131,7 @@ def test_faint_samples_are_black_and_not_looked_at_in_rounds(
     assert work.done["shaded_samples"] > 0
     assert (work.done["shaded_samples"] < work.done["samples"]) == compacts
     # Of a field whose features are 1 everywhere, what is shown is the sum of the weights seen.
-    field.features = lambda geometry, directions: torch.ones(  # type: ignore[method-assign]
+    field.features = lambda geometry, directions: torch.ones(
         len(geometry), field.channels, device=geometry.device
     )
     seen = render_rays(field, rays, occupancy, NullProbe(), Sampling(stop=stop))
@@ -150,7 +144,7 @@ def test_faint_samples_are_black_and_not_looked_at_in_rounds(
 
 
 @pytest.mark.parametrize("compacts", [True, False])
-def test_an_empty_grid_renders_nothing(compacts: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_empty_grid_renders_nothing(compacts, monkeypatch):
     monkeypatch.setattr(rendering, "compacts", lambda device: compacts)
     field = HashField(GRID, generator=torch.Generator().manual_seed(0))
     occupancy = Occupancy(torch.zeros(16, 16, 16, dtype=torch.bool))

@@ -1,7 +1,5 @@
 """The density grid that tells where a field is empty."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -30,14 +28,14 @@ def quarter(sigma: float) -> Solid:
     return Solid(slab(-1.0, 0.25), density=sigma)
 
 
-def test_cells_outside_the_bounds_cannot_be_learnt() -> None:
+def test_cells_outside_the_bounds_cannot_be_learnt():
     cells = learnable_cells(torch.tensor([[0.375, 0.375, 0.375], [0.625, 0.5, 0.625]]), AROUND)
     inside = torch.zeros_like(WHOLE)
     inside[48:80, 48:64, 48:80] = True
     assert torch.equal(cells, inside)  # in the middle, where every camera looks
 
 
-def test_what_one_camera_sees_cannot_be_learnt() -> None:
+def test_what_one_camera_sees_cannot_be_learnt():
     one, other = AROUND[:2]
     assert not learnable_cells(UNIT_CUBE, [one]).any()
     assert learnable_cells(UNIT_CUBE, [one, other]).any()
@@ -45,7 +43,7 @@ def test_what_one_camera_sees_cannot_be_learnt() -> None:
     assert not learnable_cells(UNIT_CUBE, [one, behind]).any()
 
 
-def test_cells_at_a_camera_cannot_be_learnt() -> None:
+def test_cells_at_a_camera_cannot_be_learnt():
     inside = replace(AROUND[0], c2w=AROUND[0].c2w.clone())
     inside.c2w[:, 3] = torch.tensor([0.51, 0.51, 0.51])
     without, with_it = (learnable_cells(UNIT_CUBE, x) for x in (AROUND, [*AROUND, inside]))
@@ -54,7 +52,7 @@ def test_cells_at_a_camera_cannot_be_learnt() -> None:
     assert ((lost + 0.5) / RESOLUTION - 0.51).abs().max() < 2 / 32
 
 
-def test_a_cell_is_occupied_until_it_was_visited_and_keeps_its_value_in_between() -> None:
+def test_a_cell_is_occupied_until_it_was_visited_and_keeps_its_value_in_between():
     grid = DensityGrid(WHOLE)
     grid.update(quarter(0.0), GENERATOR, samples=4096)
     visited = grid.density < INITIAL
@@ -65,7 +63,7 @@ def test_a_cell_is_occupied_until_it_was_visited_and_keeps_its_value_in_between(
     assert torch.equal(grid.occupancy.cells, ~visited)
 
 
-def test_a_density_that_is_not_a_number_is_as_good_as_none() -> None:
+def test_a_density_that_is_not_a_number_is_as_good_as_none():
     grid, other = DensityGrid(WHOLE), DensityGrid(WHOLE)
     for one, sigma in ((grid, math.nan), (other, 0.0)):
         one.update(quarter(sigma), torch.Generator().manual_seed(1), samples=4096)
@@ -73,7 +71,7 @@ def test_a_density_that_is_not_a_number_is_as_good_as_none() -> None:
 
 
 @pytest.mark.slow
-def test_matter_that_is_thin_everywhere_is_kept_where_it_is_denser_than_the_mean() -> None:
+def test_matter_that_is_thin_everywhere_is_kept_where_it_is_denser_than_the_mean():
     thin = quarter(0.1 * THRESHOLD)
     grid = DensityGrid(WHOLE)
     for _ in range(24):  # 1.2 * 0.8^24 < 0.1

@@ -1,8 +1,6 @@
 """Preceding frames: what is kept of them, which pixels of another view show their points, and range
 reduction, on solids whose surface is known."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -53,7 +51,7 @@ def shown(cloud: PointCloud, camera: Camera) -> Tensor:
 
 
 @pytest.mark.parametrize("scale", [1, 2, 3, 4])
-def test_a_still_frame_is_shown_in_the_first_pixel_of_each_cell(scale: int) -> None:
+def test_a_still_frame_is_shown_in_the_first_pixel_of_each_cell(scale):
     """Off by s / 2 - 1/2 pixels from the middle of the cell."""
     low = low_camera(scale)
     full = scale_camera(low, 8 * scale, 6 * scale)
@@ -65,7 +63,7 @@ def test_a_still_frame_is_shown_in_the_first_pixel_of_each_cell(scale: int) -> N
     torch.testing.assert_close(depth, frame_of(low).depth.flatten(), rtol=0, atol=24 * 2.0**-24)
 
 
-def test_a_frame_of_nothing_is_shown_nowhere_else() -> None:
+def test_a_frame_of_nothing_is_shown_nowhere_else():
     """Its points lie at its camera: behind, or in front of, any other."""
     low = low_camera(2)
     cloud = PointCloud.of(frame_of(low, torch.full((6, 8), math.inf), alpha=0.0))
@@ -78,7 +76,7 @@ def test_a_frame_of_nothing_is_shown_nowhere_else() -> None:
 
 @pytest.mark.parametrize("age", [1, 2])
 @pytest.mark.parametrize("which", ["zero_upsampling", "direct"])
-def test_features_land_where_the_released_code_puts_them(which: str, age: int) -> None:
+def test_features_land_where_the_released_code_puts_them(which, age):
     """`warp_zero_upsampling`, with which it trains, and `warp_direct`, with which it renders. Six
     pixels of one frame are empty: they must write nothing that is seen."""
     given = {name: torch.from_numpy(RELEASE[f"warp.{name}"]) for name in ("poses", "depth")}
@@ -93,7 +91,7 @@ def test_features_land_where_the_released_code_puts_them(which: str, age: int) -
     assert torch.equal(torch.cat((values.flatten(0, 1), torch.zeros(1, 6)))[index], wanted)
 
 
-def test_summed_depths_are_too_near_unless_the_opacity_is_divided_out() -> None:
+def test_summed_depths_are_too_near_unless_the_opacity_is_divided_out():
     low = low_camera(4)
     frame = frame_of(low)
     frame.alpha[:3] = 0.5
@@ -138,7 +136,7 @@ def interval_of(frame: FeatureFrame) -> Tensor:
     return PointCloud.of(frame).expected().interval(along_x(), EPSILON, "cpu")
 
 
-def test_a_surface_is_found_inside_the_interval_alone() -> None:
+def test_a_surface_is_found_inside_the_interval_alone():
     whole, samples = render(Solid(wall(0.3)))
     interval = interval_of(whole)
     assert interval.isfinite().all()
@@ -152,7 +150,7 @@ def test_a_surface_is_found_inside_the_interval_alone() -> None:
     assert (moved.values == 1).all()  # the background
 
 
-def test_the_interval_is_that_of_the_pixel_alone_and_everything_where_nothing_is_known() -> None:
+def test_the_interval_is_that_of_the_pixel_alone_and_everything_where_nothing_is_known():
     frame, _ = render(Solid(ball()))
     interval = interval_of(frame)
     seen = frame.alpha > RELIABLE_ALPHA
@@ -166,6 +164,6 @@ def test_the_interval_is_that_of_the_pixel_alone_and_everything_where_nothing_is
 
 
 @pytest.mark.parametrize("epsilon", [0.0, -1.0, math.nan])
-def test_an_interval_has_a_width(epsilon: float) -> None:
+def test_an_interval_has_a_width(epsilon):
     with pytest.raises(ValueError, match=r"range\.epsilon: expected more than 0, got"):
         RangeReduction("paper", epsilon, "sum")

@@ -1,7 +1,5 @@
 """The method as the harness uses it: trained, loaded again, rendered in sequence."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,19 +9,14 @@ import pytest
 import torch
 
 from bench.console import ConsoleLog
-from bench.types import Budget, Log, NullProbe, Scene
+from bench.types import Budget, NullProbe
 from methods.engines import Engine
 from methods.engines.openvino_engine import OpenVino
 from methods.engines.torch_engine import TorchEngine
 from methods.steernerf.method import SteerNerf
 from methods.steernerf.options import RangeReduction, Skips
 from methods.steernerf.unet import UNet
-from tests.methods.models import (
-    small_joint,
-    small_model,
-    small_motion,
-    small_rendering,
-)
+from tests.methods.models import small_joint, small_model, small_motion, small_rendering
 from tests.methods.trainings import GRID, QUICK
 
 BUDGET = Budget("test", steps=40, samples=1024, renderer_steps=4)
@@ -65,13 +58,8 @@ def stages(folder: Path) -> list[str]:
 
 
 def test_what_was_trained_is_found_again_and_renders_the_same(
-    ball_scene: Scene,
-    log: ConsoleLog,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    device: str,
-) -> None:
+    ball_scene, log, tmp_path, capsys, monkeypatch, device
+):
     first, second = (new_method(device=device) for _ in range(2))
     first.fit(ball_scene, BUDGET, log)
     capsys.readouterr()
@@ -85,9 +73,7 @@ def test_what_was_trained_is_found_again_and_renders_the_same(
         assert torch.equal(*frames)
 
 
-def test_steps_of_its_own_replace_those_of_the_budget(
-    ball_scene: Scene, log: ConsoleLog, tmp_path: Path
-) -> None:
+def test_steps_of_its_own_replace_those_of_the_budget(ball_scene, log, tmp_path):
     new_method().fit(ball_scene, BUDGET, log)
     more = replace(BUDGET, renderer_steps=BUDGET.renderer_steps + 1)
     new_method(steps=BUDGET.renderer_steps).fit(ball_scene, more, log)
@@ -96,9 +82,7 @@ def test_steps_of_its_own_replace_those_of_the_budget(
     assert stages(tmp_path) == ["distilled", "field", "steernerf", "steernerf"]
 
 
-def test_reset_forgets_and_sizes_are_those_of_all_that_a_frame_needs(
-    ball_scene: Scene, shared_log: Log
-) -> None:
+def test_reset_forgets_and_sizes_are_those_of_all_that_a_frame_needs(ball_scene, shared_log):
     method = new_method(rate=1e-2)
     method.fit(ball_scene, BUDGET, shared_log)
     camera = ball_scene.splits["test"].cameras[0]
@@ -115,9 +99,7 @@ def test_reset_forgets_and_sizes_are_those_of_all_that_a_frame_needs(
 
 
 @pytest.mark.slow
-def test_a_network_is_built_once_for_each_training_and_for_no_other(
-    ball_scene: Scene, log: ConsoleLog, tmp_path: Path
-) -> None:
+def test_a_network_is_built_once_for_each_training_and_for_no_other(ball_scene, log, tmp_path):
     def built(rate: float = 1e-3, **rendering: Any) -> int:
         method = new_method(rate=rate, engine=OpenVino("int8"), **rendering)
         method.fit(ball_scene, BUDGET, log)
@@ -131,7 +113,7 @@ def test_a_network_is_built_once_for_each_training_and_for_no_other(
     assert built(rate=3e-3) == 2
 
 
-def test_shorter_examples_use_more_distilled_views() -> None:
+def test_shorter_examples_use_more_distilled_views():
     # 2 examples at the beginning, and 100 steps of 2 patches, 4 or 8 of an example.
     for uses, examples in ((4, 2 + 50), (8, 2 + 25)):
         options = small_joint(distilled_share=1.0, motion=small_motion(pool=2, uses=uses))
@@ -142,7 +124,7 @@ def key_of(method: SteerNerf, **changed: Any) -> dict[str, object]:
     return replace(method.stage2, **changed).key(BUDGET)
 
 
-def test_a_training_depends_on_its_model_and_on_nothing_that_is_chosen_afterwards() -> None:
+def test_a_training_depends_on_its_model_and_on_nothing_that_is_chosen_afterwards():
     usual, skip = new_method(), Skips(empty=False, hidden=True, background=True)
     other = new_method(step=1.5, stop=1e-1, range=RANGED, skip=skip)
     assert key_of(other) == key_of(usual)
@@ -155,8 +137,8 @@ def test_a_training_depends_on_its_model_and_on_nothing_that_is_chosen_afterward
 @pytest.mark.slow
 @pytest.mark.parametrize("after", [0.125, 0.5, 1.0])
 def test_the_weights_after_a_share_of_the_steps_are_of_the_same_training(
-    ball_scene: Scene, log: ConsoleLog, tmp_path: Path, after: float
-) -> None:
+    ball_scene, log, tmp_path, after
+):
     whole, part = new_method(), new_method(after=after)
     assert part.stage2.key(BUDGET) == whole.stage2.key(BUDGET)
     for method in (whole, part):
@@ -168,7 +150,7 @@ def test_the_weights_after_a_share_of_the_steps_are_of_the_same_training(
     assert (part.train_s < whole.train_s) == (after < 1)
 
 
-def test_settings_that_do_not_fit_are_refused() -> None:
+def test_settings_that_do_not_fit_are_refused():
     """Range reduction needs preceding frames; weights are kept after some shares of the steps."""
     new_method(frames=1, range=RANGED)
     with pytest.raises(ValueError, match=r"^after: expected 0\.125, 0\.25, 0\.5 or 1, got 0\.3$"):

@@ -1,7 +1,5 @@
 """What stage 2 learns from: distilled views, examples and how long they are used, patches."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -60,8 +58,8 @@ def same(first: Split, second: Split) -> bool:
 
 
 def test_a_distilled_view_is_what_the_field_shows_among_the_training_cameras(
-    trained: TrainedField, ball_scene: Scene, tmp_path: Path
-) -> None:
+    trained, ball_scene, tmp_path
+):
     """At full resolution, and on none of them."""
     centres = torch.stack([camera.c2w[:, 3] for camera in ball_scene.splits["train"].cameras])
     views = views_of(trained, ball_scene, tmp_path)
@@ -81,8 +79,8 @@ def test_a_distilled_view_is_what_the_field_shows_among_the_training_cameras(
 
 
 def test_distilled_views_are_found_again_without_rendering(
-    trained: TrainedField, ball_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    trained, ball_scene, tmp_path, monkeypatch
+):
     first = views_of(trained, ball_scene, tmp_path)
     assert views_of(trained, ball_scene, tmp_path, count=0).cameras == []
     assert len(views_of(trained, ball_scene, tmp_path, count=1)) == 1  # other views
@@ -115,7 +113,7 @@ def new_patches(
     return Patches(pipeline, scene, halves[1], options, generator)
 
 
-def test_an_example_is_replaced_after_its_uses(ball_scene: Scene) -> None:
+def test_an_example_is_replaced_after_its_uses(ball_scene):
     source = new_patches(ball_scene, small_motion(pool=1, uses=3))
     drawn = [source.example() for _ in range(7)]
     assert [example is drawn[0] for example in drawn] == [True] * 3 + [False] * 4
@@ -123,18 +121,18 @@ def test_an_example_is_replaced_after_its_uses(ball_scene: Scene) -> None:
     assert drawn[3] is not drawn[6]
 
 
-def test_the_pool_holds_no_more_than_it_is_to(ball_scene: Scene) -> None:
+def test_the_pool_holds_no_more_than_it_is_to(ball_scene):
     source = new_patches(ball_scene, small_motion(pool=3, uses=100))
     assert len({id(source.example()) for _ in range(40)}) == 3
 
 
 @pytest.mark.parametrize("share", [0, 1])
-def test_the_share_of_distilled_views_is_kept(ball_scene: Scene, share: float) -> None:
+def test_the_share_of_distilled_views_is_kept(ball_scene, share):
     source = new_patches(ball_scene, small_motion(pool=1, uses=1), share, frames=0)
     assert all((source.example().number >= 12) == share for _ in range(20))
 
 
-def test_the_newest_preceding_frame_is_a_step_away(ball_scene: Scene) -> None:
+def test_the_newest_preceding_frame_is_a_step_away(ball_scene):
     motion = small_motion(degrees=(2.0, 2.0), pool=1, uses=1)
     source = new_patches(ball_scene, motion)
     for example in (source.example() for _ in range(12)):
@@ -150,16 +148,14 @@ MOTION = small_motion(pool=3, uses=100)
 
 
 @pytest.mark.parametrize(("share", "side"), [(1.0, 6), (0.75, 6), (0.5, 4), (0.01, 1)])
-def test_a_patch_has_its_side_and_at_most_its_share_of_the_frame(
-    ball_scene: Scene, share: float, side: int
-) -> None:
+def test_a_patch_has_its_side_and_at_most_its_share_of_the_frame(ball_scene, share, side):
     """Of a frame of 8 x 8 low-resolution pixels."""
     source = new_patches(ball_scene, MOTION, patch=6, patch_share=share)
     low = source.cut(source.example()).view.low
     assert (low.width, low.height) == (side, side)
 
 
-def test_patches_of_pictures_of_several_sizes_have_one_side(ball_scene: Scene) -> None:
+def test_patches_of_pictures_of_several_sizes_have_one_side(ball_scene):
     """The share of the shortest side of all: half of 24 pixels is 3 low-resolution pixels."""
     split = ball_scene.splits["train"]
     narrow = crop_camera(split.cameras[0], 4, 0, SIZE - 8, SIZE)
@@ -172,7 +168,7 @@ def test_patches_of_pictures_of_several_sizes_have_one_side(ball_scene: Scene) -
     assert {cut.truth.shape for cut in cuts} == {(12, 12, 3)}
 
 
-def test_a_patch_lies_anywhere(ball_scene: Scene) -> None:
+def test_a_patch_lies_anywhere(ball_scene):
     """Of a side of 2: the corner of a picture shows background alone."""
     source = new_patches(ball_scene, MOTION, patch=2)
     cuts = [source.cut(source.example()) for _ in range(200)]
@@ -181,7 +177,7 @@ def test_a_patch_lies_anywhere(ball_scene: Scene) -> None:
     assert any((patch.truth == 1).all() for patch in cuts)
 
 
-def test_rays_of_patches_are_jittered_if_they_are_to(ball_scene: Scene) -> None:
+def test_rays_of_patches_are_jittered_if_they_are_to(ball_scene):
     """The same patch twice: other samples, and so other opacities, only with jitter."""
     for jitter in (False, True):
         source = new_patches(ball_scene, MOTION, patch=4, jitter=jitter)
@@ -190,7 +186,7 @@ def test_rays_of_patches_are_jittered_if_they_are_to(ball_scene: Scene) -> None:
         assert torch.equal(one, other) == (not jitter)
 
 
-def test_a_patch_shows_what_the_picture_shows_there(ball_scene: Scene) -> None:
+def test_a_patch_shows_what_the_picture_shows_there(ball_scene):
     """The true colour of a pixel of the ball is its normal: also that of the patch's own camera."""
     source = new_patches(ball_scene, MOTION, patch=4)
     patch = source.cut(source.example())
@@ -201,7 +197,7 @@ def test_a_patch_shows_what_the_picture_shows_there(ball_scene: Scene) -> None:
     assert (patch.truth - expected).abs().max() <= 1 / 255  # the colour of a ray, rounded twice
 
 
-def test_beyond_the_border_of_a_picture_its_last_row_and_column_go_on(ball_scene: Scene) -> None:
+def test_beyond_the_border_of_a_picture_its_last_row_and_column_go_on(ball_scene):
     """Of a picture of 18 x 19 pixels, cut through the ball, the last cells are not all there."""
     split = ball_scene.splits["train"]
     cameras = [replace(camera, width=18, height=19) for camera in split.cameras]

@@ -1,7 +1,5 @@
 """A frame of the pipeline: views, cold start, what follows what, what is chosen afterwards."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Literal
 
@@ -23,9 +21,7 @@ CAMERA = look_at_the_middle(0.1, 0.3)
 
 
 @pytest.mark.parametrize("size", [(32, 32), (33, 30)])
-def test_a_ray_of_the_low_resolution_goes_through_the_middle_of_its_cell(
-    size: tuple[int, int],
-) -> None:
+def test_a_ray_of_the_low_resolution_goes_through_the_middle_of_its_cell(size):
     view = new_pipeline().view(replace(CAMERA, width=size[0], height=size[1]))
     assert (view.full.width, view.full.height) == (4 * view.low.width, 4 * view.low.height)
     rays = cast(view.low)
@@ -34,7 +30,7 @@ def test_a_ray_of_the_low_resolution_goes_through_the_middle_of_its_cell(
     assert torch.allclose(pixels[1] - pixels[0], torch.tensor((4.0, 0.0)), atol=1e-4)
 
 
-def test_a_part_of_a_view_looks_as_the_view_does() -> None:
+def test_a_part_of_a_view_looks_as_the_view_does():
     view = new_pipeline().view(CAMERA)
     part = view.crop((slice(3, 7), slice(2, 6)))
     for whole, some, scale in ((view.low, part.low, 1), (view.full, part.full, 4)):
@@ -46,9 +42,7 @@ def test_a_part_of_a_view_looks_as_the_view_does() -> None:
 
 @pytest.mark.parametrize("frames", [0, 1, 3])
 @pytest.mark.parametrize("size", [(32, 32), (33, 30), (5, 3)])
-def test_frames_have_the_size_of_the_camera_whatever_is_remembered(
-    frames: int, size: tuple[int, int]
-) -> None:
+def test_frames_have_the_size_of_the_camera_whatever_is_remembered(frames, size):
     pipeline = new_pipeline(small_model(frames=frames))
     camera = replace(CAMERA, width=size[0], height=size[1])
     buffer = Buffer(maxlen=frames)
@@ -60,7 +54,7 @@ def test_frames_have_the_size_of_the_camera_whatever_is_remembered(
         assert frame.rgb.isfinite().all()
 
 
-def test_what_is_remembered_without_drawing_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_remembered_without_drawing_is_the_same(monkeypatch):
     pipeline, drawn = new_pipeline(), []
     rendered, remembered = Buffer(maxlen=2), Buffer(maxlen=2)
     pipeline.render(CAMERA, rendered, USUAL, NullProbe())
@@ -71,7 +65,7 @@ def test_what_is_remembered_without_drawing_is_the_same(monkeypatch: pytest.Monk
         assert torch.equal(getattr(rendered[0], name), getattr(remembered[0], name))
 
 
-def test_after_a_reset_a_sequence_repeats_bit_for_bit() -> None:
+def test_after_a_reset_a_sequence_repeats_bit_for_bit():
     """And until then the newest frames are remembered, newest first."""
     pipeline, buffer = new_pipeline(), Buffer(maxlen=2)
     cameras = [look_at_the_middle(0.1 + 0.003 * i, 0.3) for i in range(4)]
@@ -83,7 +77,7 @@ def test_after_a_reset_a_sequence_repeats_bit_for_bit() -> None:
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
 
 
-def test_range_reduction_reprojects_the_depth_that_it_is_told_to() -> None:
+def test_range_reduction_reprojects_the_depth_that_it_is_told_to():
     """Expected depths are those of a cloud that has them instead."""
     pipeline, buffer, probe = new_pipeline(), Buffer(maxlen=2), NullProbe()
     pipeline.render(CAMERA, buffer, USUAL, probe)
@@ -101,14 +95,14 @@ def test_range_reduction_reprojects_the_depth_that_it_is_told_to() -> None:
 @pytest.mark.parametrize(
     ("name", "least", "most"), [("channels", 3, 256), ("frames", 0, 64), ("scale", 1, 64)]
 )
-def test_sizes_that_make_no_frame_are_refused(name: str, least: int, most: int) -> None:
+def test_sizes_that_make_no_frame_are_refused(name, least, most):
     for wrong in (least - 1, most + 1):
         with pytest.raises(ValueError, match=f"{name}: expected {least} to {most}, got {wrong}"):
             small_model(**{name: wrong})
 
 
 @pytest.mark.parametrize("make", [small_model, small_rendering])
-def test_a_step_has_a_length_and_a_stop_lets_something_through(make) -> None:
+def test_a_step_has_a_length_and_a_stop_lets_something_through(make):
     with pytest.raises(ValueError, match=r"^step: expected a length of more than 0, got 0\.0"):
         make(step=0.0)
     with pytest.raises(ValueError, match=r"stop: expected a transmittance .* got 1\.0"):
@@ -122,7 +116,7 @@ def samples(**others) -> int:
     return probe.done["samples"]
 
 
-def test_what_is_not_skipped_is_more_work_and_longer_steps_and_earlier_stops_are_less() -> None:
+def test_what_is_not_skipped_is_more_work_and_longer_steps_and_earlier_stops_are_less():
     usual, some = samples(), samples(stop=0.5)
     assert samples(step=16.0) < 0.7 * usual
     assert 0 < some < usual
@@ -140,13 +134,13 @@ def test_what_is_not_skipped_is_more_work_and_longer_steps_and_earlier_stops_are
         ((0, 0), (0, 0), (slice(0, 24), slice(0, 24))),  # a view of nothing has one, too
     ],
 )
-def test_the_part_that_is_drawn_surrounds_matter(rows, columns, part) -> None:
+def test_the_part_that_is_drawn_surrounds_matter(rows, columns, part):
     seen = torch.zeros(90, 100, dtype=torch.bool)
     seen[slice(*rows), slice(*columns)] = True
     assert near_matter(seen) == part
 
 
-def test_far_from_matter_a_picture_is_background_and_near_it_that_of_the_whole() -> None:
+def test_far_from_matter_a_picture_is_background_and_near_it_that_of_the_whole():
     """At the border of its part the network sees less than in the whole picture; what it draws of
     a pixel depends on no other farther away than 52: 2 + 3 convolutions at full size, 2 + 4 at
     half and 8 at a quarter of it, and what is pooled."""

@@ -1,16 +1,13 @@
 """Stage 2: the gradient of the whole chain, what is trained, killed trainings, the guard."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
-from bench.types import Log, Scene, Split, SteerbenchError
+from bench.types import Scene, Split, SteerbenchError
 from methods.instant_ngp.field import HashField
 from methods.steernerf.options import JointOptions
 from methods.steernerf.patches import Patches
@@ -18,13 +15,7 @@ from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.stage2 import JointTraining
 from methods.steernerf.unet import UNet
 from methods.training import loop
-from tests.methods.models import (
-    misty_field,
-    small_joint,
-    small_model,
-    small_motion,
-    trained_field,
-)
+from tests.methods.models import misty_field, small_joint, small_model, small_motion, trained_field
 from tests.methods.trainings import goes_on_after_a_kill
 
 MOTION = small_motion(pool=3, uses=4)
@@ -48,9 +39,7 @@ def new_training(
     return JointTraining(renderer, patches, steps, trained if patches.learning else None)
 
 
-def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
-    ball_scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(ball_scene, monkeypatch):
     """In float64, along a random direction of all parameters, against a central difference.
 
     Table, networks and renderer are differentiated through compositing, the splatted features of
@@ -96,9 +85,7 @@ def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
 
 
 @pytest.mark.parametrize("field", ["joint", "frozen"])
-def test_the_renderer_learns_and_the_field_unless_it_is_frozen(
-    ball_scene: Scene, field: str
-) -> None:
+def test_the_renderer_learns_and_the_field_unless_it_is_frozen(ball_scene, field):
     learned = misty_field()
     training = new_training(ball_scene, replace(OPTIONS, field=field), learned)
     parts = dict(training.renderer.state_dict(prefix="renderer."))
@@ -114,7 +101,7 @@ def test_the_renderer_learns_and_the_field_unless_it_is_frozen(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("frames", [0, 2])
-def test_the_error_falls(ball_scene: Scene, frames: int) -> None:
+def test_the_error_falls(ball_scene, frames):
     """On patches that are kept: one patch is much harder than another."""
     options = replace(OPTIONS, rate=3e-3, field_rate=1e-2)
     training = new_training(ball_scene, options, frames=frames, steps=120)
@@ -131,7 +118,7 @@ def test_the_error_falls(ball_scene: Scene, frames: int) -> None:
     assert error() < 0.8 * before
 
 
-def test_both_learning_rates_of_the_release_fall_twice_to_the_same(ball_scene: Scene) -> None:
+def test_both_learning_rates_of_the_release_fall_twice_to_the_same(ball_scene):
     """From 3e-3 and 1e-4 to 5e-5, back, and to 5e-5 again: each in a third of the steps."""
     options = replace(OPTIONS, rate=1e-4, field_rate=3e-3, final_rate=5e-5, half_waves=3)
     training = new_training(ball_scene, options, steps=30)
@@ -150,7 +137,7 @@ def test_both_learning_rates_of_the_release_fall_twice_to_the_same(ball_scene: S
         replace(OPTIONS.motion, degrees=(2.0,))
 
 
-def test_the_density_grid_follows_the_field_if_it_is_to(ball_scene: Scene) -> None:
+def test_the_density_grid_follows_the_field_if_it_is_to(ball_scene):
     """The field of the test is dense everywhere, the grid knows of a shell alone: half of the
     visits are to any cell."""
     for visits in (0, 512):
@@ -167,7 +154,7 @@ def test_the_density_grid_follows_the_field_if_it_is_to(ball_scene: Scene) -> No
         )
 
 
-def test_weights_on_the_way_are_kept(ball_scene: Scene, tmp_path: Path, quiet_log: Log) -> None:
+def test_weights_on_the_way_are_kept(ball_scene, tmp_path, quiet_log):
     """And put back by `load`, with the seconds that they took."""
     training, marks = new_training(ball_scene, steps=4), {tmp_path / "half.safetensors": 2}
     loop.train(training, tmp_path / "whole.safetensors", "training", quiet_log, marks)
@@ -182,16 +169,14 @@ def test_weights_on_the_way_are_kept(ball_scene: Scene, tmp_path: Path, quiet_lo
 
 
 @pytest.mark.parametrize("optimiser", ["muon", "adam"])
-def test_a_killed_training_ends_as_if_it_had_never_stopped(
-    ball_scene: Scene, tmp_path: Path, optimiser: str
-) -> None:
+def test_a_killed_training_ends_as_if_it_had_never_stopped(ball_scene, tmp_path, optimiser):
     """The examples go on, too. Kernels of the U-Net are channels last, and files keep no order;
     optimisers read both as they lie."""
     options = replace(OPTIONS, optimiser=optimiser, motion=small_motion(pool=2, uses=3))
     goes_on_after_a_kill(lambda: new_training(ball_scene, options, steps=8), 5, tmp_path)
 
 
-def test_a_loss_that_is_no_number_stops_and_names_what_is_not_finite(ball_scene: Scene) -> None:
+def test_a_loss_that_is_no_number_stops_and_names_what_is_not_finite(ball_scene):
     training = new_training(ball_scene)
     with torch.no_grad():
         training.renderer.network.last.bias[0] = torch.nan

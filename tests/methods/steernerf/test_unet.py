@@ -1,7 +1,5 @@
 """The U-Net of the released code: its size, its base, what it is shown."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +30,7 @@ def hashed(count: int, number: int) -> Tensor:
 
 
 @pytest.mark.parametrize("frames", [0, 2])
-def test_it_computes_what_the_released_network_computes(frames: int) -> None:
+def test_it_computes_what_the_released_network_computes(frames):
     network = unet(6, frames, 4).network
     convolutions = [layer for layer in network.modules() if isinstance(layer, nn.Conv2d)]
     with torch.no_grad():
@@ -49,7 +47,7 @@ def test_it_computes_what_the_released_network_computes(frames: int) -> None:
     torch.testing.assert_close(output[0], wanted, rtol=0, atol=tolerance)
 
 
-def test_its_first_weights_are_drawn_as_those_of_the_release() -> None:
+def test_its_first_weights_are_drawn_as_those_of_the_release():
     """Residual blocks: Kaiming times 0.1; before a pixel shuffle: Kaiming; others as torch does."""
     network = unet(6, 2, 4).network
     layers = {n: x for n, x in network.named_modules() if isinstance(x, nn.Conv2d)}
@@ -63,7 +61,7 @@ def test_its_first_weights_are_drawn_as_those_of_the_release() -> None:
 
 
 @pytest.mark.parametrize(("frames", "count"), [(0, 2_108_675), (1, 2_112_131), (2, 2_115_587)])
-def test_it_has_the_number_of_parameters_of_the_release(frames: int, count: int) -> None:
+def test_it_has_the_number_of_parameters_of_the_release(frames, count):
     renderer = unet(6, frames, 4)
     assert sum(parameter.numel() for parameter in renderer.parameters()) == count
 
@@ -72,9 +70,7 @@ def test_it_has_the_number_of_parameters_of_the_release(frames: int, count: int)
     ("channels", "frames", "scale", "height", "width"),
     [(6, 2, 4, 5, 7), (3, 0, 4, 3, 4), (8, 1, 3, 5, 3), (6, 3, 2, 3, 5), (4, 1, 1, 9, 6)],
 )
-def test_any_features_frames_and_sizes_are_taken(
-    channels: int, frames: int, scale: int, height: int, width: int
-) -> None:
+def test_any_features_frames_and_sizes_are_taken(channels, frames, scale, height, width):
     """Sides of the picture that are no multiple of 4 as well: of 15 x 9, 6 x 10 and 9 x 6."""
     renderer = unet(channels, frames, scale)
     observations = [
@@ -88,7 +84,7 @@ def test_any_features_frames_and_sizes_are_taken(
 
 
 @pytest.mark.parametrize(("height", "width", "channels"), [(8, 12, 64), (4, 8, 16)])
-def test_its_products_are_those_that_torch_counts(height: int, width: int, channels: int) -> None:
+def test_its_products_are_those_that_torch_counts(height, width, channels):
     network = unet(6, 2, 4, channels).network
     inputs = torch.zeros(2, 18, height, width)
     with FlopCounterMode(display=False) as counter:
@@ -96,14 +92,14 @@ def test_its_products_are_those_that_torch_counts(height: int, width: int, chann
     assert 2 * network.products(inputs) == counter.get_total_flops()
 
 
-def test_a_batch_of_two_is_one_after_the_other() -> None:
+def test_a_batch_of_two_is_one_after_the_other():
     renderer = shaken(unet(6, 1, 4)).double()
     observations = [doubled(observe(frames=1, seed=seed)) for seed in range(2)]
     alone = torch.cat([renderer([observation]) for observation in observations])
     torch.testing.assert_close(renderer(observations), alone, rtol=0, atol=ROUNDING)
 
 
-def test_the_base_puts_the_corners_on_corners() -> None:
+def test_the_base_puts_the_corners_on_corners():
     """Without an output of the network, the picture is the base."""
     height, width, scale = 4, 6, 4
     observation = observe(height, width, frames=0)
@@ -121,9 +117,7 @@ def test_the_base_puts_the_corners_on_corners() -> None:
 
 
 @pytest.mark.parametrize("frames", [2, 3])
-def test_a_pixel_has_the_features_of_its_points_and_every_fourth_the_present_ones(
-    frames: int,
-) -> None:
+def test_a_pixel_has_the_features_of_its_points_and_every_fourth_the_present_ones(frames):
     """Frame by frame, in Python; with L = 3 one frame is missing."""
     height, width, scale, features = 2, 3, 4, 5
     shown = observe(height, width, channels=features, frames=2, scale=scale)
@@ -144,7 +138,7 @@ def test_a_pixel_has_the_features_of_its_points_and_every_fourth_the_present_one
             assert torch.equal(got[row, column], want)
 
 
-def test_features_of_16_bits_are_rounded_before_the_network_is_shown_them() -> None:
+def test_features_of_16_bits_are_rounded_before_the_network_is_shown_them():
     seen, renderer = [], unet(6, 2, 4)
     for dtype in (torch.float32, torch.bfloat16):
         renderer.engine = Built(lambda x: seen.append(x) or (x[:, :3],), 0, dtype)
@@ -153,7 +147,7 @@ def test_features_of_16_bits_are_rounded_before_the_network_is_shown_them() -> N
     assert torch.equal(seen[1], seen[0].bfloat16())
 
 
-def test_only_the_part_without_its_border_is_corrected() -> None:
+def test_only_the_part_without_its_border_is_corrected():
     """Where the part ends with the picture, there is no border."""
     renderer, shown = unet(6, 0, 4), observe(12, 20, frames=0)
     renderer.engine = Built(lambda x: (torch.full_like(x[:, :3], 0.25),), 0)

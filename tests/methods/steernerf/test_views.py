@@ -1,7 +1,5 @@
 """TrainingViews that engines are built and compared on."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -18,9 +16,7 @@ def views_of(scene: Scene, log: Log, seed: int = 0) -> TrainingViews:
 
 
 @torch.no_grad()
-def test_engines_are_compared_in_the_same_frames_with_the_true_pictures(
-    ball_scene: Scene, quiet_log: Log
-) -> None:
+def test_engines_are_compared_in_the_same_frames_with_the_true_pictures(ball_scene, quiet_log):
     """A network that adds 1 to everything draws white pictures."""
     views, given = views_of(ball_scene, quiet_log), []
     network = views.pipeline.renderer.network
@@ -43,9 +39,7 @@ def test_engines_are_compared_in_the_same_frames_with_the_true_pictures(
     assert len(frames) == 2 * COMPARED
 
 
-def test_what_a_network_is_built_on_is_what_it_is_shown_whatever_ran_before(
-    ball_scene: Scene, quiet_log: Log
-) -> None:
+def test_what_a_network_is_built_on_is_what_it_is_shown_whatever_ran_before(ball_scene, quiet_log):
     views = views_of(ball_scene, quiet_log)
     first = views.inputs(2)
     views.pipeline.renderer.engine = Built(lambda *inputs: pytest.fail("asked"), 0)
@@ -54,8 +48,8 @@ def test_what_a_network_is_built_on_is_what_it_is_shown_whatever_ran_before(
 
 
 def test_a_frame_is_recorded_as_in_training_behind_as_many_as_the_buffer_holds_and_one_more(
-    ball_scene: Scene, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    ball_scene, quiet_log, monkeypatch
+):
     rendered, features = [], Pipeline.features
 
     def counted(self, view, preceding, rendering, probe):

@@ -1,11 +1,9 @@
 """Sparse voxels: shared corners, eighths that fill a voxel, grids of another resolution."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
-from bench.types import Rays, Scene
+from bench.types import Rays
 from methods.instant_ngp.pixels import PixelBatches
 from methods.kernels.types import Occupancy
 from methods.kernels.voxel_walk import Crossings, Voxels
@@ -17,7 +15,7 @@ def scattered(share: float, size: int = 16) -> Occupancy:
     return Occupancy(torch.rand(size, size, size, generator=generator) < share)
 
 
-def test_corners_are_where_they_belong_and_none_is_there_twice() -> None:
+def test_corners_are_where_they_belong_and_none_is_there_twice():
     voxels = scattered(0.1).cells.nonzero()
     corners, vertices = corners_of(voxels)
     want = voxels[:, None] + torch.tensor(OFFSETS)
@@ -28,7 +26,7 @@ def test_corners_are_where_they_belong_and_none_is_there_twice() -> None:
 
 
 @pytest.mark.parametrize("resolution", [1, 5, 8, 16, 24, 32, 37])
-def test_voxels_are_those_that_reach_into_occupied_cells(resolution: int) -> None:
+def test_voxels_are_those_that_reach_into_occupied_cells(resolution):
     occupancy = scattered(0.02)
     voxels = occupied_voxels(occupancy, resolution)
     size = occupancy.resolution
@@ -41,9 +39,7 @@ def test_voxels_are_those_that_reach_into_occupied_cells(resolution: int) -> Non
     assert torch.equal(voxels.long(), want)
 
 
-def test_the_largest_weight_of_a_voxel_is_that_over_all_rays(
-    ball_scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_largest_weight_of_a_voxel_is_that_over_all_rays(ball_scene, monkeypatch):
     """Traced in three chunks, of which the second has the largest weights."""
     monkeypatch.setattr("methods.students.voxels.CHUNK_RAYS", 10)
     batches = PixelBatches(ball_scene.splits["train"], torch.device("cpu"))

@@ -1,7 +1,5 @@
 """Pieces of buildings are where their corners and ends say."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -27,14 +25,14 @@ def local(part: Part, point: Triple) -> Triple:
     return (x, y, z)
 
 
-def test_a_block_lies_between_its_corners() -> None:
+def test_a_block_lies_between_its_corners():
     part = block((-1.0, 0.2, 0.0), (0.5, 0.3, 2.0), GREY)
     corners = box_corners(part.shape.extent()) + torch.tensor(part.centre)
     assert corners.amin(0).tolist() == pytest.approx([-1.0, 0.2, 0.0])
     assert corners.amax(0).tolist() == pytest.approx([0.5, 0.3, 2.0])
 
 
-def test_a_rod_ends_at_its_ends() -> None:
+def test_a_rod_ends_at_its_ends():
     start, end = (0.1, -0.2, 0.3), (0.7, 0.5, -0.4)
     part = rod(start, end, 0.01, GREY)
     half = part.shape.extent()[2]
@@ -43,7 +41,7 @@ def test_a_rod_ends_at_its_ends() -> None:
 
 
 @pytest.mark.parametrize("end", [(0.8, 0.1, 0.2), (0.1, 0.9, 0.2), (0.5, 0.1, 0.5)])
-def test_a_rail_stands_on_its_line(end) -> None:
+def test_a_rail_stands_on_its_line(end):
     start = (0.1, 0.1, 0.2)
     part = rail(start, end, 0.1, GREY)
     along, _, high = part.shape.extent()
@@ -58,7 +56,7 @@ def test_a_rail_stands_on_its_line(end) -> None:
 @pytest.mark.parametrize(
     ("turn", "falls"), [(0, (0, -1)), (180, (0, 1)), (90, (1, 0)), (-90, (-1, 0))]
 )
-def test_a_slope_falls_from_its_ridge(turn, falls) -> None:
+def test_a_slope_falls_from_its_ridge(turn, falls):
     ridge, run, pitch = (0.2, 0.1, 0.9), 0.5, 30.0
     cover, rafters = slope(ridge, 0.4, run, pitch, turn, GREY, GREY)
     _, half, thick = cover.shape.extent()

@@ -1,7 +1,5 @@
 """Textures of buildings: shares of joints, tones of pieces, patterns that go on."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -28,7 +26,7 @@ def scattered(count: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("name", TEXTURES)
-def test_a_texture_is_coloured_and_varies_from_place_to_place(name) -> None:
+def test_a_texture_is_coloured_and_varies_from_place_to_place(name):
     points = scattered(4000)
     colours = TEXTURES[name](points)
     assert colours.shape == (4000, 3)
@@ -40,14 +38,14 @@ def test_a_texture_is_coloured_and_varies_from_place_to_place(name) -> None:
     assert ((near - colours).abs().amax(1) < 0.02).float().mean() > 0.98
 
 
-def test_joints_have_their_share_of_a_wall() -> None:
+def test_joints_have_their_share_of_a_wall():
     x, y, z = scattered(200_000).unbind(1)
     _, _, inside = cells(x + y, z, 0.034, 0.012)
     share = (inside < 0.0015).float().mean().item()
     assert share == pytest.approx(1 - (1 - 0.003 / 0.034) * (1 - 0.003 / 0.012), abs=0.005)
 
 
-def test_pieces_are_laid_half_a_piece_on_in_every_other_row() -> None:
+def test_pieces_are_laid_half_a_piece_on_in_every_other_row():
     u = torch.linspace(0.01, 3.99, 400)
     row, column, _ = cells(u, torch.full_like(u, 0.5), 1.0, 1.0)
     above, shifted, _ = cells(u - 0.5, torch.full_like(u, 1.5), 1.0, 1.0)
@@ -56,7 +54,7 @@ def test_pieces_are_laid_half_a_piece_on_in_every_other_row() -> None:
     assert {*above.tolist()} == {1.0}
 
 
-def test_tones_are_evenly_spread_and_come_again_only_after_1024_pieces() -> None:
+def test_tones_are_evenly_spread_and_come_again_only_after_1024_pieces():
     row, column = torch.cartesian_prod(*(torch.arange(-64.0, 64),) * 2).unbind(1)
     tones = tone(row, column)
     assert tones.mean().item() == pytest.approx(0.5, abs=0.02)
@@ -67,7 +65,7 @@ def test_tones_are_evenly_spread_and_come_again_only_after_1024_pieces() -> None
         assert (tones == tone(row + away, column)).float().mean() < 0.1
 
 
-def test_a_pattern_goes_on_from_part_to_part() -> None:
+def test_a_pattern_goes_on_from_part_to_part():
     wall = block((0.0, 0.0, 0.0), (1.0, 0.2, 0.5), TEXTURES["bricks"])
     more = block((0.6, 0.0, 0.3), (2.0, 0.2, 0.9), TEXTURES["bricks"])
     shared = torch.rand(500, 3) * torch.tensor((0.4, 0.0, 0.2)) + torch.tensor((0.6, 0.0, 0.3))

@@ -1,7 +1,5 @@
 """The mill: a building with thin parts that is as hard to enlarge as one."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -16,7 +14,7 @@ from bench.types import Camera
 WIDTH, HEIGHT = 1920, 1080
 
 
-def test_only_the_foot_of_the_mill_is_cut_in_training_pictures() -> None:
+def test_only_the_foot_of_the_mill_is_cut_in_training_pictures():
     model, focal = mill(), 16 / math.tan(ANGLE_X / 2)
     for pose in train_poses(6, 1, VIEWS["mill"]):
         camera = Camera(pose.float(), focal, focal, 16, 9, 32, 18)
@@ -25,7 +23,7 @@ def test_only_the_foot_of_the_mill_is_cut_in_training_pictures() -> None:
         assert alpha.mean() > 0.3
 
 
-def test_thin_parts_are_seen_by_a_field_of_1024_cells_but_only_just() -> None:
+def test_thin_parts_are_seen_by_a_field_of_1024_cells_but_only_just():
     whole = mill().boxes().reshape(-1, 3)
     size = (whole.amax(0) - whole.amin(0)).max().item()
     thickness = [2 * min(part.shape.extent()) for part in mill().parts]
@@ -34,7 +32,7 @@ def test_thin_parts_are_seen_by_a_field_of_1024_cells_but_only_just() -> None:
 
 
 @pytest.mark.parametrize("place", [(700, 330), (1000, 520), (800, 700)], ids=str)
-def test_the_mill_is_as_hard_to_enlarge_as_photographs(place) -> None:
+def test_the_mill_is_as_hard_to_enlarge_as_photographs(place):
     pose = orbit_poses(24, VIEWS["mill"])[12]
     focal = WIDTH / 2 / math.tan(ANGLE_X / 2)
     x, y = WIDTH / 2 - place[0], HEIGHT / 2 - place[1]

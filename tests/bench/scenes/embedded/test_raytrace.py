@@ -1,7 +1,5 @@
 """Exact pictures: closed forms of spheres and media, culling that changes nothing, shadows."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -32,7 +30,7 @@ def sphere(radius: float, centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) 
     return Part(Ellipsoid((radius, radius, radius)), RED, centre)
 
 
-def test_16_samples_stand_for_the_16_quarter_pixel_cells() -> None:
+def test_16_samples_stand_for_the_16_quarter_pixel_cells():
     offsets = sample_offsets(16)
     cells = (offsets * 4).floor().tolist()
     assert sorted(cells) == [[a, b] for a in range(4) for b in range(4)]
@@ -44,7 +42,7 @@ def test_16_samples_stand_for_the_16_quarter_pixel_cells() -> None:
             sample_offsets(samples)
 
 
-def test_depth_of_a_sphere_is_the_closed_form(device) -> None:
+def test_depth_of_a_sphere_is_the_closed_form(device):
     camera = camera_at((3.0, 1.0, 2.0), device=device)
     frame = render(Solids([sphere(0.7)]), camera, torch.ones(3), samples=1)
     rays = cast(camera)
@@ -60,7 +58,7 @@ def test_depth_of_a_sphere_is_the_closed_form(device) -> None:
     assert torch.equal(frame.alpha.flatten()[certain] > 0, (root > 0)[certain])
 
 
-def test_silhouettes_of_a_sphere_and_a_thin_wire_have_their_closed_form_areas() -> None:
+def test_silhouettes_of_a_sphere_and_a_thin_wire_have_their_closed_form_areas():
     camera = camera_at((0.0, -4.0, 0.0))
     alpha = render(Solids([sphere(0.8)]), camera, torch.ones(3), samples=16).alpha
     radius = camera.fx * math.tan(math.asin(0.8 / 4))
@@ -82,7 +80,7 @@ def test_silhouettes_of_a_sphere_and_a_thin_wire_have_their_closed_form_areas() 
         Media([Ball((0.0, -6.0, 0.0), 0.5, 9.0, (1.0, 1.0, 1.0))]),
     ],
 )
-def test_nothing_seen_is_the_background_at_infinity(model) -> None:
+def test_nothing_seen_is_the_background_at_infinity(model):
     background = torch.tensor((0.2, 0.4, 0.6))
     frame = render(model, camera_at((0.0, -4.0, 0.0), 8), background, 4)
     assert (frame.rgb == background).all()
@@ -90,7 +88,7 @@ def test_nothing_seen_is_the_background_at_infinity(model) -> None:
     assert (frame.alpha == 0).all()
 
 
-def test_depth_is_finite_exactly_where_there_is_opacity() -> None:
+def test_depth_is_finite_exactly_where_there_is_opacity():
     frame = render(totem(), camera_at((1.0, -3.5, 1.5), size=64), torch.ones(3), 16)
     assert torch.equal(frame.depth.isfinite(), frame.alpha >= EMPTY_ALPHA)
     assert ((frame.rgb >= 0) & (frame.rgb <= 1 + 1e-6)).all()
@@ -98,7 +96,7 @@ def test_depth_is_finite_exactly_where_there_is_opacity() -> None:
 
 @pytest.mark.parametrize("model", [totem, wires, mill])
 @pytest.mark.parametrize("eye", [(1.0, -3.5, 1.5), (0.3, 0.2, 0.3), (0.0, 0.1, 4.0)])
-def test_culling_by_boxes_changes_nothing(monkeypatch, model, eye) -> None:
+def test_culling_by_boxes_changes_nothing(monkeypatch, model, eye):
     camera = camera_at(eye, size=24)
     monkeypatch.setattr(raytrace, "BAND_RAYS", 24 * 4 * 5)  # bands of five rows, the last of four
     culled = render(model(), camera, torch.ones(3), 4)
@@ -115,7 +113,7 @@ def test_culling_by_boxes_changes_nothing(monkeypatch, model, eye) -> None:
 
 
 @pytest.mark.parametrize("model", [totem, wires, mill])
-def test_the_nearest_of_all_parts_is_seen(model) -> None:
+def test_the_nearest_of_all_parts_is_seen(model):
     solids, camera = model(), camera_at((1.0, -3.5, 1.5), size=40)
     depth = render(solids, camera, torch.ones(3), samples=1).depth.flatten()
     rays = cast(camera)
@@ -131,7 +129,7 @@ def test_the_nearest_of_all_parts_is_seen(model) -> None:
     assert nearest.isfinite().any()
 
 
-def test_shadow_of_a_sphere_is_the_closed_form() -> None:
+def test_shadow_of_a_sphere_is_the_closed_form():
     caster, ground = sphere(0.3, (0.2, -0.1, 0.8)), sphere(0.01, (0.0, 0.0, -0.5))
     model = Solids([ground, caster])
     generator = torch.Generator().manual_seed(0)
@@ -151,7 +149,7 @@ def test_shadow_of_a_sphere_is_the_closed_form() -> None:
 
 
 @pytest.mark.parametrize("model", [totem, wires, mill])
-def test_culling_of_shadow_casters_changes_nothing(model) -> None:
+def test_culling_of_shadow_casters_changes_nothing(model):
     solids = model()
     points = 2.4 * torch.rand(6000, 3, generator=torch.Generator().manual_seed(3)) - 1.2
     owners = torch.full((6000,), -1, dtype=torch.int16)  # of no part
@@ -165,7 +163,7 @@ def test_culling_of_shadow_casters_changes_nothing(model) -> None:
     assert 100 < dark.sum() < 5900
 
 
-def test_highlights_move_with_the_viewer() -> None:
+def test_highlights_move_with_the_viewer():
     glossy = Solids([Part(Ellipsoid((0.7, 0.7, 0.7)), RED, gloss=0.9)])
     top = Solids([sphere(0.7)])
     places = []
@@ -183,7 +181,7 @@ BLACK = torch.zeros(3)
 
 
 @pytest.mark.parametrize("density", [0.01, 1.0, 30.0])
-def test_one_ball_through_its_middle(device, density) -> None:
+def test_one_ball_through_its_middle(device, density):
     model = Media([Ball((0.0, 0.0, 0.0), 0.5, density, (0.8, 0.4, 0.2))])
     frame = render(model, camera_at((0.0, -4.0, 0.0), 1, device), BLACK, samples=1)
     alpha = 1 - math.exp(-density)
@@ -216,7 +214,7 @@ def quadrature(model: Media, camera: Camera, steps: int) -> tuple[torch.Tensor, 
 
 
 @pytest.mark.parametrize("eye", [(0.5, -3.0, 1.0), (0.1, 0.0, -0.4)], ids=["outside", "inside"])
-def test_overlapping_balls_against_quadrature(eye) -> None:
+def test_overlapping_balls_against_quadrature(eye):
     camera = camera_at(eye, 12)
     frame = render(cloud(), camera, BLACK, samples=1)
     rgb, alpha, depth = quadrature(cloud(), camera, steps=6000)

@@ -1,7 +1,5 @@
 """Tiles: no point that a box may keep from the light is left out."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -9,7 +7,7 @@ from bench.scenes.embedded.shadows import TILES, Tiles
 
 
 @pytest.mark.parametrize("count", [1, 5, 3000])
-def test_the_points_under_a_box_are_in_its_runs(count) -> None:
+def test_the_points_under_a_box_are_in_its_runs(count):
     generator = torch.Generator().manual_seed(count)
     points = torch.rand(count, 3, generator=generator)
     tiles = Tiles(points)
@@ -35,7 +33,7 @@ def test_the_points_under_a_box_are_in_its_runs(count) -> None:
     assert left_out > 0 or count == 1
 
 
-def test_points_in_one_place_share_a_tile() -> None:
+def test_points_in_one_place_share_a_tile():
     tiles = Tiles(torch.full((7, 3), 0.25))
     assert tiles.runs(torch.zeros(3), torch.ones(3)) == [slice(0, 7)]
     assert tiles.runs(torch.zeros(3), torch.tensor((1.0, 1.0, 0.2))) == []

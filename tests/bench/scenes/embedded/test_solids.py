@@ -1,7 +1,5 @@
 """Shapes: the hit is the first place where the distance changes sign, the normal its gradient."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -69,7 +67,7 @@ def met(shape: Shape, count: int) -> tuple[torch.Tensor, torch.Tensor]:
     return origins[hit] + found[hit, None] * directions[hit], directions[hit]
 
 
-def test_the_hit_is_the_first_change_of_sign(shape) -> None:
+def test_the_hit_is_the_first_change_of_sign(shape):
     origins, directions = rays(300)
     found = hits(shape, origins, directions)
     assert 20 < found.isfinite().sum() < 290
@@ -83,7 +81,7 @@ def test_the_hit_is_the_first_change_of_sign(shape) -> None:
     assert same.all()
 
 
-def test_the_sign_changes_at_the_hit(shape) -> None:
+def test_the_sign_changes_at_the_hit(shape):
     points, directions = met(shape, 300)
     assert shape.distance(points).abs().max() < 1e-9
     step = 1e-5 * directions / directions.norm(dim=1, keepdim=True)
@@ -94,7 +92,7 @@ def test_the_sign_changes_at_the_hit(shape) -> None:
     assert edges.sum() <= 1
 
 
-def test_normals_are_the_gradient_of_the_distance(shape) -> None:
+def test_normals_are_the_gradient_of_the_distance(shape):
     points, _ = met(shape, 300)
     steps = 1e-6 * torch.eye(3, dtype=torch.float64)
     rise = [shape.distance(points + step) - shape.distance(points - step) for step in steps]
@@ -104,12 +102,12 @@ def test_normals_are_the_gradient_of_the_distance(shape) -> None:
     torch.testing.assert_close(shape.normal(points)[smooth], gradient[smooth], rtol=0, atol=1e-3)
 
 
-def test_the_extent_holds_every_hit(shape) -> None:
+def test_the_extent_holds_every_hit(shape):
     points, _ = met(shape, 2000)
     assert (points.abs() <= torch.tensor(shape.extent(), dtype=torch.float64) + 1e-9).all()
 
 
-def test_a_pierced_box_is_a_box_minus_its_holes() -> None:
+def test_a_pierced_box_is_a_box_minus_its_holes():
     pierced = Pierced((0.9, 0.25, 0.6), (3, 2), (0.22, 0.2))
     middles = [(x, 0.0, z) for x in (-0.6, 0.0, 0.6) for z in (-0.3, 0.3)]
     body = Carved(Cuboid((0.9, 0.25, 0.6)), [Shifted(Cuboid((0.22, 9, 0.2)), x) for x in middles])
@@ -127,13 +125,13 @@ def test_a_pierced_box_is_a_box_minus_its_holes() -> None:
     assert torch.equal(pierced.normal(points), body.normal(points))
 
 
-def test_from_inside_the_solid_a_pierced_box_ends_where_the_box_does() -> None:
+def test_from_inside_the_solid_a_pierced_box_ends_where_the_box_does():
     pierced = Pierced((0.9, 0.25, 0.6), (3, 2), (0.22, 0.2))
     along = tuple(torch.tensor([x]) for x in (0.0, 1.0, 0.0))
     assert pierced.hit((0.3, 0.0, 0.3), along).item() == pytest.approx(0.25)
 
 
-def test_the_end_of_a_gable_has_the_area_of_a_triangle() -> None:
+def test_the_end_of_a_gable_has_the_area_of_a_triangle():
     x, y = torch.meshgrid(*(torch.linspace(-1, 1, 801),) * 2, indexing="ij")
     directions = (torch.full_like(x, 1e-9), torch.zeros_like(x), torch.ones_like(x))
     # From below the foot is a rectangle, and a ray goes up to the slope: h (1 - |y| / w).
@@ -142,7 +140,7 @@ def test_the_end_of_a_gable_has_the_area_of_a_triangle() -> None:
     assert deep.mean().item() * 4 == pytest.approx(0.8 * 0.5 * 0.6, rel=0.01)
 
 
-def test_a_thin_wire_far_away_keeps_its_thickness_in_float32() -> None:
+def test_a_thin_wire_far_away_keeps_its_thickness_in_float32():
     radius, far = 0.006, 5.0
     offset = torch.linspace(-1.5 * radius, 1.5 * radius, 3001)
     directions = (offset / far, torch.ones_like(offset), torch.zeros_like(offset))
@@ -156,7 +154,7 @@ def test_a_thin_wire_far_away_keeps_its_thickness_in_float32() -> None:
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_rays_along_an_axis_meet_box_and_cylinder(axis) -> None:
+def test_rays_along_an_axis_meet_box_and_cylinder(axis):
     directions = [torch.zeros(1), torch.zeros(1), torch.zeros(1)]
     directions[axis] = torch.ones(1)
     origin = [0.1, 0.1, 0.1]

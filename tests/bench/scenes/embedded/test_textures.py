@@ -1,7 +1,5 @@
 """Noise, and the patterns of the stacked solids, where they can be told beforehand."""
 
-from __future__ import annotations
-
 import torch
 
 from bench.scenes.embedded.textures import checker, lattice, noise, pips, polar_checker, spiral
@@ -9,7 +7,7 @@ from bench.scenes.embedded.textures import checker, lattice, noise, pips, polar_
 DARK, LIGHT = (0.1, 0.1, 0.2), (0.7, 0.6, 0.5)
 
 
-def test_noise_is_that_of_its_lattice_continuous_and_has_a_period() -> None:
+def test_noise_is_that_of_its_lattice_continuous_and_has_a_period():
     corners = torch.cartesian_prod(*3 * [torch.arange(4.0)])
     x, y, z = corners.long().unbind(1)
     # The first coordinate of `grid_sample` runs along the last axis.
@@ -21,7 +19,7 @@ def test_noise_is_that_of_its_lattice_continuous_and_has_a_period() -> None:
     assert (noise(points + 1e-2) - noise(points)).abs().max() < 3 * 1.5 * 1e-2 + 1e-3
 
 
-def test_patterns_alternate() -> None:
+def test_patterns_alternate():
     def light(texture, *points: tuple[float, float, float]) -> list[bool]:
         colours = texture(torch.tensor(points))
         return [torch.equal(colour, torch.tensor(LIGHT)) for colour in colours]

@@ -1,7 +1,5 @@
 """Pixels of corner features: counts, chunks, types and shapes; accuracy is in its cases."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -17,7 +15,7 @@ def given() -> tuple:
     return tuple(scene[name] for name in ("rays", "corners", "layers", "towards"))
 
 
-def test_backends_count_the_same_segments() -> None:
+def test_backends_count_the_same_segments():
     """In front of the end of a ray, and of a weight that shows; none lies at a bound by chance."""
     counts = [
         render_segments(*given(), stop=0.5, faint=0.1, backend=backend)[1:]
@@ -33,9 +31,7 @@ def test_backends_count_the_same_segments() -> None:
 
 
 @pytest.mark.parametrize("size", [1, 7, RAYS])
-def test_rays_that_are_rendered_in_chunks_have_the_same_pixels(
-    size: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rays_that_are_rendered_in_chunks_have_the_same_pixels(size, monkeypatch):
     together = render_segments(*given(), stop=1e-2, backend="reference")
     monkeypatch.setattr(reference, "CHUNK_RAYS", size)
     apart = render_segments(*given(), stop=1e-2, backend="reference")
@@ -44,7 +40,7 @@ def test_rays_that_are_rendered_in_chunks_have_the_same_pixels(
     assert torch.equal(apart[1], together[1])
 
 
-def test_a_cpu_refuses_what_it_has_no_code_for() -> None:
+def test_a_cpu_refuses_what_it_has_no_code_for():
     rays, corners, layers, towards = given()
     wide = Rays(rays.origins.double(), rays.directions.double())
     with pytest.raises(ValueError, match="computes with float32"):

@@ -1,7 +1,5 @@
 """SSIM as a loss: that of scikit-image. The backends agree by its cases."""
 
-from __future__ import annotations
-
 import torch
 from skimage.metrics import structural_similarity
 from torch.nn import functional
@@ -17,7 +15,7 @@ def pictures() -> tuple[torch.Tensor, torch.Tensor]:
     return one.contiguous(), other.contiguous()
 
 
-def test_it_is_the_ssim_of_scikit_image() -> None:
+def test_it_is_the_ssim_of_scikit_image():
     one, other = pictures()
     window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     how = window | {"data_range": 1.0, "channel_axis": -1, "full": True}

@@ -1,7 +1,5 @@
 """The splatting against a plain loop over the points."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -38,7 +36,7 @@ def plain_splat(pixels: Tensor, depth: Tensor, width: int, height: int) -> list[
     ("count", "width", "height"),
     [(0, 3, 2), (2000, 1, 1), (2000, 13, 7), (2000, 60, 80), (2000, 4097, 3)],
 )
-def test_the_pixels_of_points_are_the_definition(count: int, width: int, height: int) -> None:
+def test_the_pixels_of_points_are_the_definition(count, width, height):
     pixels, depth = scatter_points(count, width, height)
     found = splat(pixels, depth, width, height)
     assert found.dtype == torch.int64
@@ -46,7 +44,7 @@ def test_the_pixels_of_points_are_the_definition(count: int, width: int, height:
     assert (found < width * height).any() == (count > 0)
 
 
-def test_the_reference_keeps_the_digits_of_float64() -> None:
+def test_the_reference_keeps_the_digits_of_float64():
     pixels, depth = scatter_points(500, 9, 9, torch.float64)
     pixels -= 1e-12  # nothing in float32: over the border of a pixel
     assert splat(pixels, depth, 9, 9).tolist() == plain_splat(pixels, depth, 9, 9)
@@ -57,7 +55,7 @@ WRONG = (math.nan, math.inf, -math.inf, 1e20, -1e20, 2.0**32, -(2.0**31))
 DEPTHS = (*WRONG, 0.0, -0.0, -1.0, 1.0, 1e-20, 1e-42, 3e38)
 
 
-def test_the_border_of_a_pixel_belongs_to_the_next_and_wrong_points_to_none() -> None:
+def test_the_border_of_a_pixel_belongs_to_the_next_and_wrong_points_to_none():
     """A point at a time, at all places and depths; the border of the picture belongs to none."""
     places, depths = torch.tensor((*EDGES, *WRONG)), torch.tensor(DEPTHS)
     for point in torch.cartesian_prod(places, places, torch.ones(1)).split(1):
@@ -68,7 +66,7 @@ def test_the_border_of_a_pixel_belongs_to_the_next_and_wrong_points_to_none() ->
         assert splat(*given).tolist() == plain_splat(*given), depth
 
 
-def test_the_number_of_threads_does_not_change_the_pixels() -> None:
+def test_the_number_of_threads_does_not_change_the_pixels():
     pixels, depth = scatter_points(5000, 50, 3)  # a hundred points a pixel, from all threads
     found = []
     for threads in (1, 2, 4):
@@ -77,7 +75,7 @@ def test_the_number_of_threads_does_not_change_the_pixels() -> None:
     assert all(torch.equal(each, found[0]) for each in found)
 
 
-def test_wrong_arguments_are_named() -> None:
+def test_wrong_arguments_are_named():
     pixels, depth = torch.zeros(3, 2), torch.ones(3)
     with pytest.raises(ValueError, match=r"pixels: expected shape \[3, 2\], got \[3\]"):
         splat(depth, depth, 5, 4)
