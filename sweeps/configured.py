@@ -202,8 +202,14 @@ def check_settings(
         if isinstance(value, dict) and "_target_" in value:
             check_settings(target_of(value), value, f"{prefix}{name}.")
         elif not _fits(value, hints.get(name, Any)):
-            wanted = " or ".join(map(str, _choices(hints[name]))) or parameters[name].annotation
+            wanted = " or ".join(map(str, _choices(hints[name])))
+            wanted = wanted or _as_written(parameters[name].annotation)
             raise unexpected(f"{prefix}{name}", wanted, repr(value))
+
+
+def _as_written(annotation: Any) -> str:
+    """A type as its signature has it."""
+    return annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
 
 
 def _choices(hint: Any) -> tuple[object, ...]:

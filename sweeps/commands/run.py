@@ -37,7 +37,7 @@ class Sweep:
 
 
 _sweep: ContextVar[Sweep] = ContextVar("sweep")
-"""Of the present call of `main`: Hydra makes the object that is told of a sweep by itself."""
+"""The sweep of the present call of `main`. Hydra itself makes the object that learns of a sweep."""
 
 
 class SweepCallback(Callback):

@@ -1,7 +1,5 @@
 """Building from a configuration: settings are checked by name and type before anything runs."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path
