@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from bench.clock import OTHER
-from bench.experiments import observed_order
+from bench.convergence import observed_order
 from reports.figures import frontier_plot
 from reports.images import Part, Picture
 from reports.runs import Run

@@ -6,6 +6,7 @@ All raise SteerbenchError, which names the setting, if one is wrong or cannot be
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, lru_cache
@@ -209,7 +210,9 @@ def check_settings(
 
 def _as_written(annotation: Any) -> str:
     """A type as its signature has it."""
-    return annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
+    if isinstance(annotation, str):
+        return annotation
+    return re.sub(r"[a-z]\w*\.", "", inspect.formatannotation(annotation))  # without modules
 
 
 def _choices(hint: Any) -> tuple[object, ...]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.console import ConsoleLog
-from bench.experiments import experiment_rows
+from bench.convergence import experiment_rows
 from methods import checks
 from reports.tables import Table, decimal
 from sweeps.processes import device_lock

@@ -14,7 +14,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from bench.experiments import Experiment, Trial
+from bench.convergence import Experiment, Trial
 from bench.types import Rays
 from methods.kernels.composite import composite
 from methods.kernels.march import march

@@ -5,6 +5,7 @@ test_gpu.py as a program of its own, in which nothing is interpreted.
 
 import importlib
 import os
+from contextlib import suppress
 from typing import Any
 
 import triton
@@ -77,7 +78,8 @@ os.environ["TRITON_INTERPRET"] = "1"  # so that CPU tensors are taken; too late 
 for case in found("cases"):
     by_gpu = any(backend == "gpu" for backend, _ in case.tolerances)
     if isinstance(case.error, Difference) and by_gpu and not case.timed:
-        case.error.prepare("cpu")("gpu")
+        with suppress(IndexError):  # no kernel has written the indices that torch reads
+            case.error.prepare("cpu")("gpu")
 for given in last.values():
     for target in (AMPERE, ADA):
         compile_for(target, *given)
