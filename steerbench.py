@@ -11,12 +11,14 @@ with a message for the user.
 | name | what it is for |
 |---|---|
 | `run` | measure a method on a scene, or read the result from the store |
+| `sweep` | measure every combination of settings; returns its runs and its table |
+| `load` | a run of the store, by its key |
 | `fit` | train a method, or load it, to render any camera |
 | `load_scene` | cameras, pictures and bounds of a scene |
 | `score` | score pictures of any program against true ones |
 | `results` | the rows of all runs in the store |
 | `methods`, `scenes` | what can be chosen, with a description of each |
-| `Run` | what `run` and `score` return |
+| `Run`, `Sweep` | what `run`, `load` and `score` return; what `sweep` returns |
 | `Method`, `Probe`, `NullProbe` | the interface of a method; the probe it reports to |
 | `Scene`, `Split`, `Camera`, `Frame`, `Budget` | what methods take and return |
 | `SteerbenchError` | base class of all errors that a user can fix |
@@ -24,9 +26,9 @@ with a message for the user.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import pandas as pd
 
@@ -34,8 +36,12 @@ from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from bench.results import Store
 from bench.types import Budget, Camera, Frame, Method, NullProbe, Probe, Scene, Split
+from reports.comparison import columns_of
+from reports.lines import as_lines
+from reports.lines import results as rows_of
 from reports.runs import Run, load_runs
 from sweeps import configured
+from sweeps.hydra_runs import run_hydra
 from sweeps.measurement import Job, obtain
 from sweeps.overrides import composed, described
 from sweeps.scored import score
@@ -52,13 +58,16 @@ __all__ = [
     "Scene",
     "Split",
     "SteerbenchError",
+    "Sweep",
     "fit",
+    "load",
     "load_scene",
     "methods",
     "results",
     "run",
     "scenes",
     "score",
+    "sweep",
 ]
 
 
@@ -72,10 +81,39 @@ def run(*settings: str) -> Run:
     config = composed(settings)
     job = Job(config, ["steerbench", "run", *settings])
     (key,), _ = obtain([job])
-    (run,) = load_runs(job.store, {key: key})
-    label = str(run.facts["method"])
-    write_page(config.report, job.store, {key: label})
-    return replace(run, label=label)
+    write_page(config.report, job.store, [key])
+    return load_runs(job.store, [key])[0]
+
+
+class Sweep(NamedTuple):
+    """The `runs` of a sweep, and its `table`, a line for all runs that differ only in their seed.
+
+    A line has its settings, the number of seeds and, of each metric, the mean and half the 95 %
+    interval of this mean ("psnr", "psnr.half").
+    """
+
+    runs: Sequence[Run]
+    table: pd.DataFrame
+
+
+def sweep(*settings: str) -> Sweep:
+    """Measure every combination of `settings`, of which any may have several values: "seed=0,1,2".
+
+    What the store has is not measured again. If jobs fail, the others are still measured; then the
+    first error is raised.
+    """
+    ended, errors = run_hydra(["-m", *settings], alone=lambda config, command: None)
+    if errors:
+        raise errors[0]
+    keys = dict.fromkeys(job.run for job in ended if job.run)
+    lines = as_lines(load_runs(Store(Path(ended[0].outputs)), keys))
+    return Sweep(lines.runs, lines.frame(columns_of(lines)))
+
+
+def load(key: str, outputs: str | Path = "outputs") -> Run:
+    """The run of the store below `outputs` whose key begins with `key`."""
+    store = Store(Path(outputs))
+    return load_runs(store, [store.whole_key(key)])[0]
 
 
 def fit(*settings: str) -> Method:
@@ -93,8 +131,11 @@ def load_scene(*settings: str) -> Scene:
 
 
 def results(outputs: str | Path = "outputs") -> pd.DataFrame:
-    """All rows of all runs below `outputs`, one metric each; docs/protocol.md explains columns."""
-    return Store(Path(outputs)).rows()
+    """All rows of all runs below `outputs`, one metric each, with the settings that differ.
+
+    docs/protocol.md explains the columns.
+    """
+    return rows_of(Store(Path(outputs)))
 
 
 def methods(*settings: str) -> Mapping[str, str]:

@@ -25,7 +25,7 @@ def unexpected(where: str | Path, expected: str, got: object) -> SteerbenchError
 
 
 def unknown(kind: str, name: str, existing: Iterable[str]) -> SteerbenchError:
-    """The error for a `name` not among `existing`, with those that are near.
+    """The error for a `name` not among `existing`, with those that are near, or all.
 
     Near are first names on the same level (scene.path for scene.pth), then names anywhere.
     """
@@ -33,8 +33,8 @@ def unknown(kind: str, name: str, existing: Iterable[str]) -> SteerbenchError:
     beside = {other.removeprefix(place): other for other in names if other.startswith(place)}
     near = [beside[last] for last in get_close_matches(name.removeprefix(place), beside)]
     near = near or get_close_matches(name, names)
-    guess = f" Did you mean {' or '.join(near)}?" if near else ""
-    return SteerbenchError(f"unknown {kind} '{name}'.{guess} There are: {', '.join(names)}.")
+    more = f"Did you mean {' or '.join(near)}?" if near else f"There are: {', '.join(names)}."
+    return SteerbenchError(f"unknown {kind} '{name}'. {more}")
 
 
 def install_command(extra: str) -> str:

@@ -28,6 +28,9 @@ from bench.types import BACKGROUNDS, Camera, Log, Split, SteerbenchError, compos
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 """Endings of files that count as pictures; other files in a folder are ignored."""
 
+OF_A_RUN = re.compile(r"\d+-(rendered|truth|error)")
+"""File names, without ending, of the pictures that a run keeps."""
+
 NAMED = 5  # an error names at most this many files and gives the number of the rest
 
 Match = Literal["name", "order"]
@@ -86,6 +89,11 @@ def listed(folder: Path) -> list[Path]:
     files.sort(key=lambda path: _natural(path.name))
     if not files:
         raise unexpected(folder, f"pictures ({', '.join(SUFFIXES)})", "none")
+    if all(OF_A_RUN.fullmatch(path.stem) for path in files):
+        raise SteerbenchError(
+            f"{folder}: these are renderings, truths and error maps of a run, which is scored "
+            "already: `steerbench results`; `steerbench compare` compares it with another run"
+        )
     if twice := _repeated([path.stem for path in files]):
         raise unexpected(folder, "one picture of a name", f"several of {_some(twice)}")
     return files

@@ -53,7 +53,7 @@ def locate(net: str, weights_dir: Path | None, log: Log) -> Path:
                 raise
     except (OSError, SteerbenchError) as error:
         advice = "name a folder that has it as weights_dir=DIR or in $STEERBENCH_WEIGHTS"
-        raise Unavailable(f"{name} is not on this machine, and {error}; {advice}") from error
+        raise Unavailable(f"LPIPS {net}: {name} is not here, and {error}; {advice}") from error
 
 
 def load_features(net: str, weights_dir: Path | None, log: Log) -> tuple[Path, dict[str, Tensor]]:

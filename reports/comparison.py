@@ -1,13 +1,15 @@
-"""One table of several runs, one line each, with the best figures in bold."""
+"""Tables of several runs, a line for each of their settings, with the best figures in bold."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 from bench.errors import SteerbenchError
 from bench.rows import UNITS
+from reports.lines import Lines
 from reports.runs import Repeated, Run
 from reports.tables import NOT_AVAILABLE, QUALITY, Metric, Table, decimal, megabytes
 
@@ -24,31 +26,58 @@ COST = {
 COMMON = ("scene", "resolution", "trajectory", "budget", "protocol", "device")
 """Facts that a heading lists."""
 
+COLD_FRAMES = (
+    "Cold frames: the first of a path, which have fewer preceding frames than the method uses"
+)
 
-def comparison(runs: Sequence[Run], failures: Mapping[str, str]) -> Table:
-    """One line per run or per phase of a run, then one per failure; the best figures are bold.
 
-    Figures are ranked only among runs under the same conditions, if there are at least two. A
-    quality metric that no run has gets no column. `failures` says why a run is missing, by label.
+def comparison(lines: Lines, failures: Mapping[str, str]) -> list[Table]:
+    """The figures of `lines`, then those of their cold frames if they have any.
+
+    Figures are ranked only among lines under the same conditions, if there are at least two; the
+    best are bold. A quality metric that no run has gets no column. `failures` says why runs are
+    missing, by label: each is a line of its own.
     """
-    metrics = [*(name for name in QUALITY if any(name in run.values for run in runs)), *COST]
-    parts = [Repeated(part.label, [part]) for run in runs for part in run.phases()]
-    lines = [
-        (part.label, *(written(part, metric) or NOT_AVAILABLE for metric in metrics))
-        for part in parts
-    ]
+    metrics = columns_of(lines)
+    title = f"Comparison: {common(lines)}" if lines.lines else "Comparison"
+    tables = [_table(title, lines.settings, lines.lines, metrics)]
+    blank = ("",) * (len(tables[0].columns) - 1)
+    failed = tuple((f"{label}: failed: {why}", *blank) for label, why in failures.items())
+    tables[0] = replace(tables[0], lines=tables[0].lines + failed)
+    cold = [replace(x, runs=[run.cold for run in x.runs if run.cold]) for x in lines.lines]
+    if kept := [index for index, line in enumerate(cold) if line.runs]:
+        settings = {name: [of[index] for index in kept] for name, of in lines.settings.items()}
+        of_frames = [name for name in metrics if name in (*QUALITY, "frame_ms")]
+        tables.append(_table(COLD_FRAMES, settings, [cold[index] for index in kept], of_frames))
+    return tables
+
+
+def columns_of(lines: Lines) -> list[str]:
+    """The metrics that a comparison of `lines` shows."""
+    return [*(name for name in QUALITY if any(name in x.values for x in lines.runs)), *COST]
+
+
+def _table(
+    title: str,
+    settings: Mapping[str, Sequence[str]],
+    lines: Sequence[Repeated],
+    metrics: Sequence[str],
+) -> Table:
+    columns = dict(settings)
+    if any(len(line.runs) > 1 for line in lines):
+        columns["seeds"] = [str(len(line.runs)) for line in lines]
+    figures = {
+        metric: [written(line, metric) or NOT_AVAILABLE for line in lines] for metric in metrics
+    }
+    heads = (*columns, *(shown_as(metric).heading for metric in metrics))
+    cells = tuple(zip(*columns.values(), *figures.values(), strict=True))
     bold = frozenset(
         (row, column)
-        for column, metric in enumerate(metrics, 1)
-        for row, place in ranks(parts, metric).items()
+        for column, metric in enumerate(metrics, len(columns))
+        for row, place in ranks(lines, metric).items()
         if place == 1
     )
-    blank = ("",) * len(metrics)
-    lines += [(f"{label}: failed: {reason}", *blank) for label, reason in failures.items()]
-    title = f"Comparison: {conditions_of(runs)}" if runs else "Comparison"
-    heads = ("run", *(shown_as(metric).heading for metric in metrics))
-    sources = (*(part.keys for part in parts), *(() for _ in failures))
-    return Table(title, heads, tuple(lines), bold=bold, sources=sources)
+    return Table(title, heads, cells, bold=bold, sources=tuple(line.keys for line in lines))
 
 
 def shown_as(metric: str) -> Metric:
@@ -95,9 +124,10 @@ def marked(
 def ranks(lines: Sequence[Repeated], metric: str, write: Write | None = None) -> dict[int, int]:
     """The rank, from 1, of each of `lines` among those under the same conditions, by its index.
 
-    Figures that look the same when written (by `write`, or in the usual format) share a rank. A
-    line that is alone under its conditions has no rank, nor has the last of several, so that the
-    second of two has none. No line has one in a metric without a better side.
+    Figures share the rank of a better one from which they differ by no more than their intervals,
+    or not when written (by `write`, or in the usual format). A line that is alone under its
+    conditions has no rank, nor has the last of several, so that the second of two has none. No line
+    has one in a metric without a better side.
     """
     shown = shown_as(metric)
     if not shown.better:
@@ -110,17 +140,43 @@ def ranks(lines: Sequence[Repeated], metric: str, write: Write | None = None) ->
             known.setdefault(line.conditions, {})[row] = mean
     places: dict[int, int] = {}
     for figures in known.values():
-        ordered = sorted(figures.values(), reverse=shown.better == "↑")
-        texts = list(dict.fromkeys(map(write, ordered)))
-        ranked = {row: texts.index(write(value)) + 1 for row, value in figures.items()}
-        places |= {row: place for row, place in ranked.items() if place < len(figures)}
+        of_rank: list[list[int]] = []  # the best of a rank comes first
+        for row in sorted(figures, key=figures.__getitem__, reverse=shown.better == "↑"):
+            if not of_rank or _apart(lines, metric, write, of_rank[-1][0], row):
+                of_rank.append([])
+            of_rank[-1].append(row)
+        ranked = {row: rank for rank, rows in enumerate(of_rank, 1) for row in rows}
+        places |= {row: rank for row, rank in ranked.items() if rank < len(figures)}
     return places
+
+
+def _apart(lines: Sequence[Repeated], metric: str, write: Write, one: int, other: int) -> bool:
+    """Whether two means differ when written, and by more than the intervals of both."""
+    (low, near), (high, far) = (
+        (x.mean(metric), x.half(metric)) for x in (lines[one], lines[other])
+    )
+    assert low is not None
+    assert high is not None
+    interval = math.hypot(*(half for half in (near, far) if half > 0))
+    return write(low) != write(high) and abs(high - low) > interval
+
+
+def machines(runs: Sequence[Run]) -> str:
+    """On which machines `runs` were measured, with how many threads."""
+    found = (run.record["machine"] for run in runs)
+    return " / ".join(dict.fromkeys(f"{x['cpu']} with {x['threads']} threads" for x in found))
 
 
 def conditions(runs: Sequence[Run], names: Sequence[str] = COMMON) -> dict[str, str]:
     """The facts `names` of `runs`, each with all of its values."""
     facts = {name: dict.fromkeys(str(run.facts[name]) for run in runs) for name in names}
     return {name: " / ".join(values) for name, values in facts.items()}
+
+
+def common(lines: Lines) -> str:
+    """Scene, resolution and so on, as text, where they are no columns."""
+    names = [name for name in COMMON if name not in lines.settings]
+    return ", ".join(map(" ".join, conditions(lines.runs, names).items()))
 
 
 def conditions_of(runs: Sequence[Run]) -> str:

@@ -1,4 +1,4 @@
-"""Exports the paper's tables: LaTeX for an article, CSV for a spreadsheet."""
+"""Exports tables: LaTeX for an article, Markdown, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from functools import partial
 import pandas as pd
 
 from reports.comparison import conditions_of, marked, shown_as
-from reports.paper_tables import Measured, PaperTable, Shown
-from reports.tables import decimal
+from reports.paper_tables import Measured, PaperTable, Shown, figure_table
+from reports.tables import Table, decimal
 
 DECIMALS = {"ssim": 3, "lpips": 3, "frame": 2, "size": 1}
 """Decimals of the paper where pages have others, by the first part of a metric's name."""
@@ -36,28 +36,66 @@ MARKS = (r"\textbf{%s}", r"\underline{%s}")
 """LaTeX for the best and the second-best figure of a column."""
 
 
-def latex(tables: Sequence[PaperTable], measured: Measured) -> str:
-    """All tables as LaTeX, for the package booktabs, with as many decimals as in the paper.
+def exported(table: Table, figures: pd.DataFrame, form: str) -> str:
+    """A table as `markdown` or `latex`, or its `figures` as `csv` or `json`."""
+    match form:
+        case "markdown":
+            return f"## {table.title}\n\n{table.markdown()}\n"
+        case "latex":
+            rows = [
+                [
+                    MARKS[0] % escaped(text) if (row, column) in table.bold else escaped(text)
+                    for column, text in enumerate(line)
+                ]
+                for row, line in enumerate(table.lines)
+            ]
+            sides = "".join("lr"[table.right(column)] for column in range(len(table.columns)))
+            return _tabular(f"{table.title}.", "", sides, table.columns, [rows])
+        case "csv":
+            return figures.to_csv(index=False)
+    return figures.to_json(orient="records", indent=1, double_precision=15) + "\n"
 
-    Among figures under the same conditions, the best of a column is bold and, of at least three,
-    the second best is underlined; figures that look the same share a rank.
+
+def exported_tables(tables: Sequence[PaperTable], measured: Measured, form: str) -> str:
+    """Tables that experiments declare, in the same forms.
+
+    In LaTeX they have as many decimals as in the paper, and the second best of at least three
+    figures is underlined.
     """
-    return "\n".join(_latex(table, measured) for table in tables)
+    if form == "latex":
+        return "\n".join(_latex(table, measured) for table in tables)
+    blocks = [(table, block) for table in tables for block in table.shown(measured)]
+    if form == "markdown":
+        shown = (exported(figure_table(block), pd.DataFrame(), form) for _, block in blocks)
+        return "\n".join(shown)
+    return exported(Table("", (), ()), _figures(blocks), form)
 
 
 def _latex(table: PaperTable, measured: Measured) -> str:
     blocks = table.shown(measured)
     runs = [run for block in blocks for line in block.measured for run in line.runs]
-    caption = f"{_escaped(table.title)}. " + (f"{_escaped(conditions_of(runs))}." if runs else "")
-    heads = ["", *(_escaped(shown_as(metric).heading) for metric in table.metrics)]
-    parts = ([heads], *map(_rows, blocks))
+    caption = f"{table.title}. " + (f"{conditions_of(runs)}." if runs else "")
+    heads = ["", *(shown_as(metric).heading for metric in table.metrics)]
+    sides = f"l{'r' * len(table.metrics)}"
+    return _tabular(caption.strip(), table.name, sides, heads, list(map(_rows, blocks)))
+
+
+def _tabular(
+    caption: str,
+    name: str,
+    sides: str,
+    heads: Sequence[str],
+    blocks: Sequence[Sequence[Sequence[str]]],
+) -> str:
+    """A table for the package booktabs; the cells of `blocks` are LaTeX already."""
+    parts = ([list(map(escaped, heads))], *blocks)
     rows = ("\n".join(" & ".join(row) + r" \\" for row in part) for part in parts)
     return "\n".join(
         (
             r"\begin{table}",
-            rf"\caption{{{caption.strip()}}}",
-            rf"\label{{tab:{table.name}}}",
-            rf"\begin{{tabular}}{{l{'r' * len(table.metrics)}}}",
+            rf"\caption{{{escaped(caption)}}}",
+            *([rf"\label{{tab:{name}}}"] if name else []),
+            rf"\begin{{tabular}}{{{sides}}}",
             r"\toprule",
             "\n\\midrule\n".join(rows),
             r"\bottomrule",
@@ -75,18 +113,18 @@ def _rows(block: Shown) -> list[list[str]]:
     ]
     where = f" ({block.title})" if block.title else ""
     return [
-        [_escaped(line.label + where), *((text or "--").replace("±", r"$\pm$") for text in row)]
+        [escaped(line.label + where), *((text or "--").replace("±", r"$\pm$") for text in row)]
         for line, *row in zip(block.measured, *columns, strict=True)
     ]
 
 
-def csv(tables: Sequence[PaperTable], measured: Measured) -> str:
-    """All tables as CSV, one figure per row, in the units of `steerbench results`.
+def _figures(blocks: Sequence[tuple[PaperTable, Shown]]) -> pd.DataFrame:
+    """One figure per row, in the units of `steerbench results`.
 
     A row has the measured mean, the number of runs, half the 95 % interval, and the paper's figure.
     Lines have their keys and labels; of a table's further blocks, also the data set.
     """
-    rows = [
+    return pd.DataFrame(
         {
             "table": table.name,
             "data_set": block.title,
@@ -98,12 +136,10 @@ def csv(tables: Sequence[PaperTable], measured: Measured) -> str:
             "runs": len(found.runs),
             "published": block.published(metric).get(key),
         }
-        for table in tables
-        for block in table.shown(measured)
+        for table, block in blocks
         for key, (line, found) in block.lines.items()
         for metric in table.metrics
-    ]
-    return pd.DataFrame(rows).to_csv(index=False)
+    )
 
 
 def _written(metric: str, value: float) -> str:
@@ -114,6 +150,6 @@ def _written(metric: str, value: float) -> str:
     return decimal(value / 1e6 if family == "size" else value, DECIMALS[family])
 
 
-def _escaped(text: str) -> str:
-    """For LaTeX; powers of numbers are set in math mode."""
+def escaped(text: str) -> str:
+    """Text for LaTeX; powers of numbers are set in math mode."""
     return POWER.sub(r"$^{\1}$", text.translate(ESCAPES))

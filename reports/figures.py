@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, ScalarFormatter
 from matplotlib.transforms import Bbox
 from numpy.typing import ArrayLike
@@ -26,6 +28,7 @@ from reports.runs import Repeated, Run
 from reports.tables import NOT_AVAILABLE
 
 LEGEND_COLUMNS = 4
+MOST_NAMES = 10  # on a plot; more lines have a legend
 MARKERS = "osD^vP*X<>"
 COLOURS = [matplotlib.colormaps["tab20"](index) for index in (*range(0, 20, 2), *range(1, 20, 2))]
 COLOURS = [colour for colour in COLOURS if len(set(colour[:3])) > 1]  # grey is for "other"
@@ -47,9 +50,9 @@ MARK = "mark-{}"  # the `gid` of the mark of the line with this number
 NAME_SIZE = (160, 13)  # width and height in pixels of the name of a setting on a plot
 
 
-def stage_bars(runs: Sequence[Run], path: Path) -> None:
-    """Write a PNG: one bar per run, its mean frame time in ms split into parts; time outside all
-    stages is grey and comes last."""
+def stage_bars(runs: Sequence[Run | Repeated], path: Path) -> None:
+    """Write a PNG: one bar per run or line, its mean frame time in ms split into parts; time
+    outside all stages is grey and comes last."""
     of_runs = [run.parts for run in runs]
     there = dict.fromkeys(part for of in of_runs for part in of)
     parts = [*(part for part in there if part != OTHER), OTHER]
@@ -73,7 +76,9 @@ def stage_bars(runs: Sequence[Run], path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
-def quality_plot(lines: Sequence[Repeated], metric: str) -> Picture:
+def quality_plot(
+    lines: Sequence[Repeated], metric: str, settings: Mapping[str, Sequence[str]] = {}
+) -> Picture:
     """`quality_against` as a part of a page, with a mark for each line that has both figures."""
     stem, _, axis = COSTS[metric]
     marks = {}
@@ -82,27 +87,33 @@ def quality_plot(lines: Sequence[Repeated], metric: str) -> Picture:
         if not {quality, cost} & {None, NOT_AVAILABLE}:
             says = f"{line.label}: PSNR {quality} dB, {cost} {axis}"
             marks[MARK.format(number)] = says, line.keys
-    shows = f"PSNR in dB against {axis}, one mark a run"
-    return Picture(stem, shows, partial(quality_against, lines, metric), marks)
+    shows = f"PSNR in dB against {axis}, one mark a line"
+    return Picture(stem, shows, partial(quality_against, lines, metric, settings), marks)
 
 
-def quality_against(lines: Sequence[Repeated], metric: str, path: Path) -> None:
+def quality_against(
+    lines: Sequence[Repeated], metric: str, settings: Mapping[str, Sequence[str]], path: Path
+) -> None:
     """Write a PNG: PSNR of each of `lines` against its `metric`, one of `COSTS`, with its name.
 
-    With several seeds, error bars show the intervals of both.
+    With several seeds, error bars show the intervals of both. More than a few lines have a legend
+    instead of names, made of their `settings`: a colour for each value of the first that differs,
+    a marker for the others.
     """
     _, unit, label = COSTS[metric]
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
     _label(axes, label)
+    legend = _Legend(settings) if len(lines) > MOST_NAMES else None
     points = []
     for number, line in enumerate(lines):
         across, up = line.mean(metric), line.mean("psnr")
         if across is None or up is None:
             continue
         bars = [half if half > 0 else None for half in (line.half(metric), line.half("psnr"))]
-        style = {**_style(number), "xerr": bars[0] and bars[0] / unit, "yerr": bars[1]}
-        drawn = axes.errorbar(across / unit, up, **style, markersize=8)
+        own = _style(number) if legend is None else legend.style(number)
+        style = {**own, "xerr": bars[0] and bars[0] / unit, "yerr": bars[1]}
+        drawn = axes.errorbar(across / unit, up, **style, markersize=8, elinewidth=0.8)
         drawn[0].set_gid(MARK.format(number))
         points.append((line.label, (across / unit, up)))
     axes.set_xscale("log")
@@ -113,8 +124,37 @@ def quality_against(lines: Sequence[Repeated], metric: str, path: Path) -> None:
     axes.xaxis.set_major_locator(LogLocator(subs=ticks))
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_locator(NullLocator())
-    _name(axes, points)
+    if legend is None:
+        _name(axes, points)
+    else:
+        figure.legend(handles=legend.handles, loc="outside right upper", frameon=False)
     figure.savefig(path, dpi=150)
+
+
+class _Legend:
+    """Styles of lines by their settings: the first that differs has colours, the others markers."""
+
+    def __init__(self, settings: Mapping[str, Sequence[str]]) -> None:
+        differ = {name: of for name, of in settings.items() if len(set(of)) > 1}
+        named = [[f"{name}={value}" for value in of] for name, of in differ.items()]
+        first, *rest = named
+        others = list(map(", ".join, zip(*rest, strict=True))) if rest else [""] * len(first)
+        self._of_lines = list(zip(first, others, strict=True))
+        self._colours = dict(zip(dict.fromkeys(first), cycle(COLOURS), strict=False))
+        self._markers = dict(zip(dict.fromkeys(others), cycle(MARKERS), strict=False))
+
+    def style(self, number: int) -> dict[str, Any]:
+        """Of the line with this number."""
+        first, other = self._of_lines[number]
+        colour, marker = self._colours[first], self._markers[other]
+        return {"marker": marker, "color": colour, "linestyle": "none"}
+
+    @property
+    def handles(self) -> list[Line2D]:
+        """What the legend shows."""
+        styles = [(name, {"color": of, "marker": "o"}) for name, of in self._colours.items()]
+        styles += [(name, {"color": "grey", "marker": of}) for name, of in self._markers.items()]
+        return [Line2D([], [], linestyle="none", label=x, **style) for x, style in styles if x]
 
 
 def _name(axes: Axes, points: Sequence[tuple[str, tuple[float, float]]]) -> None:

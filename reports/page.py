@@ -2,79 +2,88 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from bench.results import Store
 from reports import figures
-from reports.comparison import comparison, conditions_of
+from reports.comparison import common, comparison, machines
 from reports.images import MOST_RENDERINGS, Part, Picture, frame_section, kept_frames
+from reports.lines import Lines, as_lines
 from reports.publish import publish
-from reports.runs import Repeated, Run, load_runs, missing_figures, over_common_frames
+from reports.runs import Run, load_runs, missing_figures
 from reports.tables import Table, run_tables
 
 
 def write_page(
-    store: Store, labels: Mapping[str, str], folder: Path, failures: Mapping[str, str] = {}
+    store: Store, keys: Iterable[str], folder: Path, failures: Mapping[str, str] = {}
 ) -> Path:
     """Write `folder/report.md` with its pictures, and the same as `report.html`; return the former.
 
-    The page replaces an earlier one only once it is complete. `labels` has the names of the runs on
-    the page, by key and in its order; `failures` says why a run is missing, by its label. Raises
-    SteerbenchError if a run is not in the store or `folder` cannot be written to.
+    The page replaces an earlier one only once it is complete. It shows the runs with these `keys`,
+    in this order; `failures` says why others are missing, by their label. Raises SteerbenchError if
+    a run is not in the store or `folder` cannot be written to.
     """
-    runs = over_common_frames(load_runs(store, labels))
+    lines = as_lines(load_runs(store, keys))
+    runs = lines.runs
+    few = len(runs) <= MOST_RENDERINGS
     parts = [
-        *_heading(runs, failures),
-        *_tradeoffs(runs),
+        *_heading(lines, failures),
+        *_tradeoffs(lines),
         "## Where the time goes",
-        Picture("stages", "Mean ms of a frame by stages", partial(figures.stage_bars, runs)),
-        "One bar per run: the mean time of a frame, divided into the stages of the method; a stage"
+        Picture("stages", "Mean ms of a frame by stages", partial(figures.stage_bars, lines.lines)),
+        "One bar per line: the mean time of a frame, divided into the stages of the method; a stage"
         " includes the stages inside it. Time outside all stages is `other`.",
-        *_pictures(runs),
-        *(part for run in runs for part in _figures(run)),
+        *_pictures([replace(line.runs[0], label=line.label) for line in lines.lines]),
+        *(part for run in runs if few for part in _figures(run)),
         *_provenance(runs),
     ]
     return publish(parts, folder, runs)
 
 
-def _heading(runs: Sequence[Run], failures: Mapping[str, str]) -> Iterator[Part]:
-    """Title, the table of all runs, and how to read it."""
-    few = len(runs) <= MOST_RENDERINGS
-    labels = ", ".join(run.label for run in runs) if few else f"{len(runs)} runs"
+def _heading(lines: Lines, failures: Mapping[str, str]) -> Iterator[Part]:
+    """Title, the table of all lines, and how to read it."""
+    runs, (methods, *varied) = lines.runs, lines.settings
+    labels = ", ".join(dict.fromkeys(lines.settings[methods]))
     scenes = ", ".join(dict.fromkeys(run.facts["scene"] for run in runs))
-    table = comparison(runs, failures)
+    first, *further = comparison(lines, failures)
     scored, timed = (
         " / ".join(dict.fromkeys(str(run.headline["n"][metric]) for run in runs))
         for metric in ("psnr", "frame_ms")
     )
     reading = f"Arrows point to better. Quality is a mean over {scored} frames, time over {timed}."
-    if table.bold:
+    if any(len(line.runs) > 1 for line in lines.lines):
+        reading += " Figures are means over seeds, ± half their 95 % interval."
+    if first.bold:
         reading += (
-            " The best figure of each column is **bold**, among runs with the same frames, protocol"
-            " and machine."
+            " The best figure of each column is **bold**, with those that differ from it by no more"
+            " than the intervals, among runs with the same frames, protocol and machine."
         )
-    yield f"# {labels} on {scenes}"
-    yield f"Measured: {conditions_of(runs)}."
-    yield table
+    days = sorted({run.record["stored"][:10] for run in runs})
+    when = " to ".join(dict.fromkeys((days[0], days[-1])))
+    yield f"# {': '.join(filter(None, (labels, ', '.join(varied))))} on {scenes}"
+    yield f"Measured {when} on {machines(runs)}: {common(lines)}."
+    yield first
     yield reading
+    for table in further:
+        yield f"{table.title}:"
+        yield table
     yield from missing_figures(runs)
 
 
-def _tradeoffs(runs: Sequence[Run]) -> Iterator[Part]:
-    """Plots of quality against its costs, if there are runs to compare."""
-    lines = [Repeated(run.label, [run]) for run in runs]
+def _tradeoffs(lines: Lines) -> Iterator[Part]:
+    """Plots of quality against its costs, if there are lines to compare."""
     for title, metric, better in (
         ("Quality against time", "frame_ms", "faster"),
         ("Quality against memory", "size_bytes.total", "smaller"),
     ):
-        plot = figures.quality_plot(lines, metric)
+        plot = figures.quality_plot(lines.lines, metric, lines.settings)
         if len(plot.marks) > 1:
             yield f"## {title}"
             yield plot
-            yield f"One mark a run: further up is better, further left is {better}."
+            yield f"One mark a line: further up is better, further left is {better}."
 
 
 def _pictures(runs: Sequence[Run]) -> Iterator[Part]:

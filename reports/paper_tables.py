@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from reports.claims import Claim, Comparison, apart, compare, gap, told
-from reports.comparison import COMMON, conditions, marked, shown_as, written
+from reports.comparison import COMMON, conditions, machines, marked, shown_as, written
 from reports.runs import Repeated, Run, missing_figures
 from reports.tables import ABSENT, Table
 
@@ -179,9 +179,7 @@ def comparisons(table: PaperTable, measured: Measured) -> list[Comparison]:
 
 def measured_where(runs: Sequence[Run]) -> dict[str, str]:
     """Under which conditions, and on which machines, `runs` were measured."""
-    machines = (run.record["machine"] for run in runs)
-    named = dict.fromkeys(f"{each['cpu']} with {each['threads']} threads" for each in machines)
-    return {**conditions(runs, (*COMMON, "seed", "commit")), "machine": " / ".join(named)}
+    return {**conditions(runs, (*COMMON, "seed", "commit")), "machine": machines(runs)}
 
 
 def section(table: PaperTable, measured: Measured, said: Collection[str] = ()) -> list[str | Table]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
@@ -11,13 +11,16 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from torch import Tensor
 
 from bench.clock import OTHER
 from bench.errors import SteerbenchError
 from bench.intervals import half_interval
+from bench.metrics import psnr
 from bench.neighbours import Neighbours
-from bench.results import COLD, STEADY, WHOLE, Store, content_key, unreadable
+from bench.results import COLD, STEADY, Store, content_key, unreadable
 from bench.rows import phase_rows
+from bench.scenes.images import contents, decode_bytes
 from bench.study import part_of
 from reports.tables import phases, run_tables
 
@@ -87,13 +90,13 @@ class Run:
         found[OTHER] = found.pop(OTHER)
         return {part: ms for part, ms in found.items() if ms or part == OTHER}
 
-    def phases(self) -> list[Run]:
-        """The run once per phase, with only the figures of that phase."""
-        whole = self.rows[self.rows["phase"] == WHOLE]
-        return [
-            replace(self, label=self.label + suffix, rows=pd.concat([of_phase, whole]))
-            for suffix, of_phase in phases(self.rows)
-        ]
+    @property
+    def cold(self) -> Run | None:
+        """The run with the figures of its cold frames alone, if it has steady ones, too."""
+        of_phases = [of_phase for _, of_phase in phases(self.rows)]
+        if len(of_phases) < 2:
+            return None
+        return replace(self, rows=of_phases[1])
 
     def _repr_markdown_(self) -> str:
         """The run's tables, for display in a notebook."""
@@ -123,6 +126,14 @@ class Run:
         """Equal for runs whose figures are comparable."""
         phase = self.headline["phase"].iloc[0]
         return (*self.views, phase, self.facts["protocol"], *self.computer)
+
+    def psnr_to(self, other: Run) -> float:
+        """Mean PSNR in dB between the pictures that both runs kept; inf if all are equal, nan if
+        there are none."""
+        kept = sorted(self.pictures.glob("*-rendered.png"))
+        pairs = [(path, other.pictures / path.name) for path in kept]
+        found = [psnr(_read(one), _read(two)) for one, two in pairs if two.exists()]
+        return float(np.mean(found)) if found else math.nan
 
     @property
     def provenance(self) -> dict[str, str]:
@@ -203,18 +214,32 @@ class Repeated:
         """Half the 95 % interval of this mean; nan with fewer than two seeds."""
         return half_interval(np.array(self._figures(metric)))
 
+    @property
+    def parts(self) -> dict[str, float]:
+        """The mean ms of each part of a frame; see `Run.parts`."""
+        of_runs = [run.parts for run in self.runs]
+        names = dict.fromkeys(name for of_run in of_runs for name in of_run)
+        return {name: float(np.mean([of.get(name, 0.0) for of in of_runs])) for name in names}
+
     def _figures(self, metric: str) -> list[float]:
         figures = (run.figure(metric) for run in self.runs)
         return [figure for figure in figures if figure is not None]
 
 
-def readable(store: Store, keys: Collection[str] | None = None) -> list[Run]:
-    """Every readable run, or those in `keys`, labelled with its key, in the order of storing."""
-    rows = store.rows(report=lambda unreadable: None, keys=keys)
+def readable(
+    store: Store,
+    keys: Collection[str] | None = None,
+    report: Callable[[str], object] = lambda unreadable: None,
+) -> list[Run]:
+    """Every readable run, or those in `keys`, labelled with its method, in the order of storing.
+
+    `report` gets a line on each schema that cannot be read.
+    """
+    rows = store.rows(report=report, keys=keys)
     runs = [
         Run(
             folder.name,
-            folder.name,
+            str(of_run["method"].iloc[0]),
             of_run,
             cache(partial(store.frames, folder.name)),
             store.record(folder.name),
@@ -226,17 +251,18 @@ def readable(store: Store, keys: Collection[str] | None = None) -> list[Run]:
     return sorted(runs, key=lambda run: run.record["stored"])
 
 
-def load_runs(store: Store, labels: Mapping[str, str]) -> list[Run]:
-    """Load the runs whose keys are in `labels`, in its order.
+def load_runs(store: Store, keys: Iterable[str]) -> list[Run]:
+    """Load the runs with these `keys`, in this order, labelled with their methods.
 
     Raises SteerbenchError if one is not in the store, or has a schema that cannot be read.
     """
-    runs = {run.key: run for run in readable(store, labels)}
-    for key in labels:
+    wanted = list(keys)
+    runs = {run.key: run for run in readable(store, wanted)}
+    for key in wanted:
         if key not in runs:
             schema = store.record(key).get("schema_version")
             raise SteerbenchError(f"{store.folder / key}: {unreadable(schema)}")
-    return [replace(runs[key], label=label) for key, label in labels.items()]
+    return [runs[key] for key in wanted]
 
 
 def missing_figures(runs: Sequence[Run]) -> list[str]:
@@ -325,6 +351,10 @@ def _record(runs: Sequence[Run]) -> dict[str, Any]:
         "scene": {**records[0]["scene"], "digest": digest},
         "missing": {name: why for record in records for name, why in record["missing"].items()},
     }
+
+
+def _read(picture: Path) -> Tensor:
+    return decode_bytes(contents(picture), picture)[..., :3] / 255.0
 
 
 def _joined(values: Sequence[Any]) -> Any:

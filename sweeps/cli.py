@@ -20,6 +20,7 @@ import sys
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -38,6 +39,7 @@ examples
   steerbench run scene=blender scene.path=DIR  Instant-NGP on your copy of a NeRF-Synthetic scene
   steerbench run --help                        all choices and settings
   steerbench paper budget=demo                 every table of the SteerNeRF paper, as a page
+  steerbench table table3 --format latex       one table, or one of your own; also for an article
   steerbench parity scene=totem budget=demo    what int8 costs, in decibels, and saves, in time
   steerbench accuracy --within 0.1dB           the fastest setting that loses no more than that
   steerbench check BASELINE.json               is everything as good as it was
@@ -45,6 +47,8 @@ examples
 
 `steerbench COMMAND --help` explains a command.
 """
+
+PLACES = ("outputs", "report")
 
 INTERRUPTED = 130  # an exit status, as of a shell
 
@@ -88,6 +92,7 @@ def _fail(message: str, status: int) -> int:
 def dispatch(argv: Sequence[str]) -> int:
     """Pass `argv` to the file of its command, which is imported only now."""
     of_hydra = argv[:1] == ["run"] or argv[:1] in (["-sc"], ["--shell-completion"])
+    argv = _one_form(argv)
     options = None if of_hydra else parsed(argv)
     if options and options.command is None:
         options.parser.print_help()
@@ -96,6 +101,28 @@ def dispatch(argv: Sequence[str]) -> int:
     file = COMMANDS[name].get("module", name)
     command = importlib.import_module(f"sweeps.commands.{file}")
     return command.main(options or argv[argv[0] == "run" :])
+
+
+def _one_form(argv: Sequence[str]) -> list[str]:
+    """`argv` with the folders of store and page as its command takes them.
+
+    They are an option or a setting; every command understands `--outputs DIR` and `outputs=DIR`.
+    """
+    name, words = argv[0] if argv else "", iter(argv)
+    if name not in COMMANDS:
+        return list(argv)
+    known = {each for names, _ in _arguments(COMMANDS[name]) for each in names}
+    found = []
+    for word in words:
+        option, equals, value = word.partition("=")
+        place = option.removeprefix("--")
+        if place not in PLACES or word == place:
+            found.append(word)
+        elif f"--{place}" in known:
+            found.append(f"--{place}={value}" if equals else f"--{place}")
+        else:
+            found.append(f"{place}={value if equals else next(words, '')}")
+    return found
 
 
 class Parser(argparse.ArgumentParser):
@@ -122,13 +149,14 @@ def parsed(argv: Sequence[str]) -> argparse.Namespace:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument("--version", action="version", version=version("steerbench"))
     parser.set_defaults(command=None, parser=parser)
     commands = parser.add_subparsers(prog=parser.prog, help=argparse.SUPPRESS)
     for name, about in COMMANDS.items():
         below = commands.add_parser(name, description=about["description"])
         below.set_defaults(command=name, parser=below, typed=list(argv))
-        for argument, given in _arguments(about):
-            below.add_argument(argument, **given)
+        for names, given in _arguments(about):
+            below.add_argument(*names, **given)
     if argv and not argv[0].startswith("-") and argv[0] not in COMMANDS:
         raise unknown("command", argv[0], COMMANDS)
     options, unread = parser.parse_known_args(argv)
@@ -142,21 +170,22 @@ def parsed(argv: Sequence[str]) -> argparse.Namespace:
     return options
 
 
-def _arguments(about: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """The name and the options, as for `add_argument`, of each argument of a command."""
+def _arguments(about: Mapping[str, Any]) -> Iterator[tuple[list[str], dict[str, Any]]]:
+    """The names and the options, as for `add_argument`, of each argument of a command."""
     include = about.get("include", [])
     if usual := about.get("settings"):
         include = [*include, "folder"]
     for group in (about.get("arguments", {}), *(_SHARED[name] for name in include)):
         for name, options in group.items():
             kind = TYPES[options["type"]] if "type" in options else {}
-            own = {key: value for key, value in options.items() if key != "type"}
+            own = {key: of for key, of in options.items() if key not in ("type", "also")}
             more = "; may be repeated" if kind.get("action") == "append" else ""
             more += f" (default {own['default']})" if own.get("default") else ""
-            yield name, {**kind, **own, "help": own["help"] + more}
+            names = filter(None, (name, options.get("also")))
+            yield [*names], {**kind, **own, "help": own["help"] + more}
     if usual:  # last, because it takes all words that are left
         help = f"settings as of `steerbench run` (default {usual})"
-        yield "overrides", {"help": help, "nargs": "*"}
+        yield ["overrides"], {"help": help, "nargs": "*"}
 
 
 def count(text: str, at_most: float = math.inf) -> int:
@@ -193,6 +222,7 @@ TYPES: dict[str, dict[str, Any]] = {
     "positive": {"type": positive},
     "port": {"type": partial(count, at_most=65535)},
     "flag": {"action": "store_true"},
+    "form": {"choices": ["markdown", "latex", "csv", "json"]},
     "several": SEVERAL,
     "folders": {**SEVERAL, "type": config_dir},
 }

@@ -6,7 +6,9 @@ All raise SteerbenchError, which names the setting, if one is wrong or cannot be
 from __future__ import annotations
 
 import inspect
+import os
 import re
+import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, lru_cache
@@ -61,8 +63,11 @@ def checked_settings(config: DictConfig) -> Settings:
         values["frame_size"] = list(values["frame_size"])
     check_settings(Settings, values)
     settings = Settings(**values)
-    if settings.seed < 0:
-        raise unexpected("seed", "0 or more", settings.seed)
+    if not 0 <= settings.seed < 2**63:
+        raise unexpected("seed", "0 or more, below 2^63", settings.seed)
+    precisions = target_of(config.engine).precisions if "engine" in config else ()
+    if precisions and config.precision not in precisions:
+        raise unexpected("precision", " or ".join(precisions), config.precision)
     if settings.threads is not None and settings.threads < 1:
         raise unexpected("threads", "1 or more, or null", settings.threads)
     if settings.pictures < 0:
@@ -85,7 +90,10 @@ def checked_settings(config: DictConfig) -> Settings:
 
 def use_threads(settings: Settings) -> None:
     """Let torch, and the kernels with it, use as many threads as the settings say from now on."""
-    torch.set_num_threads(settings.threads or USUAL_THREADS)
+    threads, cores = settings.threads or USUAL_THREADS, len(os.sched_getaffinity(0))
+    if settings.threads and threads > cores:
+        print(f"threads={threads}: more than the {cores} cores here are slower", file=sys.stderr)
+    torch.set_num_threads(threads)
 
 
 def trained(config: DictConfig, log: Log) -> Method:

@@ -214,7 +214,7 @@ def _printed() -> Iterator[None]:
 
 def say(job: Job, run: str, more: str = "") -> None:
     """Print the figures of a job's run in one line, and `more` after them."""
-    (loaded,) = load_runs(job.store, {run: job.name})
+    (loaded,) = load_runs(job.store, [run])
     psnr, ms = decimal(loaded.values.get("psnr"), 2), decimal(loaded.values["frame_ms"], 1)
     print(f"{job.name}: {psnr} dB, {ms} ms a frame{more}", file=sys.stderr)
 

@@ -36,6 +36,7 @@ from sweeps.configured import (
 )
 from sweeps.overrides import target_of
 from sweeps.processes import device_lock
+from sweeps.tables import axes
 
 J = TypeVar("J", bound="Job")
 
@@ -152,7 +153,7 @@ def obtain(jobs: Sequence[Job]) -> tuple[list[str], bool]:
             if measured:
                 _measure(ready, log)
     for each in ready:
-        send(each.job.config, each.run, each.method.name)
+        send(each.job.config, each.run)
     return _told(ready, measured, log), measured
 
 
@@ -275,13 +276,14 @@ def _measure(ready: Sequence[_Ready], log: Log) -> None:
         each.job.store.remove(each.run)
     for each, measurement in zip(ready, measurements, strict=True):
         command, place = shlex.join(each.job.command), scene_folder(each.job.config)
-        record = {**measurement.record, "command": command, "scene_path": place}
+        named = {axis.setting: name for name, axis in axes(each.method.name).items()}
+        record = {**measurement.record, "command": command, "scene_path": place, "axes": named}
         if each.task.protocol.compared:
             record["compared_with"] = ready[0].run
         each.job.store.save(each.parts, replace(measurement, record=record))
 
 
-def send(config: DictConfig, run: str, label: str) -> None:
+def send(config: DictConfig, run: str) -> None:
     """Send a run to the tracker of `config`, if it names one. Errors are only logged, because the
     measurement is valid."""
     if not config.tracker:
@@ -289,7 +291,7 @@ def send(config: DictConfig, run: str, label: str) -> None:
     outputs = Path(config.outputs)
     log = ConsoleLog(outputs)
     try:
-        tracker(config.tracker)(load_runs(Store(outputs), {run: label})[0], outputs)
+        tracker(config.tracker)(load_runs(Store(outputs), [run])[0], outputs)
         log.info(f"sent to {config.tracker}: {run}")
     except Exception as error:  # third-party library: any exception
         log.info(f"not sent to {config.tracker}: {run}: {reason(error)}")

@@ -100,11 +100,11 @@ def score(
         "scene": {"name": facts["scene"], "digest": record["truths"]},
         "budget": {"name": NOTHING},
     }
-    key, label = store.key(parts), str(facts["method"])
+    key = store.key(parts)
     if store.find(key) is None:
         store.save(parts, replace(measurement, record={**record, **more}))
-    send(config, key, label)
-    (run,) = load_runs(store, {key: label})
+    send(config, key)
+    (run,) = load_runs(store, [key])
     return run
 
 

@@ -45,7 +45,7 @@ def chosen(
         tables.sort(key=lambda table: table.number or 0)
     compared = [any(METHOD in line.job for line in table.lines.values()) for table in tables]
     if methods and not any(compared):
-        raise SteerbenchError(f"--with: {name} compares no methods; table1 does")
+        raise SteerbenchError(f"--beside: {name} compares no methods; table1 does")
     further = {f"with {x}": Line(x, {METHOD: x}, added=True) for x in methods}
     return [
         replace(table, lines={**table.lines, **further}) if compares else table

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,9 @@ from rich.table import Table as RichTable
 from bench.results import Store
 from reports.tables import Table, run_tables
 
-if TYPE_CHECKING:  # it loads torch, which `steerbench list` does without
+if TYPE_CHECKING:  # loads torch, which `steerbench list` does without
+    import pandas as pd
+
     from reports.runs import Run
 
 
@@ -33,9 +35,13 @@ def console() -> Console:
     return _Output(width=None if sys.stdout.isatty() else 200, highlight=False)
 
 
-def show(table: Table) -> None:
-    """Print `table`, in a file or pipe as Markdown."""
-    if sys.stdout.isatty():
+def show(table: Table, figures: pd.DataFrame | None = None, form: str | None = None) -> None:
+    """Print `table`, in a file or pipe as Markdown; or, in the `form` asked for, its `figures`."""
+    if form and figures is not None:
+        from reports.export import exported
+
+        print(exported(table, figures, form), end="", flush=True)
+    elif sys.stdout.isatty():
         console().print(rich_table(table))
     else:
         print(f"## {table.title}\n\n{table.markdown()}\n", flush=True)
@@ -61,16 +67,16 @@ def say_missing(runs: Sequence[Run]) -> None:
 
 
 def write_page(
-    report: str | None, store: Store, labels: Mapping[str, str], failed: Mapping[str, str] = {}
+    report: str | None, store: Store, keys: Collection[str], failed: Mapping[str, str] = {}
 ) -> None:
     """Write a page into the folder `report`, if there is to be one, and print where it is.
 
-    It shows the runs whose keys are in `labels`, if any, and says why other jobs `failed`, by name.
+    It shows the runs with these `keys`, if any, and says why other jobs `failed`, by name.
     """
-    if report and labels:
+    if report and keys:
         from reports import page  # loads matplotlib, which only a page needs
 
-        print(f"report: {page.write_page(store, labels, Path(report), failed)}", file=sys.stderr)
+        print(f"report: {page.write_page(store, keys, Path(report), failed)}", file=sys.stderr)
 
 
 def print_rows(rows: Any) -> None:

@@ -96,7 +96,7 @@ def mortal(folder: Path, last: int) -> subprocess.CompletedProcess[str]:
     """Two trainings of a 2D renderer, killed at the change `last` of a file; see mortal.py."""
     folder.mkdir(exist_ok=True)
     program = [sys.executable, "-P", Path(__file__).with_name("mortal.py"), str(last)]
-    command = [*program, "paper", "--table", "table5", *SMALLEST]
+    command = [*program, "table", "table5", *SMALLEST]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 

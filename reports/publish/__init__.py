@@ -107,6 +107,7 @@ def html_page(parts: Sequence[Part], runs: Sequence[Run]) -> str:
         title=str(parts[0]).partition("\n")[0].lstrip("# "),
         parts=[_html(part, origins, headings) for part in parts],
         headings=headings,
+        opening=next((n for n, part in enumerate(parts) if isinstance(part, Table)), 0),
         origins=origins,
     )
 

@@ -15,6 +15,7 @@ from bench.provenance import digest, sha256
 from bench.results import RECORD, Store
 from bench.scenes.export import check_empty, data_camera
 from reports.comparison import comparison
+from reports.lines import as_lines
 from reports.runs import load_runs
 from sweeps.commands.render import words_of_run
 from sweeps.configured import build, scene_of
@@ -30,7 +31,7 @@ def main(options: argparse.Namespace) -> int:
 def _export(options: argparse.Namespace) -> int:
     store = Store(options.outputs)
     key = store.whole_key(options.run)
-    (run,), place = load_runs(store, {key: key}), setting("outputs", str(options.outputs))
+    (run,), place = load_runs(store, [key]), setting("outputs", str(options.outputs))
     config = composed([*words_of_run(key, [place]), place])
     scene = scene_of(config)
     if scene.digest != run.record["scene"]["digest"]:
@@ -89,9 +90,10 @@ def _import(options: argparse.Namespace) -> int:
         record = {**measurement.record, "command": command}
         store.save(parts, replace(measurement, record=record))
     others = [store.whole_key(run) for run in options.beside]
-    imported, *runs = load_runs(store, dict.fromkeys([key, *others], ""))
-    labelled = [replace(run, label=f"{run.facts['method']}, run {run.key[:8]}") for run in runs]
-    table = comparison([replace(imported, label=f"{facts['method']}, imported"), *labelled], {})
-    show(table)
+    imported, *runs = load_runs(store, [key, *others])
+    labelled = [replace(run, label=f"{run.label}, run {run.key[:8]}") for run in runs]
+    named = replace(imported, label=f"{imported.label}, imported")
+    for table in comparison(as_lines([named, *labelled]), {}):
+        show(table)
     console().print(f"run {key}", markup=False)
     return 0

@@ -44,11 +44,11 @@ def main(options: argparse.Namespace) -> int:
     for name, why in missing.items():
         print(f"missing: {name}: {why}", file=sys.stderr)
     shown = data_sets(scenes_of(words, data))
-    tables = chosen(options.table, words, options.methods, shown)
+    tables = chosen(getattr(options, "table", None), words, options.beside, shown)
     jobs = [job for table in tables for job in plan(table, words, data)]
     outputs = Path(jobs[0].config.outputs)
     failed = 0
-    if options.command == "paper":
+    if options.command != "report":
         failed = run_jobs(jobs, Launcher([*options.config_dir, *of_hydra], outputs))
     runs = newest(Store(outputs))
     broken = outliers(list(chain(*runs.values())))
@@ -56,7 +56,7 @@ def main(options: argparse.Namespace) -> int:
     measured = gather(jobs, runs)
     page = write_paper_page(tables, measured, broken, folder, missing)
     if options.format:
-        print(getattr(export, options.format)(tables, measured), end="")
+        print(export.exported_tables(tables, measured, options.format), end="")
     print(f"report: {page}", file=sys.stderr)
     return int(failed > 0)
 

@@ -48,10 +48,10 @@ def main(options: argparse.Namespace) -> int:
     methods = [trained(each, log) for each in (config, *others)]
     cameras = [step.camera for step in trajectory.steps]
     drawn = "-".join([scene.name, *(method.name for method in methods), trajectory.name])
-    folder = options.output or Path(config.outputs) / "render" / drawn
+    folder = options.to or Path(config.outputs) / "render" / drawn
     with explained(folder), ExitStack() as stack:
         folder.mkdir(parents=True, exist_ok=True)
-        if not options.output:  # what an earlier call left there, of a longer path, say
+        if not options.to:  # what an earlier call left there, of a longer path, say
             for old in folder.glob("[0-9]*.png"):
                 old.unlink()
         if trajectory.resolution != MIXED:

@@ -7,7 +7,8 @@ import math
 import sys
 
 from bench.errors import SteerbenchError, unknown
-from bench.results import Store
+from bench.results import COLUMNS, Store
+from reports.lines import results
 from reports.tables import NOT_AVAILABLE, Table
 from sweeps.terminal import show
 
@@ -15,12 +16,13 @@ SHOWN = (
     *("run", "method", "scene", "trajectory", "device", "seed", "phase"),
     *("metric", "value", "lo", "hi", "n", "unit"),
 )
-"""The columns of the printed table; csv and json have all columns."""
+"""The columns of the printed table, beside settings that differ; csv and json have all columns."""
 
 
 def main(options: argparse.Namespace) -> int:
-    """Print the rows below `options.outputs`, filtered if asked, as a table, csv or json."""
-    rows = Store(options.outputs).rows(report=lambda message: print(message, file=sys.stderr))
+    """Print the rows below `options.outputs`, filtered if asked, in the form that is asked for."""
+    store = Store(options.outputs)
+    rows = results(store, report=lambda message: print(message, file=sys.stderr))
     if rows.empty:
         raise SteerbenchError(f"{options.outputs}: no runs yet; `steerbench run` makes one")
     for column in ("method", "scene", "metric"):
@@ -29,15 +31,11 @@ def main(options: argparse.Namespace) -> int:
             if wanted not in set(rows[column]):
                 raise unknown(column, wanted, set(rows[column]))
             rows = rows[rows[column] == wanted]
-    if options.format == "csv":
-        rows.to_csv(sys.stdout, index=False)
-    elif options.format == "json":
-        rows.to_json(sys.stdout, orient="records", indent=1, double_precision=15)
-        print()
-    else:
-        shown = rows.assign(run=rows["run"].str[:8])[list(SHOWN)]
-        lines = tuple(tuple(map(_text, line)) for line in shown.itertuples(index=False))
-        show(Table(str(options.outputs), SHOWN, lines))
+    own = [str(name) for name in rows if name not in COLUMNS]
+    columns = [*SHOWN[:2], *own, *SHOWN[2:]]
+    short = rows.assign(run=rows["run"].str[:8])[columns]
+    lines = tuple(tuple(map(_text, line)) for line in short.itertuples(index=False))
+    show(Table(str(options.outputs), tuple(columns), lines), rows, options.format)
     return 0
 
 

@@ -1,95 +1,30 @@
-"""`steerbench run`: Hydra composes the configuration of every job and runs it."""
+"""`steerbench run`: measures one run, or a sweep, and prints its tables."""
 
 from __future__ import annotations
 
-import os
-import re
-import sys
-from collections.abc import Collection, Sequence
-from contextvars import ContextVar
-from dataclasses import dataclass, field
-from math import prod
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import hydra
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.hydra_config import HydraConfig
-from hydra.experimental.callback import Callback
-from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from bench.errors import unexpected
-from sweeps.overrides import CONFIGS, explain, of_hydra, settled, swept
+from sweeps.hydra_runs import run_hydra
 
 if TYPE_CHECKING:
+    from reports.runs import Run
     from sweeps.execute import Ended
-    from sweeps.measurement import Job
-
-
-@dataclass
-class Sweep:
-    """The sweep of a call of `main`: the `folder` where jobs record how they ended, None without a
-    sweep, and the jobs that wait to be measured in turns, with their numbers."""
-
-    folder: Path | None = None
-    waiting: list[tuple[int, Job]] = field(default_factory=list)
-
-
-_sweep: ContextVar[Sweep] = ContextVar("sweep")
-"""The sweep of the present call of `main`. Hydra itself makes the object that learns of a sweep."""
-
-
-class SweepCallback(Callback):
-    """Notes that a sweep starts; run.yaml lists it among Hydra's callbacks."""
-
-    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Note the folder of the sweep, before its launcher is made."""
-        from sweeps.execute import join_cluster
-
-        _sweep.get().folder = Path(config.hydra.sweep.dir)
-        join_cluster(config)
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run one job, a sweep, or Hydra's own help, as the overrides and flags in `argv` say.
+    """Run what the overrides and flags in `argv` say.
 
-    In a sweep, a failed job is reported at once and the others still run; the table at the end
-    lists all of them. Raises the error of a job, or SteerbenchError for a wrong setting.
+    The table at the end lists all jobs of a sweep. Raises the error of a job, or SteerbenchError
+    for a wrong setting.
     """
-    if several := swept([word for word in argv if word.startswith("outputs=")]):
-        got = ", ".join(several["outputs"])
-        raise unexpected("outputs", "one folder, for the table of all jobs", got)
-    # Hydra's parser accepts overrides only in one contiguous block, so flags go first.
-    flags = [word for word in argv if word.startswith("-") or not re.search("^~|=", word)]
-    sys.argv = [sys.argv[0], *flags, *(word for word in argv if word not in flags)]
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its errors instead of printing them
-    _hide_subcommand_from_completion()
-    errors: list[Exception] = []
-
-    def job(config: DictConfig) -> None:
-        present = HydraConfig.get()
-        sources = present.runtime.config_sources
-        folders = [f"--config-dir={x.path}" for x in sources if x.provider == "command-line"]
-        command = ["steerbench", "run", *folders, *present.overrides.task]
-        if present.mode == RunMode.MULTIRUN:
-            _one_of_many(settled(config), command)
-            return
-        try:
-            _alone(settled(config), command)
-        except Exception as error:
-            errors.append(error)  # bypasses Hydra, which would print it in its own way
-
-    token = _sweep.set(sweep := Sweep())
-    try:
-        hydra.main(str(CONFIGS), "run", version_base="1.3")(job)()
-    except Exception as error:
-        errors.append(explain(error, argv) if of_hydra(error) else error)
-    finally:
-        _sweep.reset(token)
-    if sweep.folder is not None:
-        errors += _in_turns(sweep.waiting, sweep.folder)
-        _finish(sweep.folder)
+    words, form = _without_form(argv)
+    ended, errors = run_hydra(words, lambda config, command: _alone(config, command, form))
+    if ended:
+        _finish(ended, form)
     if errors:
         raise errors[0]
     return 0
@@ -98,112 +33,62 @@ def main(argv: Sequence[str]) -> int:
 # These load torch, which --help and completion do not need.
 
 
-def _alone(config: DictConfig, command: Sequence[str]) -> None:
+def _alone(config: DictConfig, command: Sequence[str], form: str | None) -> None:
     """Obtain the run that `config` describes, print its tables, write the page it asks for."""
     from reports.runs import load_runs
     from sweeps.measurement import Job, obtain
     from sweeps.terminal import say_missing, show_run, write_page
 
     job = Job(config, command)
-    (key,), measured = obtain([job])
-    labels = {key: HydraConfig.get().runtime.choices["method"]}
-    (run,) = load_runs(job.store, labels)
-    what = run.facts[["method", "scene", "trajectory", "resolution", "budget", "protocol"]]
-    show_run(run, f"{', '.join(what)}, seed {run.facts['seed']}")
-    if not measured:
+    (key,), fresh = obtain([job])
+    (run,) = load_runs(job.store, [key])
+    if form:
+        _show([run], {}, form)
+    else:
+        facts = ("method", "scene", "trajectory", "resolution", "budget", "protocol")
+        show_run(run, f"{', '.join(run.facts[list(facts)])}, seed {run.facts['seed']}")
+    if not fresh:
         say_missing([run])
-    write_page(config.report, job.store, labels)
+    write_page(config.report, job.store, [key])
 
 
-def _one_of_many(config: DictConfig, command: Sequence[str]) -> None:
-    from sweeps.execute import attempt
-    from sweeps.measurement import Job
-    from sweeps.processes import set_up
-
-    set_up()  # the launcher may have started this process
-    present = HydraConfig.get()
-    sizes = _sizes(Path(present.runtime.output_dir) / "multirun.yaml")
-    name = label(present.runtime.choices["method"], present.overrides.task, sizes or ())
-    total = 0 if sizes is None else prod(sizes.values())
-    number, folder = present.job.num, Path(present.runtime.output_dir)
-    if config.in_turns:
-        launcher = present.runtime.choices["hydra/launcher"]
-        if launcher != "basic":
-            expected = "false with a launcher, because one process renders all frames"
-            raise unexpected("in_turns", expected, f"true with hydra/launcher={launcher}")
-        _sweep.get().waiting.append((number, Job(config, command, name, turns="sweep")))
-    elif errors := attempt([(number, Job(config, command, name))], total, folder):
-        raise errors[0]
-
-
-def _in_turns(waiting: Sequence[tuple[int, Job]], folder: Path) -> list[Exception]:
-    """Measure the jobs of a sweep: those that differ only in their method together, in turns."""
-    from bench.results import content_key
-    from sweeps.execute import attempt
-
-    groups: dict[str, list[tuple[int, Job]]] = {}
-    for number, job in waiting:
-        of_method = ("method", "engine", "precision")
-        shared = {name: of for name, of in job.settings.items() if name not in of_method}
-        groups.setdefault(content_key(shared), []).append((number, job))
-    return [error for group in groups.values() for error in attempt(group, len(waiting), folder)]
-
-
-def _sizes(file: Path) -> dict[str, int] | None:
-    """How many values each swept setting has, by the file of Hydra's own sweeper; else None."""
-    if not file.exists():
-        return None
-    sweep = OmegaConf.load(file).hydra
-    params = sweep.sweeper.get("params") or {}
-    words = [*(f"{name}={values}" for name, values in params.items()), *sweep.overrides.task]
-    values = swept(words, GlobalHydra.instance().config_loader())
-    return {name: len(several) for name, several in values.items()}
-
-
-def label(method: str, overrides: Sequence[str], names: Collection[str]) -> str:
-    """The label of a job among others: its method, and its values of the settings `names`.
-
-    A name is shortened to its last part unless that is ambiguous.
-    """
-    settings = dict(word.split("=", 1) for word in overrides if "=" in word)
-    names = [name for name in names if name in settings and name != "method"]
-    ends = [name.rpartition(".")[2] for name in names]
-    shown = [
-        f"{end if ends.count(end) == 1 else name}={settings[name]}"
-        for name, end in zip(names, ends, strict=True)
-    ]
-    return f"{method} ({', '.join(shown)})" if shown else method
-
-
-def _finish(folder: Path) -> None:
+def _finish(ended: Sequence[Ended], form: str | None) -> None:
     """Print one table of all jobs that have ended, and write the pages that they requested."""
     from bench.results import Store
-    from reports.comparison import comparison
-    from reports.runs import load_runs, over_common_frames
-    from sweeps.execute import read
-    from sweeps.terminal import say_missing, show, write_page
+    from reports.runs import load_runs
+    from sweeps.terminal import say_missing, write_page
 
-    def labels(jobs: Sequence[Ended]) -> tuple[dict[str, str], dict[str, str]]:
-        """Names of the runs by key, and reasons of failed jobs by name."""
-        runs: dict[str, str] = {}
-        for job in jobs:
-            if job.run:  # equal jobs share one
-                runs[job.run] = ", ".join(filter(None, (runs.get(job.run), job.name)))
-        return runs, {job.name: job.failure for job in jobs if job.failure}
+    def of(jobs: Sequence[Ended]) -> tuple[list[str], dict[str, str]]:
+        """Keys of the runs, equal ones once, and reasons of failed jobs by name."""
+        failed = {job.name: job.failure for job in jobs if job.failure}
+        return list(dict.fromkeys(job.run for job in jobs if job.run)), failed
 
-    if not (ended := read(folder)):
-        return
     store = Store(Path(ended[0].outputs))
-    names, failed = labels(ended)
-    runs = over_common_frames(load_runs(store, names))
-    show(comparison(runs, failed))
+    keys, failed = of(ended)
+    runs = load_runs(store, keys)
+    _show(runs, failed, form)
     say_missing(runs)
     for report in dict.fromkeys(job.report for job in ended):
-        write_page(report, store, *labels([job for job in ended if job.report == report]))
+        write_page(report, store, *of([job for job in ended if job.report == report]))
 
 
-def _hide_subcommand_from_completion() -> None:
-    """Hydra's completion knows no subcommands: show it `steerbench run a=b` as `steerbench a=b`."""
-    program, _, rest = os.environ.get("COMP_LINE", "").lstrip().partition(" ")
-    if rest.lstrip().startswith("run "):
-        os.environ["COMP_LINE"] = f"{program} {rest.lstrip().removeprefix('run ')}"
+def _show(runs: Sequence[Run], failed: Mapping[str, str], form: str | None) -> None:
+    """Print the tables of `runs`, in the `form` that is asked for."""
+    from reports.comparison import columns_of, comparison
+    from reports.lines import as_lines
+    from sweeps.terminal import show
+
+    lines = as_lines(runs)
+    tables = comparison(lines, failed)
+    for table in tables[:1] if form else tables:
+        show(table, lines.frame(columns_of(lines)), form)
+
+
+def _without_form(argv: Sequence[str]) -> tuple[list[str], str | None]:
+    """The words that are Hydra's, and the form of tables that --format asks for."""
+    from sweeps.cli import TYPES, Parser
+
+    parser = Parser(prog="steerbench run", add_help=False, allow_abbrev=False)
+    parser.add_argument("--format", **TYPES["form"])
+    options, words = parser.parse_known_args(argv)
+    return words, options.format

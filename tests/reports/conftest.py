@@ -73,7 +73,8 @@ def measured_of(table: PaperTable, runs: Mapping[str, Run]) -> dict[Place, Repea
 
 def run_of(rows: pd.DataFrame, label: str = "run", **record: object) -> Run:
     """A run that has nothing but `rows` and a `record`."""
-    return Run(label, label, rows, pd.DataFrame, record, Path())
+    known = {"made_of": {}, "command": "", **record}
+    return Run(label, label, rows, lambda: pd.DataFrame(columns=["frame", "phase"]), known, Path())
 
 
 def changed(run: Run, figures: Mapping[str, float], **facts: object) -> Run:
@@ -106,7 +107,7 @@ def of_scene(run: Run, scene: str, by: float = 0.0, **facts: object) -> Run:
 @pytest.fixture
 def run(store: Store, stored_run: str) -> Run:
     """A run of six scored frames, three of them pictured."""
-    (found,) = load_runs(store, {stored_run: "run"})
+    (found,) = load_runs(store, [stored_run])
     return found
 
 
@@ -127,18 +128,26 @@ def rewrite(store: Store, key: str, **others: object) -> None:
     path.write_text(json.dumps(record))
 
 
+def rename(store: Store, key: str, method: str) -> None:
+    """Change the method of a stored run."""
+    path = store.folder / key / "rows.csv"
+    pd.read_csv(path).assign(method=method).to_csv(path, index=False)
+
+
 @pytest.fixture
 def several(store: Store, stored_run: str) -> tuple[Store, dict[str, str]]:
-    """A store with six runs of the same frames, and what each is called.
+    """A store with six runs of the same frames, and the method of each.
 
     The last was made on another machine; all else is the same.
     """
     labels = {stored_run: "first"}
+    rename(store, stored_run, "first")
     for number in range(5):
         key = f"{number}{stored_run[1:]}"
         folder = shutil.copytree(store.folder / stored_run, store.folder / key)
         for file in (folder / "rows.csv", folder / "record.json"):
             file.write_text(file.read_text().replace(stored_run, key))
         labels[key] = f"copy {number}"
+        rename(store, key, labels[key])
     rewrite(store, key, machine={"cpu": "another"})
     return store, labels

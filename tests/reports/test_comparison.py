@@ -6,6 +6,7 @@ import pytest
 
 from bench.errors import SteerbenchError
 from reports.comparison import comparison, ranks, shown_as
+from reports.lines import as_lines
 from reports.runs import Repeated, Run
 from tests.reports.conftest import changed, elsewhere, run_of
 
@@ -24,13 +25,18 @@ def make(rows):
     return make_run
 
 
+def table_of(runs):
+    """The first table of a comparison."""
+    return comparison(as_lines(runs), {})[0]
+
+
 def bold(table) -> set[tuple[str, str]]:
     """Label and column of every bold cell."""
     return {(table.lines[row][0], table.columns[column]) for row, column in table.bold}
 
 
 def test_every_run_has_a_line_with_quality_speed_size_and_training(make):
-    table = comparison([make("ngp"), make("nerf", ssim=math.nan)], {})
+    table = table_of([make("ngp"), make("nerf", ssim=math.nan)])
     assert table.columns[1:4] == ("PSNR, dB ↑", "SSIM ↑", "LPIPS alex ↓")
     assert table.columns[4:] == ("ms / frame ↓", "FPS ↑", "model, MB ↓", "training, s ↓")
     assert table.lines[0] == ("ngp", "30.46", "0.9877", "n/a", "200.0", "5.00", "25.20", "61")
@@ -38,7 +44,7 @@ def test_every_run_has_a_line_with_quality_speed_size_and_training(make):
 
 
 def test_the_best_is_the_highest_or_the_lowest_as_the_arrow_says(make):
-    table = comparison([make("slow", psnr=31.0, frame_ms=300.0), make("fast", psnr=29.0)], {})
+    table = table_of([make("slow", psnr=31.0, frame_ms=300.0), make("fast", psnr=29.0)])
     assert ("slow", "PSNR, dB ↑") in bold(table)
     assert ("fast", "ms / frame ↓") in bold(table)
     assert not {("fast", "PSNR, dB ↑"), ("slow", "ms / frame ↓")} & bold(table)
@@ -48,15 +54,27 @@ def test_the_best_is_the_highest_or_the_lowest_as_the_arrow_says(make):
 def test_one_run_or_runs_of_different_kinds_have_no_best(make):
     other = changed(make("c"), {}, protocol="quick")
     runs = [make("a"), elsewhere(make("b")), other, make("d", digest="other")]
-    assert bold(comparison(runs, {})) == set()
+    assert bold(table_of(runs)) == set()
 
 
-def test_cold_frames_have_a_line_of_their_own_and_compete_among_themselves(make, rows_with_cold):
-    table = comparison([make("a"), *(make(label, rows_with_cold) for label in "bc")], {})
-    assert [line[0] for line in table.lines] == ["a", "b", "b, cold", "c", "c, cold"]
-    assert [line[1] for line in table.lines] == ["30.46", "30.46", "27.46", "30.46", "27.46"]
-    assert table.lines[2][-4:] == ("400.0", "2.50", "25.20", "61")
-    assert ("b, cold", "PSNR, dB ↑") in bold(table)
+def test_cold_frames_have_a_table_of_their_own_and_compete_among_themselves(make, rows_with_cold):
+    runs = [make("a"), *(make(label, rows_with_cold) for label in "bc")]
+    table, cold = comparison(as_lines(runs), {})
+    assert [line[:2] for line in table.lines] == [("a", "30.46"), ("b", "30.46"), ("c", "30.46")]
+    assert [line[:2] for line in cold.lines] == [("b", "27.46"), ("c", "27.46")]
+    assert cold.columns[-1] == "ms / frame ↓"
+    assert cold.lines[0][-1] == "400.0"
+    assert ("b", "PSNR, dB ↑") in bold(cold)
+
+
+def test_a_mean_shares_the_rank_of_a_better_one_within_their_intervals(make):
+    def line(*psnr: float) -> Repeated:
+        return Repeated("", [make("m", psnr=each) for each in psnr])
+
+    best, close, far = line(31.0, 31.2), line(30.9, 31.1), line(20.0, 20.01)
+    assert ranks([best, close, far], "psnr") == {0: 1, 1: 1, 2: 2}
+    single = [line(31.1), line(31.0), line(20.0)]  # nothing is known of their spread
+    assert ranks(single, "psnr") == {0: 1, 1: 2}
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from reports import publish
 from reports.images import ComparedFrame, RunView
 from reports.page import write_page
 from reports.tables import Table
-from tests.reports.conftest import rewrite
+from tests.reports.conftest import rename, rewrite
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 FIRST = re.compile(r"first: tiny, .*, frame 1 of 6")
@@ -136,7 +136,8 @@ def test_names_are_text_and_nothing_else(store, stored_run, tmp_path):
     rows = store.folder / stored_run / "rows.csv"
     rows.write_text(rows.read_text().replace(",tiny,", f",{HOSTILE},"))
     rewrite(store, stored_run, command=HOSTILE, error_map=HOSTILE)
-    write_page(store, {stored_run: HOSTILE}, tmp_path / "page", {HOSTILE: HOSTILE})
+    rename(store, stored_run, HOSTILE)
+    write_page(store, [stored_run], tmp_path / "page", {HOSTILE: HOSTILE})
     text = (tmp_path / "page" / "report.html").read_text()
     assert "<script>x" not in text
     assert text.count("&lt;script&gt;x") > 10

@@ -63,7 +63,7 @@ def test_list_shows_choices_backends_and_why_an_engine_cannot_be_used(steerbench
         (["results", "--format", "cvs"], "invalid choice: 'cvs'"),
         (["kernels", "--repeats", "0"], "--repeats: expected 1 or more, got 0"),
         (["kernels", "--repeats", "many"], "--repeats: expected 1 or more, got many"),
-        (["paper", "--table", "tabel1"], "unknown table 'tabel1'. Did you mean table1"),
+        (["table", "tabel1"], "unknown table 'tabel1'. Did you mean table1"),
         (["scenes", "verify", os.curdir], "expected a folder chair or drums or"),
         (["scenes", "get", "lgeo"], "lego"),
         # Options and settings are read in any order.

@@ -98,14 +98,14 @@ def test_what_the_document_makes_is_listed_measured_and_studied(steerbench, mine
 
 
 def test_the_method_of_the_document_has_a_line_in_a_table(mine, monkeypatch):
-    seen = captured(monkeypatch, typed("paper .* --table table1"))
+    seen = captured(monkeypatch, typed("table table1"))
     (table,) = chosen(seen.table, seen.overrides, seen.methods)
     assert "mean_colour" in [job.label for job in plan(table, seen.overrides)]
-    assert captured(monkeypatch, typed("report .* --table table1")).methods == seen.methods
+    assert captured(monkeypatch, typed("report .* --table table1")).beside == seen.beside
 
 
 def test_the_table_of_the_document_is_measured_reported_and_the_same_sweep(steerbench, mine):
-    words = typed("paper --config-dir configs --table shades")
+    words = typed("table shades --config-dir configs")
     steerbench(*words, *WITHOUT_LPIPS).ok()
     page = Path("outputs/paper/report.md")
     written = page.read_text()

@@ -9,8 +9,8 @@ import pytest
 
 from bench.errors import SteerbenchError
 from sweeps import execute
-from sweeps.commands.run import label
 from sweeps.execute import Ended, read
+from sweeps.hydra_runs import label
 from sweeps.measurement import Job, obtain, stored
 from sweeps.overrides import composed
 from sweeps.plan import plan
@@ -176,13 +176,13 @@ SMALL = [
 @pytest.mark.slow
 def test_what_was_trained_ahead_is_found_when_it_is_measured(steerbench, monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
-    outcome = steerbench("paper", "--table", "table5", *SMALL).ok()
+    outcome = steerbench("table", "table5", *SMALL).ok()
     assert "training 2 models, 2 at a time" in outcome.err
     assert outcome.err.count("trained in") == 2
     _, measured = outcome.err.split("1 of 6", 1)
     assert "training the 2D renderer: done" not in measured
     assert measured.count("training the 2D renderer: found in") == 6
 
-    again = steerbench("paper", "--table", "table5", *SMALL)
+    again = steerbench("table", "table5", *SMALL)
     assert "models" not in again.err
     assert again.err.count("already measured") == 6

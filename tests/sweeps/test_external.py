@@ -105,7 +105,7 @@ def test_the_worker_of_the_document_has_a_line_in_a_table(steerbench, documented
 
 
 def test_the_worker_of_the_document_is_drawn_along_a_path(steerbench, documented):
-    steerbench("render", *documented, *WHITE, "--beside", "grey", "--output", "there").ok()
+    steerbench("render", *documented, *WHITE, "--beside", "grey", "--to", "there").ok()
     for picture in pictures("there"):  # white as the scene, and beside it the grey
         assert (picture[:, :40] == 255).all()
         assert (picture[:, 40:] == 128).all()

@@ -27,7 +27,7 @@ ROUNDS = "protocol.rounds=2"
         ["skips", ROUNDS],
         ["accuracy", ROUNDS, "--only", "stop"],
         ["scaling", ROUNDS, "--only", "L"],
-        ["paper", "--table", "table2"],
+        ["table", "table2"],
         ["kernels", "--filter", "adam"],
     ],
     ids=" ".join,

@@ -78,7 +78,7 @@ def labels(page: Path) -> list[str]:
 
 
 def test_a_job_that_fails_stands_in_its_line_and_the_others_run(steerbench, measured, outputs):
-    outcome = steerbench("paper", "--table", "table3", "seed=0", outputs)
+    outcome = steerbench("table", "table3", "seed=0", outputs)
     assert outcome.status == 1
     assert len(measured) == 4 * (1 + 2)  # lines; twice each for their curves
     assert "failed: table3: L = 3, seed 0: no room" in outcome.err
@@ -89,14 +89,14 @@ def test_a_job_that_fails_stands_in_its_line_and_the_others_run(steerbench, meas
 
 
 def test_the_jobs_go_where_hydras_launcher_puts_them(steerbench, measured, launched, outputs):
-    assert steerbench("paper", "--table", "table5", "seed=0", outputs).status == 0
+    assert steerbench("table", "table5", "seed=0", outputs).status == 0
     assert launched == [len(measured)]
 
 
 def test_what_cannot_run_here_says_so_and_does_not_fail(steerbench, monkeypatch, outputs):
     cause = Unavailable("no bfloat16 on this CPU")
     monkeypatch.setattr(execute, "obtain", Mock(side_effect=cause))
-    outcome = steerbench("paper", "--table", "table3", "seed=0", outputs).ok()
+    outcome = steerbench("table", "table3", "seed=0", outputs).ok()
     page = Path(re.search(r"report: (.*)", outcome.err)[1])
     assert labels(page)[0] == "L = 0: failed: no bfloat16 on this CPU"
 
@@ -200,7 +200,7 @@ def test_a_failure_stands_beside_what_was_measured_before(scenes, tmp_path, else
 @pytest.fixture
 def psnr(store: Store, stored_run: str, monkeypatch: pytest.MonkeyPatch, elsewhere: None):
     """Gathers lines of Table 5 from the PSNR of each line, scene and seed that was measured."""
-    (source,) = load_runs(store, {stored_run: "run"})
+    (source,) = load_runs(store, [stored_run])
     monkeypatch.setattr(paper, "of_scene", lambda run, config: True)
 
     def lines(found: Mapping[tuple[int, str, int], float], scenes: str, seeds: str):

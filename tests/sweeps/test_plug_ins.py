@@ -81,8 +81,8 @@ THERE = "There are: diver, external, gaussians, kilonerf, mine, nerf, nerfbaseli
           for name in ("run", "accuracy")),
         *((f"{name} --config-dir nowhere", "expected a folder, there is none at nowhere")
           for name in ("list", "report")),
-        ("report --with mein", "Did you mean mine?"),
-        ("report --table table3 --with mine", "--with: table3 compares no methods; table1 does"),
+        ("report --beside mein", "Did you mean mine?"),
+        ("report --table table3 --beside mine", "table3 compares no methods; table1 does"),
     ],
 )  # fmt: skip
 def test_a_word_that_leads_nowhere_is_answered(call, argv, said):

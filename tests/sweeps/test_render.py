@@ -23,7 +23,7 @@ def test_every_frame_of_a_run_is_written_and_its_path_can_be_followed_and_timed(
     steerbench("run", "method=ngp", *SCENE, *QUICK, *PROTOCOL).ok()
     (run,) = Store(Path("outputs")).rows()["run"].unique()
 
-    outcome = steerbench("render", "--run", run[:6], "--output", "there").ok()
+    outcome = steerbench("render", "--run", run[:6], "--to", "there").ok()
     assert "trained field found" in outcome.err
     there = pictures("there")
     assert [picture.shape for picture in there] == [(24, 24, 3)] * 2
@@ -32,7 +32,7 @@ def test_every_frame_of_a_run_is_written_and_its_path_can_be_followed_and_timed(
 
     path = json.loads(Path("there/path.json").read_text())
     assert len(path["camera_path"]) == 2
-    words = ["--run", run, "--path", "there/path.json", "--beside", "ngp", "--output", "again"]
+    words = ["--run", run, "--path", "there/path.json", "--beside", "ngp", "--to", "again"]
     steerbench("render", *words).ok()
     for before, after in zip(there, pictures("again"), strict=True):
         left, right = after[:, :24], after[:, 24:]

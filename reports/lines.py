@@ -1,0 +1,164 @@
+"""Runs as lines of a table: seeds are repetitions, and settings that differ are columns."""
+
+from __future__ import annotations
+
+import shlex
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from bench.results import Store, content_key
+from reports.runs import Repeated, Run, over_common_frames, readable
+
+METHOD = "method"  # the first column
+
+FACTS = ("scene", "resolution", "trajectory", "budget", "protocol", "device", "engine", "precision")
+"""Columns of rows that are shown where they differ, beside the method."""
+
+HIDDEN = ("seed", "pictures", "budget.name", "protocol.name", "scene.name", "method.name")
+"""Settings that make no column: repetitions, what changes no figure, and what `FACTS` show."""
+
+LOGARITHM = "log2_"  # begins the names of settings that are exponents of 2
+
+
+@dataclass(frozen=True)
+class Lines:
+    """`runs` that differ only in their seed make one of `lines`, in the order of the first of them.
+
+    `settings` are the columns before the figures: the method, then what differs between the lines,
+    with the value of each line.
+    """
+
+    lines: Sequence[Repeated]
+    settings: Mapping[str, Sequence[str]]
+
+    @property
+    def runs(self) -> list[Run]:
+        """The runs of all lines."""
+        return [run for line in self.lines for run in line.runs]
+
+    @property
+    def cells(self) -> list[tuple[str, ...]]:
+        """The settings of each line."""
+        return list(zip(*self.settings.values(), strict=True))
+
+    def frame(self, metrics: Sequence[str]) -> pd.DataFrame:
+        """A row each: settings, number of seeds, means of metrics and halves of their intervals."""
+        figures: dict[str, Sequence[Any]] = {
+            **self.settings,
+            "seeds": [len(line.runs) for line in self.lines],
+        }
+        for metric in metrics:
+            figures[metric] = [line.mean(metric) for line in self.lines]
+            figures[f"{metric}.half"] = [line.half(metric) for line in self.lines]
+        return pd.DataFrame(figures)
+
+
+def as_lines(runs: Sequence[Run]) -> Lines:
+    """The lines of `runs`, over the frames that are steady in all of them.
+
+    The label of a run is shown as its method.
+    """
+    by_line: dict[str, list[Run]] = {}
+    for run in over_common_frames(runs):
+        by_line.setdefault(_line_of(run), []).append(run)
+    firsts = [of_line[0] for of_line in by_line.values()]
+    settings = {METHOD: [run.label for run in firsts], **differing(firsts)}
+    columns = list(settings.items())
+    lines = []
+    for index, of_line in enumerate(by_line.values()):
+        own = ((name, values[index]) for name, values in columns[1:] if values[index])
+        shown = ", ".join((columns[0][1][index], *(f"{name}={value}" for name, value in own)))
+        lines.append(Repeated(shown, of_line))
+    return Lines(lines, settings)
+
+
+def differing(runs: Sequence[Run]) -> dict[str, list[str]]:
+    """What `varied` finds, under short names: the symbol of the paper, or the last part."""
+    columns = varied(runs)
+    symbols = {name: of for run in runs for name, of in run.record.get("axes", {}).items()}
+    ends = [name.rpartition(".")[2] for name in columns]
+    short = {
+        name: symbols.get(name) or (end if ends.count(end) == 1 else name)
+        for name, end in zip(columns, ends, strict=True)
+    }
+    return {short[name]: values for name, values in columns.items()}
+
+
+def varied(runs: Sequence[Run]) -> dict[str, list[str]]:
+    """The facts and the settings beside method and seed that differ between `runs`, with their
+    values.
+
+    Settings of a method are compared with those of the same method. One that follows from columns
+    that are shown already is left out, unless it was typed.
+    """
+    columns = {
+        fact: values
+        for fact in FACTS
+        if len(set(values := [str(run.facts[fact]) for run in runs])) > 1
+    }
+    facts = dict(columns)
+    methods = [str(run.facts[METHOD]) for run in runs]
+    settings = [_settings(run) for run in runs]
+    typed = {word for run in runs for word in _typed(run)}
+    names = dict.fromkeys(name for of_run in settings for name in of_run)
+    for name in sorted(names, key=lambda name: name not in typed):
+        values = [of_run.get(name, "") for of_run in settings]
+        shown = columns if name not in typed or name.partition(".")[0] in facts else {}
+        if not (_follows([methods], values) or _follows([methods, *shown.values()], values)):
+            columns[name] = values
+    return columns
+
+
+def results(store: Store, report: Callable[[str], object] = warnings.warn) -> pd.DataFrame:
+    """Every row of all runs, with a column for each setting that differs between them.
+
+    `report` gets a line on each schema that cannot be read.
+    """
+    runs = readable(store, report=report)
+    own = {name: values for name, values in varied(runs).items() if name not in FACTS}
+    rows = [
+        run.rows.assign(**{name: values[index] for name, values in own.items()})
+        for index, run in enumerate(runs)
+    ]
+    return pd.concat(rows, ignore_index=True) if rows else store.rows()
+
+
+def _follows(known: Sequence[Sequence[str]], values: Sequence[str]) -> bool:
+    """Whether runs with the same values of all `known` columns have the same of `values`."""
+    places = list(zip(*known, strict=True))
+    return len(set(zip(places, values, strict=True))) == len(set(places))
+
+
+def _line_of(run: Run) -> str:
+    """Equal for runs that differ only in their seed."""
+    if "config" not in run.record["made_of"]:
+        return run.key
+    return content_key({"settings": _settings(run), "where": list(map(str, run.conditions))})
+
+
+def _settings(run: Run) -> dict[str, str]:
+    """The settings of a run by name, without seeds, as text; none for scored pictures."""
+    config = run.record["made_of"].get("config", {})
+    (flat,) = pd.json_normalize(config).to_dict("records") or [{}]
+    kept = {str(name): value for name, value in flat.items() if name not in HIDDEN}
+    return {name: _text(name, value) for name, value in kept.items() if not _is_seed(name)}
+
+
+def _is_seed(name: str) -> bool:
+    return name.startswith("method.") and name.endswith(".seed")
+
+
+def _text(name: str, value: Any) -> str:
+    if value is None:
+        return "null"
+    return f"2^{value}" if name.rpartition(".")[2].startswith(LOGARITHM) else str(value)
+
+
+def _typed(run: Run) -> list[str]:
+    """The names of the settings that were typed for a run."""
+    words = shlex.split(str(run.record["command"]))
+    return [word.lstrip("+").partition("=")[0] for word in words if "=" in word]
