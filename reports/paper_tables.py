@@ -64,9 +64,8 @@ class PaperTable:
     set. `notes` are what a reader should know before comparing, `claims` what the paper concludes;
     in what a claim says, {KEY} is what this line is called. Distances are those to the line
     `reference`, by default the first. For a line that was not measured stands the one that
-    `instead` has for it. The metrics `scenes` are also shown for every scene of a data set. Where a
-    table compares times, its lines are measured `in_turns`, frame by frame. With `curve`, the lines
-    are also shown as curves over the training.
+    `instead` has for it. The metrics `scenes` are also shown for every scene of a data set. With
+    `curve`, the lines are also shown as curves over the training.
     """
 
     name: str
@@ -80,7 +79,6 @@ class PaperTable:
     notes: Sequence[str] = ()
     claims: Sequence[Claim] = ()
     scenes: Sequence[str] = ()
-    in_turns: bool = False
     curve: bool = False
     reference: str = ""
     instead: Mapping[str, str] = field(default_factory=dict)

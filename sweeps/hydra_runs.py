@@ -20,7 +20,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from bench.errors import unexpected
-from sweeps.overrides import CONFIGS, explain, of_hydra, settled, swept
+from sweeps.overrides import CONFIGS, explain, of_hydra, searched, settled, swept
 
 if TYPE_CHECKING:  # these load torch, which --help and completion do not need
     from sweeps.execute import Ended
@@ -75,11 +75,12 @@ def run_hydra(
         sources = present.runtime.config_sources
         folders = [f"--config-dir={x.path}" for x in sources if x.provider == "command-line"]
         command = ["steerbench", "run", *folders, *present.overrides.task]
+        config = settled(config, searched(folders)[1:])
         if present.mode == RunMode.MULTIRUN:
-            _one_of_many(settled(config), command)
+            _one_of_many(config, command)
             return
         try:
-            alone(settled(config), command)
+            alone(config, command)
         except Exception as error:
             errors.append(error)  # bypasses Hydra, which would print it in its own way
 
@@ -100,7 +101,7 @@ def run_hydra(
 
 def _one_of_many(config: DictConfig, command: Sequence[str]) -> None:
     from sweeps.execute import attempt
-    from sweeps.measurement import Job
+    from sweeps.measurement import Job, turns_of
     from sweeps.processes import set_up
 
     set_up()  # the launcher may have started this process
@@ -114,7 +115,8 @@ def _one_of_many(config: DictConfig, command: Sequence[str]) -> None:
         if launcher != "basic":
             expected = "false with a launcher, because one process renders all frames"
             raise unexpected("in_turns", expected, f"true with hydra/launcher={launcher}")
-        _sweep.get().waiting.append((number, Job(config, command, name, turns="sweep")))
+        turns = turns_of(present.runtime.choices.get("experiment", "sweep"), config)
+        _sweep.get().waiting.append((number, Job(config, command, name, turns)))
     elif errors := attempt([(number, Job(config, command, name))], total, folder):
         raise errors[0]
 

@@ -58,7 +58,8 @@ def described(config: DictConfig) -> dict[str, Any]:
     unused = () if "engine" in plain["method"] else ("engine", "precision")
     left_out = ("split", "tables", "in_turns", *PLACES, *unused)
     kept = {key: value for key, value in plain.items() if key not in left_out}
-    kept["scene"] = {name: value for name, value in plain["scene"].items() if name != "root"}
+    for group, place in (("scene", "root"), ("method", "folders")):
+        kept[group] = {name: value for name, value in plain[group].items() if name != place}
     if "path" in kept["scene"]:
         kept["scene"]["path"] = Path(kept["scene"]["path"]).name
     return kept
@@ -71,6 +72,12 @@ def job_key(settings: Mapping[str, Any], turns: str) -> str:
         return content_key({"settings": settings, "turns": turns} if turns else settings)
     except ValueError as error:
         raise unexpected("settings", "finite numbers", error) from error
+
+
+def turns_of(name: str, config: DictConfig) -> str:
+    """The `turns` of jobs of the sweep `name` that share scene and seed."""
+    scene = Path(config.scene.get("path") or config.scene.get("name", "")).name
+    return f"{name}, {config.seed}, {scene}"
 
 
 def reason(error: BaseException) -> str:

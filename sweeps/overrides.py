@@ -47,16 +47,17 @@ def composed(words: Sequence[str], **options: bool) -> DictConfig:
     overrides = [*_overrides(words), *([f"hydra.searchpath=[{paths}]"] if paths else [])]
     try:
         with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-            return settled(compose("run", overrides=overrides, **options))
+            return settled(compose("run", overrides=overrides, **options), searched(words)[1:])
     except Exception as error:
         if not of_hydra(error):
             raise
         raise explain(error, words) from error
 
 
-def settled(config: DictConfig) -> DictConfig:
+def settled(config: DictConfig, folders: Sequence[Path]) -> DictConfig:
     """`config` as a run needs it: without the declaration of a table or a study, which only plans
-    read, and with the validation trajectory if split=validation asks for it.
+    read; with the validation trajectory if split=validation asks for it; and with the `folders` of
+    further choices, where a method looks for files that its own YAML names.
 
     From here on only the trajectory determines which pictures are scored, hence held out.
     """
@@ -67,6 +68,8 @@ def settled(config: DictConfig) -> DictConfig:
     if asked == VALIDATION and there != VALIDATION:
         node = OmegaConf.load(CONFIGS / "trajectory" / f"{VALIDATION}.yaml")
         OmegaConf.update(config, "trajectory", node, merge=False, force_add=True)
+    if OmegaConf.select(config, "method.folders") is not None:
+        OmegaConf.update(config, "method.folders", [str(folder / "method") for folder in folders])
     return config
 
 
@@ -148,7 +151,7 @@ def explain(error: Exception, words: Sequence[str]) -> SteerbenchError:
 
 def _settings(words: Sequence[str]) -> list[str]:
     """All settings that exist with the choices (scene=blender) in `words`."""
-    groups = {path.name for folder in _folders(words) for path in folder.iterdir() if path.is_dir()}
+    groups = {path.name for folder in searched(words) for path in folder.iterdir() if path.is_dir()}
     there = {f"{group}={name}" for group in groups for name in choices(group, words)}
     chosen = [word for word in words if word in there]
     config: Any = composed([*folder_words(words), *chosen])
@@ -184,7 +187,7 @@ def choices(group: str, words: Sequence[str] = ()) -> dict[str, Path]:
     """The file of every choice of `group` by name, including folders named in `words`."""
     found = {
         path.stem: path
-        for folder in reversed(_folders(words))  # for equal names, the first folder wins
+        for folder in reversed(searched(words))  # for equal names, the first folder wins
         for path in (folder / group).glob("*.yaml")
     }
     return dict(sorted(found.items()))
@@ -228,7 +231,7 @@ def _overrides(words: Sequence[str]) -> list[str]:
     return [word for word in words if not word.startswith(f"{FLAGS[0]}=")]
 
 
-def _folders(words: Sequence[str]) -> list[Path]:
+def searched(words: Sequence[str]) -> list[Path]:
     """Our configurations, the folders named in `words`, and those of installed plug-ins."""
     return [CONFIGS, *_typed(words), *(x for x in plug_ins().values() if isinstance(x, Path))]
 
@@ -268,7 +271,7 @@ class _InstalledChoices(SearchPathPlugin):
     """Appends the plug-ins' folders to Hydra's search path, so that our names take precedence."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        for folder in _folders(())[1:]:
+        for folder in searched(())[1:]:
             search_path.append("steerbench-plug-in", f"file://{folder}")
 
 

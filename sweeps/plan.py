@@ -15,7 +15,7 @@ from bench.errors import SteerbenchError, Unavailable, unexpected
 from reports.paper_tables import CURVES, METHOD, SHARES, Line, PaperTable, point
 from sweeps.configured import build
 from sweeps.data_sets import DataSet, data_set_of
-from sweeps.measurement import Job
+from sweeps.measurement import Job, turns_of
 from sweeps.overrides import changed, choices, composed, setting, swept, target_of, unquoted
 from sweeps.processes import on_gpu
 from sweeps.tables import SEED, grid
@@ -106,8 +106,8 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
             command = ["steerbench", "run", *fixed, *own, "hydra.mode=RUN"]
             parts = (f"{table.name}: {line.label}", scene, f"seed {config.seed}")
             told = ", ".join(filter(None, parts))
-            where_timed = Path(config.scene.get("path") or config.scene.get("name", "")).name
-            turns = f"{table.name}, {seed}, {where_timed}" if each.in_turns else ""
+            timed = experiment.in_turns and each.block != CURVES
+            turns = turns_of(table.name, config) if timed else ""
             where = {"table": table.name, "block": each.block, "line": each.key, "scene": scene}
             jobs.append(Planned(config, command, told, turns, label=line.label, **where))
     return jobs
@@ -134,18 +134,17 @@ class _Wanted(NamedTuple):
     key: str
     line: Line
     data_set: str
-    in_turns: bool
 
 
 def _wanted(table: PaperTable) -> Iterator[_Wanted]:
     """The lines of a table's blocks, then the points of its curves, which are not timed."""
     for data_set, lines in table.blocks.items():
         for key, line in lines.items():
-            yield _Wanted(data_set, key, line, data_set, table.in_turns)
+            yield _Wanted(data_set, key, line, data_set)
     for (key, line), share in product(table.lines.items(), SHARES if table.curve else ()):
         job = {**line.job, AFTER: str(share), **OF_CURVES}
         mark = replace(line, label=f"{line.label}, after {share}", job=job)
-        yield _Wanted(CURVES, point(key, share), mark, table.data_sets[0], False)
+        yield _Wanted(CURVES, point(key, share), mark, table.data_sets[0])
 
 
 def scenes_of(words: Sequence[str], data: DataSet | None = None) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 import shlex
 import shutil
@@ -53,7 +54,9 @@ class External:
     python: str | None
     options: Mapping[str, Any]
     files: list[str]
+    environment: Mapping[str, str]
     lock: str | None
+    folders: list[str]
     start_s: float
     fit_s: float
     frame_s: float
@@ -64,8 +67,13 @@ class External:
 
     @property
     def _typed(self) -> list[str]:
-        """The words of the command."""
-        return _words("method.command", self.command)
+        """The words of the command; files are those beside the YAML, or in the current folder."""
+        words = _words("method.command", self.command)
+        places = [[str(Path(folder) / word) for folder in self.folders] for word in words]
+        return [
+            next(filter(os.path.isfile, of_word), word)
+            for word, of_word in zip(words, places, strict=True)
+        ]
 
     @cached_property
     def _worker(self) -> Worker:
@@ -74,7 +82,7 @@ class External:
             words[0] = str(shipped)
         if words[0].endswith(".py"):
             words.insert(0, self.python or sys.executable)
-        worker = Worker(words, self.start_s)
+        worker = Worker(words, self.start_s, self.environment)
         self._closing = weakref.finalize(self, _close, worker)
         return worker
 
@@ -117,7 +125,7 @@ class External:
         return sorted(file for file in {*loaded, *given, *words} if file.is_file())
 
     @cached_property
-    def _environment(self) -> dict[str, object]:
+    def _packages(self) -> dict[str, object]:
         """The versions of what its environment holds."""
         if self.lock is None:
             return self._about["packages"]
@@ -138,7 +146,7 @@ class External:
             device = f"worker's {device}"  # nothing here can wait for it
         shown = {"device": device, "backend": "external", "field_precision": precision}
         shown |= {"engine": "none", "precision": "none"}
-        return {**shown, "environment": content_key(self._environment)[:16]}
+        return {**shown, "environment": content_key(self._packages)[:16]}
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """Let it train and store the result, load what it stored before, or get ready."""
@@ -189,7 +197,7 @@ class External:
                 sha256(Path(word)) if Path(word).is_file() else word for word in self._typed
             ],
             "files": [sha256(file) for file in self.reads],
-            "environment": self._environment,
+            "environment": [self._packages, dict(self.environment)],
             "device": self._about["device"],
             **computed_by(write_blender),
         }

@@ -24,13 +24,16 @@ END_S = 10.0  # a process that has been told to close is killed after so many se
 
 
 class Worker:
-    """A process that was started with `command` and speaks the protocol of docs/external.md.
+    """A process that was started with `command` and speaks the protocol of docs/external.md; its
+    environment has `variables`, too.
 
     Whatever it does wrong is one SteerbenchError with its name and its last words. It is killed
     then, and so are the processes that it has started.
     """
 
-    def __init__(self, command: Sequence[str], limit_s: float) -> None:
+    def __init__(
+        self, command: Sequence[str], limit_s: float, variables: Mapping[str, str]
+    ) -> None:
         self.name = command[-1]  # until it tells one
         self._output = tempfile.TemporaryFile()  # noqa: SIM115  it is closed by `_end`
         here, there = socket.socketpair()
@@ -40,6 +43,7 @@ class Worker:
             VARIABLE: str(there.fileno()),
             "OMP_NUM_THREADS": str(torch.get_num_threads()),
             "PYTHONUNBUFFERED": "1",  # or its last words are lost
+            **variables,
         }
         try:
             with there:

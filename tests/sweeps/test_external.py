@@ -142,3 +142,25 @@ def test_when_steerbench_is_killed_the_worker_ends(spawn, write, tmp_path):
     process.kill()
     process.wait()
     worker.wait(60)
+
+
+def test_a_worker_beside_its_yaml_is_found_from_anywhere_and_gets_variables(
+    steerbench, write, tmp_path, monkeypatch
+):
+    write("""
+        import os
+        Grey.render = lambda self, camera: np.full(
+            (camera.height, camera.width, 3), float(os.environ["LEVEL"]))
+    """)
+    shutil.copytree(HERE / "configs", tmp_path / "one" / "configs")
+    for name in ("worker.py", "steerbench_worker.py"):
+        shutil.move(tmp_path / name, tmp_path / "one" / "configs" / "method")
+    mine = "defaults: [external, _self_]\ncommand: worker.py\nenvironment: {LEVEL: '1.0'}\n"
+    (tmp_path / "one" / "configs" / "method" / "mine.yaml").write_text(mine)
+    words = ["method=mine", *QUICK[1:], f"outputs={tmp_path / 'outputs'}"]
+    steerbench("run", "--config-dir", str(tmp_path / "one" / "configs"), *words).ok()
+    shutil.move(tmp_path / "one", tmp_path / "two")
+    steerbench("run", "--config-dir", str(tmp_path / "two" / "configs"), *words).ok()
+    assert len(list(tmp_path.glob("outputs/runs/*"))) == 1  # the key knows no folder
+    psnr = rows(tmp_path).set_index("metric").loc["psnr", "value"]
+    assert psnr == math.inf  # white, as the scene is

@@ -18,7 +18,13 @@ from bench.types import Camera, NullProbe, Scene
 from methods.gaussians import ply
 from methods.gaussians.model import Gaussians
 from methods.rendering.frame import FeatureFrame
-from steerbench_worker import serve
+from steerbench_worker import serve, stage
+
+
+class Stages(NullProbe):
+    """Passes the stages of a frame on to steerbench."""
+
+    stage = staticmethod(stage)
 
 
 class Ply:
@@ -41,8 +47,9 @@ class Ply:
         pose = torch.from_numpy(camera.c2w).float()
         lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
         seen = place_camera(Camera(pose, *lens), self.device)
-        pixels = self.gaussians.render(seen, self.stop, NullProbe())
-        frame = FeatureFrame.of(seen, pixels, self.background).picture()
+        pixels = self.gaussians.render(seen, self.stop, Stages())
+        with stage("finish"):
+            frame = FeatureFrame.of(seen, pixels, self.background).picture()
         return {"rgb": frame.rgb, "depth": frame.depth, "alpha": frame.alpha}
 
     def sizes(self) -> dict[str, int]:

@@ -46,6 +46,7 @@ def external() -> Iterator[Callable[..., External]]:
 
     def make(command: object, **settings) -> External:
         usual = {"python": None, "options": {}, "files": [], "lock": None, "seed": 3}
+        usual |= {"environment": {}, "folders": []}
         limits = {"start_s": 60.0, "fit_s": 60.0, "frame_s": 60.0}
         return External(command=str(command), **{**usual, **limits, **settings})
 
