@@ -88,11 +88,11 @@ def quality_plot(
             says = f"{line.label}: PSNR {quality} dB, {cost} {axis}"
             marks[MARK.format(number)] = says, line.keys
     shows = f"PSNR in dB against {axis}, one mark a line"
-    return Picture(stem, shows, partial(quality_against, lines, metric, settings), marks)
+    return Picture(stem, shows, partial(quality_against, lines, metric, settings=settings), marks)
 
 
 def quality_against(
-    lines: Sequence[Repeated], metric: str, settings: Mapping[str, Sequence[str]], path: Path
+    lines: Sequence[Repeated], metric: str, path: Path, settings: Mapping[str, Sequence[str]] = {}
 ) -> None:
     """Write a PNG: PSNR of each of `lines` against its `metric`, one of `COSTS`, with its name.
 

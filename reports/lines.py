@@ -92,7 +92,7 @@ def varied(runs: Sequence[Run]) -> dict[str, list[str]]:
     """The facts and the settings beside method and seed that differ between `runs`, with their
     values.
 
-    Settings of a method are compared with those of the same method. One that follows from columns
+    Settings of a method are compared with those under the same label. One that follows from columns
     that are shown already is left out, unless it was typed.
     """
     columns = {
@@ -101,7 +101,7 @@ def varied(runs: Sequence[Run]) -> dict[str, list[str]]:
         if len(set(values := [str(run.facts[fact]) for run in runs])) > 1
     }
     facts = dict(columns)
-    methods = [str(run.facts[METHOD]) for run in runs]
+    methods = [run.label for run in runs]
     settings = [_settings(run) for run in runs]
     typed = {word for run in runs for word in _typed(run)}
     names = dict.fromkeys(name for of_run in settings for name in of_run)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
@@ -61,7 +62,7 @@ def _heading(lines: Lines, failures: Mapping[str, str]) -> Iterator[Part]:
             " The best figure of each column is **bold**, with those that differ from it by no more"
             " than the intervals, among runs with the same frames, protocol and machine."
         )
-    days = sorted({run.record["stored"][:10] for run in runs})
+    days = sorted(str(datetime.fromtimestamp(run.record["stored"], UTC).date()) for run in runs)
     when = " to ".join(dict.fromkeys((days[0], days[-1])))
     yield f"# {': '.join(filter(None, (labels, ', '.join(varied))))} on {scenes}"
     yield f"Measured {when} on {machines(runs)}: {common(lines)}."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
@@ -239,14 +240,14 @@ def readable(
     runs = [
         Run(
             folder.name,
-            str(of_run["method"].iloc[0]),
+            _label(record["command"], of_run),
             of_run,
             cache(partial(store.frames, folder.name)),
-            store.record(folder.name),
+            record,
             folder / "pictures",
         )
         for key, of_run in rows.groupby("run")
-        if (folder := store.find(str(key)))
+        if (folder := store.find(str(key))) and (record := store.record(folder.name))
     ]
     return sorted(runs, key=lambda run: run.record["stored"])
 
@@ -263,6 +264,12 @@ def load_runs(store: Store, keys: Iterable[str]) -> list[Run]:
             schema = store.record(key).get("schema_version")
             raise SteerbenchError(f"{store.folder / key}: {unreadable(schema)}")
     return [runs[key] for key in wanted]
+
+
+def _label(command: object, rows: pd.DataFrame) -> str:
+    """The method, as it was typed if it was: a choice may have other settings than its method."""
+    typed = [word for word in shlex.split(str(command)) if word.startswith("method=")]
+    return typed[-1].partition("=")[2] if typed else str(rows["method"].iloc[0])
 
 
 def missing_figures(runs: Sequence[Run]) -> list[str]:

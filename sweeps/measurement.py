@@ -34,9 +34,9 @@ from sweeps.configured import (
     scene_of,
     use_threads,
 )
+from sweeps.experiments import axes
 from sweeps.overrides import target_of
 from sweeps.processes import device_lock
-from sweeps.tables import axes
 
 J = TypeVar("J", bound="Job")
 

@@ -15,10 +15,10 @@ from bench.errors import SteerbenchError, Unavailable, unexpected
 from reports.paper_tables import CURVES, METHOD, SHARES, Line, PaperTable, point
 from sweeps.configured import build
 from sweeps.data_sets import DataSet, data_set_of
+from sweeps.experiments import SEED, grid
 from sweeps.measurement import Job, turns_of
 from sweeps.overrides import changed, choices, composed, setting, swept, target_of, unquoted
 from sweeps.processes import on_gpu
-from sweeps.tables import SEED, grid
 
 AFTER = "method.after"  # the setting for the share of its training that a method is rendered after
 OF_CURVES = {"protocol.name": "psnr", "protocol.lpips": "[]"}

@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from bench.errors import SteerbenchError, unknown
 from bench.study import Axis, Study, Variant, study_of
 from reports.studies import StudyLine
-from sweeps import tables
+from sweeps import experiments
 from sweeps.configured import build
 from sweeps.measurement import Job
 from sweeps.overrides import (
@@ -88,7 +88,7 @@ class Subject:
 
     def axes(self) -> dict[str, Axis]:
         """What tables vary of the method, and what it declares itself."""
-        return {**tables.axes(self.name), **self.study.axes}
+        return {**experiments.axes(self.name), **self.study.axes}
 
     def lines(self, group: str, variants: Sequence[Variant], **more: Any) -> Iterator[StudyLine]:
         """The lines of a group."""

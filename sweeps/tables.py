@@ -11,18 +11,14 @@ from itertools import product
 from string import Formatter
 from typing import Any
 
-from omegaconf import OmegaConf
-
 from bench.errors import SteerbenchError, unexpected, unknown
-from bench.study import Axis
 from reports.claims import Claim
 from reports.comparison import shown_as
 from reports.paper_tables import METHOD, Line, PaperTable
 from sweeps.configured import check_settings
 from sweeps.data_sets import FIRST
-from sweeps.overrides import choices, swept
-
-SEED = "seed"  # in a grid, it makes no lines: they are means over their seeds
+from sweeps.experiments import SEED, experiment, grid_of
+from sweeps.overrides import choices
 
 
 def chosen(
@@ -37,9 +33,9 @@ def chosen(
     methods. SteerbenchError if there is no such table, or what is declared of it is wrong.
     """
     if name is not None:
-        tables = [_table(name, _experiment(name, words), data_sets)]
+        tables = [_table(name, experiment(name, words), data_sets)]
     else:
-        found = {name: _experiment(name) for name in choices("experiment")}
+        found = {name: experiment(name) for name in choices("experiment")}
         every = [_table(*each, data_sets) for each in found.items() if "table" in each[1]]
         tables = [table for table in every if table.number is not None]
         tables.sort(key=lambda table: table.number or 0)
@@ -53,44 +49,10 @@ def chosen(
     ]
 
 
-def grid(name: str, words: Sequence[str] = ()) -> dict[str, list[str]]:
-    """The settings that the experiment `name` varies, each with its values, as it declares them.
-
-    `words` may name folders with further experiments.
-    """
-    return _grid(_experiment(name, words))
-
-
-def axes(method: str) -> dict[str, Axis]:
-    """The settings of `method`, whole numbers, that our tables vary, by the name of the axis."""
-    found = {}
-    for name in choices("experiment"):
-        experiment = _experiment(name)
-        table = experiment.get("table", {})
-        if "axis" in table and {"override /method": method} in experiment["defaults"]:
-            ((setting, values),) = _grid(experiment).items()
-            found[table["axis"]] = Axis(table["label"], setting, tuple(sorted(map(int, values))))
-    return found
-
-
-def _experiment(name: str, words: Sequence[str] = ()) -> Any:
-    """What the file of an experiment holds."""
-    files = choices("experiment", words)
-    if name not in files:
-        raise unknown("table", name, files)
-    return OmegaConf.to_container(OmegaConf.load(files[name]))
-
-
-def _grid(experiment: Any) -> dict[str, list[str]]:
-    params = experiment.get("hydra", {}).get("sweeper", {}).get("params", {})
-    several = swept([f"{name}={values}" for name, values in params.items()])
-    return {name: several.get(name, [str(values)]) for name, values in params.items()}
-
-
-def _table(name: str, experiment: Any, data_sets: Sequence[str]) -> PaperTable:
+def _table(name: str, whole: Any, data_sets: Sequence[str]) -> PaperTable:
     """What an experiment declares below `table`, with the figures on those of `data_sets` that
     there are any of."""
-    where, declared = f"experiment {name}: table", experiment.get("table")
+    where, declared = f"experiment {name}: table", whole.get("table")
     if not isinstance(declared, dict):
         raise unexpected(where, "a section with title and metrics", declared)
     own = {**declared, "published_on": _by_data_set(declared.get("published_on", {}))}
@@ -105,7 +67,7 @@ def _table(name: str, experiment: Any, data_sets: Sequence[str]) -> PaperTable:
     if any("published" in of for of in said.values()) and not own["published_on"]:
         raise unexpected(f"{where}.published_on", "what `published` was measured on", "nothing")
     own["lines"] = lines = {}
-    for key, job in _jobs(said, label, _grid(experiment), where).items():
+    for key, job in _jobs(said, label, grid_of(whole), where).items():
         of = {**job, **said.get(key, {})}
         published = _by_data_set(of.pop("published", {}))
         check_settings(Line, of, f"{where}.lines.{key}.", ("published", "added"))

@@ -86,6 +86,13 @@ def test_pictures_that_do_not_match_are_named(tmp_path, match, names, said):
         pictures.listed(tmp_path / "nowhere")
 
 
+def test_pictures_that_a_run_kept_are_refused_by_their_names(tmp_path):
+    for kind in ("rendered", "truth", "error"):
+        Image.new("RGB", (4, 4)).save(tmp_path / f"0003-{kind}.png")
+    with pytest.raises(SteerbenchError, match=r"scored already.*steerbench compare"):
+        pictures.listed(tmp_path)
+
+
 def test_two_truths_of_one_name_have_no_picture_of_their_own(tmp_path):
     ours = write(tmp_path / "ours", {"r_10.png": noise(), "r_9.png": noise()})
     said = "--match order takes both in their order, got several of 0001"

@@ -1,6 +1,7 @@
 """The tables of the paper as LaTeX and as CSV."""
 
 import io
+import json
 from dataclasses import replace
 
 import pandas as pd
@@ -47,7 +48,7 @@ def cells(text: str) -> dict[str, list[str]]:
 
 
 def test_latex_is_of_booktabs_has_the_decimals_of_the_paper_and_marks_the_best(measured):
-    text = export.latex([TABLE], measured)
+    text = export.exported_tables([TABLE], measured, "latex")
     assert r"\caption{Quality \& size." in text
     for rule in ("toprule", "midrule", "bottomrule"):
         assert text.count(f"\\{rule}") == 1
@@ -62,7 +63,7 @@ def test_latex_is_of_booktabs_has_the_decimals_of_the_paper_and_marks_the_best(m
     # Of several seeds, half of the interval: t(0.975, 1) = 12.71.
     place = Place("table9", "First", "k3")
     runs = [changed(measured[place].runs[0], {"psnr": psnr}) for psnr in (29.0, 31.0)]
-    found = cells(export.latex([TABLE], {place: Repeated("K = 3", runs)}))
+    found = cells(export.exported_tables([TABLE], {place: Repeated("K = 3", runs)}, "latex"))
     assert found["K = 3"][0] == r"30.00 $\pm$ 12.71"
 
 
@@ -71,24 +72,29 @@ def test_a_metric_that_the_paper_lacks_is_written_as_on_our_pages(measured):
     (run,) = measured[Place("table9", "First", "t19")].runs
     rows = run.rows.replace({"metric": {"ssim": "flip"}})
     shown = changed(replace(run, rows=rows), {"flip": 0.1234, "peak_bytes": 2.5e9})
-    found = cells(export.latex([table], measured_of(table, {"t19": shown})))
+    found = cells(export.exported_tables([table], measured_of(table, {"t19": shown}), "latex"))
     assert found["T = 2$^{19}$"] == ["0.1234", "2,500.00"]
 
 
 def test_a_rule_stands_before_what_is_of_a_further_data_set(measured):
     table = replace(TABLE, data_sets=["First", "Second"], beside=["k3"])
     of_first = measured[Place("table9", "First", "k3")]
-    text = export.latex([table], {**measured, Place("table9", "Second", "k3"): of_first})
+    both = {**measured, Place("table9", "Second", "k3"): of_first}
+    text = export.exported_tables([table], both, "latex")
     first, second = text.split("\\midrule\n")[1:]
     assert "(Second)" not in first
     assert second.startswith("K = 3 (Second) & ")
-    assert "Second" not in export.latex([table], measured)
+    assert "Second" not in export.exported_tables([table], measured, "latex")
 
 
 def test_csv_has_a_figure_a_row_as_it_was_measured(measured):
-    found = pd.read_csv(io.StringIO(export.csv([TABLE], measured)))
+    found = pd.read_csv(io.StringIO(export.exported_tables([TABLE], measured, "csv")))
     assert len(found) == len(LINES) * len(TABLE.metrics)
     row = found.set_index(["line", "metric"]).loc[("t19", "psnr")]
     assert row["label"] == "T = 2^19"
     assert (row["measured"], row["published"], row["runs"]) == (30.456, 33.0, 1)
+    (first, *_) = json.loads(export.exported_tables([TABLE], measured, "json"))
+    assert (first["line"], first["metric"], first["measured"]) == ("t19", "psnr", 30.456)
+    markdown = export.exported_tables([TABLE], measured, "markdown")
+    assert markdown.startswith("## Quality & size\n\n| measured | PSNR, dB ↑ |")
     assert pd.isna(row["half_interval"])

@@ -7,7 +7,7 @@ import pytest
 
 from reports.comparison import columns_of, comparison
 from reports.lines import as_lines, results
-from tests.reports.conftest import rewrite, run_of
+from tests.reports.conftest import rename, rewrite, run_of
 
 FACTS = dict.fromkeys(("scene", "split", "trajectory", "budget", "protocol", "device"), "same")
 FACTS |= {"method": "m", "engine": "none", "precision": "none", "seed": 0}
@@ -72,6 +72,7 @@ def test_results_have_the_settings_that_differ(several):
     store, keys = several
     config = {"method": {"frames": 1}}
     for number, key in enumerate(keys):
+        rename(store, key, "m")
         rewrite(store, key, made_of={"config": {"method": {"frames": number}}, "was": config})
     rows = results(store)
     assert isinstance(rows, pd.DataFrame)

@@ -69,6 +69,7 @@ def test_list_shows_choices_backends_and_why_an_engine_cannot_be_used(steerbench
         # Options and settings are read in any order.
         (["kernels", "scene=totem", "--repeats", "0", "budget=demo"], "--repeats: expected 1"),
         (["report", "budget=tiny", "--table", "table3", "sed=1"], "unknown setting 'sed'"),
+        (["table", "table9"], "unknown table 'table9'. Did you mean table"),
         (["report", "seed=0", "--tabl3", "table3", "seed=1"], "Did you mean --table?"),
     ],
 )

@@ -1,14 +1,19 @@
 """`steerbench run`: from overrides to a table, a stored run and a page, and how it is ended."""
 
+import io
 import json
+import math
 import signal
 from pathlib import Path
 
+import pandas as pd
 import pytest
 import torch
 
+import steerbench as python
+from bench.errors import SteerbenchError
 from reports.trackers import TRACKERS
-from tests.sweeps.conftest import CONFIGS
+from tests.sweeps.conftest import CONFIGS, STAND_INS
 
 
 def stored(tmp_path: Path) -> list[Path]:
@@ -107,6 +112,72 @@ def test_a_job_that_fails_stands_in_the_table_and_on_the_page_and_the_others_run
     assert len(stored(tmp_path)) == 2
 
 
+ABLATION = ("-m", "method.level=0.5,0.25", "seed=0,1")
+
+
+def test_an_ablation_is_a_table_over_seeds_in_every_form_and_grows_by_what_is_new(run, tmp_path):
+    table = run(*ABLATION, "report=page", "--format", "markdown").ok().out
+    assert "| method | level | seeds | PSNR, dB ↑ |" in table
+    assert "| grey | 0.5 | 2 | **6.05** |" in table
+    page = (tmp_path / "page" / "report.md").read_text()
+    assert table.partition("\n\n")[2].strip() in page
+    assert "means over seeds" in page
+    keys = stored(tmp_path)
+    latex = run(*ABLATION, "--format=latex").ok().out
+    assert r"grey & 0.5 & 2 & \textbf{6.05}" in latex
+    figures = pd.read_csv(io.StringIO(run("--format", "csv", *ABLATION).ok().out))
+    assert figures[["level", "seeds", "psnr.half"]].to_numpy().tolist() == [
+        [0.5, 2, 0],
+        [0.25, 2, 0],
+    ]
+    assert json.loads(run(*ABLATION, "--format", "json").out)[0]["seeds"] == 2
+    assert stored(tmp_path) == keys
+    grown = run(*ABLATION, "backend=auto,reference").ok().out
+    assert grown.count("| grey |") == 4
+    assert set(keys) < set(stored(tmp_path))
+    assert "invalid choice: 'word'" in run("--format", "word").refused()
+
+
+def test_a_sweep_and_a_run_of_the_store_are_frames_in_python(elsewhere, tmp_path):
+    runs, table = python.sweep(*STAND_INS, *ABLATION[1:])
+    assert table[["method", "level", "seeds"]].to_numpy().tolist() == [
+        ["grey", "0.5", 2], ["grey", "0.25", 2]
+    ]  # fmt: skip
+    assert table["psnr"].round(2).tolist() == [6.05, 2.51]
+    rows = python.results()
+    assert rows.groupby("run")["method.level"].unique().str[0].to_dict() == {
+        run.key: level for run, level in zip(runs, ["0.5", "0.5", "0.25", "0.25"], strict=True)
+    }
+    first, *_, last = [python.load(run.key[:10]) for run in runs]
+    assert first.psnr_to(first) == math.inf
+    # Between 128/255 and 64/255: PSNR = -20 log10(64 / 255) = 12.01 dB.
+    assert round(first.psnr_to(last), 2) == 12.01
+    with pytest.raises(SteerbenchError, match="expected 0 to 1, got 7"):
+        python.sweep(*STAND_INS, "method.level=0.5,7")
+
+
+@pytest.mark.parametrize("form", [["--outputs", "there"], ["--outputs=there"], ["outputs=there"]])
+def test_a_store_is_named_in_either_form(run, steerbench, tmp_path, form):
+    run(*form).ok()
+    assert list(tmp_path.glob("there/runs/*/record.json"))
+    assert "grey" in steerbench("results", *form).ok().out
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("precision=fp8", "precision: expected fp32"),
+        (f"seed={2**63}", "seed: expected 0 or more, below 2^63"),
+    ],
+)
+def test_a_setting_that_nothing_here_has_is_refused(run, word, said):
+    assert said in run(word).refused()
+
+
+def test_more_threads_than_cores_are_named(run):
+    assert "threads=500: more than the" in run("threads=500").ok().err
+
+
 def test_a_sweep_whose_jobs_all_fail_has_a_table_and_no_page(run, tmp_path):
     outcome = run("-m", "method.level=7,8", "report=page")
     assert outcome.status == 2
@@ -153,7 +224,9 @@ def test_a_folder_named_after_what_is_swept_gets_a_page_of_its_own(run, tmp_path
     run("-m", "scene.frames=2,3", "seed=0,1", "report=pages/${scene.frames}")
     for frames in (2, 3):
         text = (tmp_path / f"pages/{frames}/report.md").read_text()
-        assert text.startswith(f"# grey (frames={frames}, seed=0), grey (frames={frames}, seed=1)")
+        assert text.startswith("# grey on white")
+        assert f"scene.frames={frames}" in text
+        assert f"scene.frames={5 - frames}" not in text
 
 
 def test_a_second_sweep_is_read_from_the_store_and_knows_nothing_of_the_first(run, tmp_path):
@@ -187,9 +260,9 @@ def test_a_sweep_has_one_folder_of_outputs_for_its_table(run):
     assert "outputs: expected one folder, for the table of all jobs, got a, b" in refused
 
 
-def test_equal_jobs_share_a_line_with_both_names(run):
-    outcome = run("-m", "precision=fp32,bf16")  # of a method without an engine
-    assert "grey (precision=fp32), grey (precision=bf16)" in outcome.out
+def test_equal_jobs_share_a_line(run):
+    outcome = run("-m", "precision=fp32,bf16").ok()  # of a method without an engine
+    assert outcome.out.count("| grey |") == 1
 
 
 def test_outputs_that_cannot_be_written_are_named(run, tmp_path):

@@ -7,7 +7,8 @@ import pytest
 from bench.errors import SteerbenchError
 from reports.tables import QUALITY
 from sweeps.data_sets import DATA_SETS, FIRST
-from sweeps.tables import chosen, grid
+from sweeps.experiments import grid
+from sweeps.tables import chosen
 
 _, SECOND = DATA_SETS
 TABLES = {table.name: table for table in chosen()}

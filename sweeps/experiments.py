@@ -1,0 +1,49 @@
+"""Reads the files of experiments: what they vary, and which axes of a method that makes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from bench.errors import unknown
+from bench.study import Axis
+from sweeps.overrides import choices, swept
+
+SEED = "seed"  # in a grid, it makes no lines: they are means over their seeds
+
+
+def experiment(name: str, words: Sequence[str] = ()) -> Any:
+    """What the file of an experiment holds."""
+    files = choices("experiment", words)
+    if name not in files:
+        raise unknown("table", name, files)
+    return OmegaConf.to_container(OmegaConf.load(files[name]))
+
+
+def grid(name: str, words: Sequence[str] = ()) -> dict[str, list[str]]:
+    """The settings that the experiment `name` varies, each with its values, as it declares them.
+
+    `words` may name folders with further experiments.
+    """
+    return grid_of(experiment(name, words))
+
+
+def grid_of(declared: Any) -> dict[str, list[str]]:
+    """The same of what `experiment` returned."""
+    params = declared.get("hydra", {}).get("sweeper", {}).get("params", {})
+    several = swept([f"{name}={values}" for name, values in params.items()])
+    return {name: several.get(name, [str(values)]) for name, values in params.items()}
+
+
+def axes(method: str) -> dict[str, Axis]:
+    """The settings of `method`, whole numbers, that our tables vary, by the name of the axis."""
+    found = {}
+    for name in choices("experiment"):
+        declared = experiment(name)
+        table = declared.get("table", {})
+        if "axis" in table and {"override /method": method} in declared["defaults"]:
+            ((setting, values),) = grid_of(declared).items()
+            found[table["axis"]] = Axis(table["label"], setting, tuple(sorted(map(int, values))))
+    return found
