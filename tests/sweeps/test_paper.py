@@ -141,8 +141,8 @@ def test_frames_of_runs_that_are_not_on_a_page_are_not_read(steerbench, outputs,
 
 def test_the_page_goes_where_asked_and_tables_to_stdout(steerbench, measured, outputs, tmp_path):
     folder = tmp_path / "there"
-    words = ("--table", "table5", "--report", str(folder), "--format", "latex")
-    outcome = steerbench("paper", *words, outputs).ok()
+    words = ("--report", str(folder), "--format", "latex")
+    outcome = steerbench("table", "table5", *words, outputs).ok()
     assert r"\label{tab:table5}" in outcome.out
     assert "## Table 5: Joint training" in (folder / "report.md").read_text()
 
@@ -278,8 +278,8 @@ def test_the_page_of_a_data_set_has_means_scenes_and_gaps(steerbench, tmp_path):
     for name, value in values.items():
         blender(data / name, value)
     blender(data / "ship", pictures=False)
-    words = ["--table", "table9", CONFIGS, f"data={data}", "device=cpu", "seed=0,1"]
-    outcome = steerbench("paper", *words).ok()
+    words = [CONFIGS, f"data={data}", "device=cpu", "seed=0,1"]
+    outcome = steerbench("table", "table9", *words).ok()
     assert "missing: ship: no pictures" in outcome.err
     assert "4 of 8" in outcome.err
     page = Path(re.search(r"report: (.*)", outcome.err)[1]).read_text()
@@ -301,6 +301,6 @@ def test_the_page_of_a_data_set_has_means_scenes_and_gaps(steerbench, tmp_path):
         assert f"| {scene}: a dark one | {dark[place]:.2f} |" in page
     assert f"| Table 9, PSNR, dB: a dark one < a grey | +0.50 | +{by:.2f} |" in page
     assert "2 scenes × 2 seeds" in page
-    again = steerbench("report", *words)
+    again = steerbench("report", "--table", "table9", *words)
     assert f"| a grey | **{mean}** |" in (tmp_path / "outputs/paper/report.md").read_text()
     assert again.status == 0

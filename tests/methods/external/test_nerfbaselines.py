@@ -75,4 +75,4 @@ def test_a_registered_method_trains_renders_and_is_loaded(
     torch.testing.assert_close(pictures[0][0, 0], expected, rtol=0, atol=1e-6)
     assert torch.equal(*pictures)
     assert seconds[0] == seconds[1] > 0  # the second was loaded
-    assert method._environment["nerfbaselines"] == VERSION
+    assert method._packages["nerfbaselines"] == VERSION
