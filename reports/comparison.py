@@ -7,7 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
+
 from bench.errors import SteerbenchError
+from bench.intervals import half_interval
 from bench.rows import UNITS
 from reports.lines import Lines
 from reports.runs import Repeated, Run
@@ -124,10 +127,10 @@ def marked(
 def ranks(lines: Sequence[Repeated], metric: str, write: Write | None = None) -> dict[int, int]:
     """The rank, from 1, of each of `lines` among those under the same conditions, by its index.
 
-    Figures share the rank of a better one from which they differ by no more than their intervals,
-    or not when written (by `write`, or in the usual format). A line that is alone under its
-    conditions has no rank, nor has the last of several, so that the second of two has none. No line
-    has one in a metric without a better side.
+    Figures share the rank of a better one from which they differ by no more than the interval over
+    seeds, or not when written (by `write`, or in the usual format). Lines have none if they are all
+    alike, or alone under their conditions; nor has the last of several, so that the second of two
+    has none, and no line in a metric without a better side.
     """
     shown = shown_as(metric)
     if not shown.better:
@@ -142,23 +145,29 @@ def ranks(lines: Sequence[Repeated], metric: str, write: Write | None = None) ->
     for figures in known.values():
         of_rank: list[list[int]] = []  # the best of a rank comes first
         for row in sorted(figures, key=figures.__getitem__, reverse=shown.better == "↑"):
-            if not of_rank or _apart(lines, metric, write, of_rank[-1][0], row):
+            if not of_rank or _apart(lines[of_rank[-1][0]], lines[row], metric, write):
                 of_rank.append([])
             of_rank[-1].append(row)
         ranked = {row: rank for rank, rows in enumerate(of_rank, 1) for row in rows}
-        places |= {row: rank for row, rank in ranked.items() if rank < len(figures)}
+        if len(of_rank) > 1:
+            places |= {row: rank for row, rank in ranked.items() if rank < len(figures)}
     return places
 
 
-def _apart(lines: Sequence[Repeated], metric: str, write: Write, one: int, other: int) -> bool:
-    """Whether two means differ when written, and by more than the intervals of both."""
-    (low, near), (high, far) = (
-        (x.mean(metric), x.half(metric)) for x in (lines[one], lines[other])
+def _apart(one: Repeated, other: Repeated, metric: str, write: Write) -> bool:
+    """Whether two means differ when written, and by more than the interval of their difference:
+    over pairs of the same seed or, if the seeds are others, from the intervals of both."""
+    low, high = (
+        {run.facts["seed"]: figure for run in x.runs if (figure := run.figure(metric)) is not None}
+        for x in (one, other)
     )
-    assert low is not None
-    assert high is not None
-    interval = math.hypot(*(half for half in (near, far) if half > 0))
-    return write(low) != write(high) and abs(high - low) > interval
+    means = [float(np.mean([*of.values()])) for of in (low, high)]
+    if write(means[0]) == write(means[1]):
+        return False
+    interval = math.hypot(*(half for x in (one, other) if (half := x.half(metric)) > 0))
+    if low.keys() == high.keys() and len(low) > 1:
+        interval = half_interval(np.array([high[seed] - low[seed] for seed in low]))
+    return abs(means[1] - means[0]) > interval
 
 
 def machines(runs: Sequence[Run]) -> str:

@@ -97,14 +97,15 @@ def quality_against(
     """Write a PNG: PSNR of each of `lines` against its `metric`, one of `COSTS`, with its name.
 
     With several seeds, error bars show the intervals of both. More than a few lines have a legend
-    instead of names, made of their `settings`: a colour for each value of the first that differs,
-    a marker for the others.
+    instead of names, and so has an ablation. It is made of their `settings`: a colour for each
+    value of the first that differs, a marker for the others.
     """
     _, unit, label = COSTS[metric]
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
     _label(axes, label)
-    legend = _Legend(settings) if len(lines) > MOST_NAMES else None
+    many = len(lines) > MOST_NAMES or any(len(set(of)) > 1 for of in list(settings.values())[1:])
+    legend = _Legend(settings) if settings and many else None
     points = []
     for number, line in enumerate(lines):
         across, up = line.mean(metric), line.mean("psnr")
@@ -112,7 +113,9 @@ def quality_against(
             continue
         bars = [half if half > 0 else None for half in (line.half(metric), line.half("psnr"))]
         own = _style(number) if legend is None else legend.style(number)
-        style = {**own, "xerr": bars[0] and bars[0] / unit, "yerr": bars[1]}
+        # On a logarithmic axis, an interval over two seeds may reach below any time.
+        reach = bars[0] and [[min(bars[0], across / 2) / unit], [min(bars[0], across) / unit]]
+        style = {**own, "xerr": reach, "yerr": bars[1]}
         drawn = axes.errorbar(across / unit, up, **style, markersize=8, elinewidth=0.8)
         drawn[0].set_gid(MARK.format(number))
         points.append((line.label, (across / unit, up)))

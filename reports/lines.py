@@ -70,9 +70,9 @@ def as_lines(runs: Sequence[Run]) -> Lines:
     columns = list(settings.items())
     lines = []
     for index, of_line in enumerate(by_line.values()):
-        own = ((name, values[index]) for name, values in columns[1:] if values[index])
-        shown = ", ".join((columns[0][1][index], *(f"{name}={value}" for name, value in own)))
-        lines.append(Repeated(shown, of_line))
+        own = [f"{name}={values[index]}" for name, values in columns[1:] if values[index]]
+        several = len(set(settings[METHOD])) > 1 or not own
+        lines.append(Repeated(", ".join([settings[METHOD][index]] * several + own), of_line))
     return Lines(lines, settings)
 
 
@@ -103,9 +103,9 @@ def varied(runs: Sequence[Run]) -> dict[str, list[str]]:
     facts = dict(columns)
     methods = [run.label for run in runs]
     settings = [_settings(run) for run in runs]
-    typed = {word for run in runs for word in _typed(run)}
+    typed = dict.fromkeys(word for run in runs for word in _typed(run))
     names = dict.fromkeys(name for of_run in settings for name in of_run)
-    for name in sorted(names, key=lambda name: name not in typed):
+    for name in dict.fromkeys((*(name for name in typed if name in names), *names)):
         values = [of_run.get(name, "") for of_run in settings]
         shown = columns if name not in typed or name.partition(".")[0] in facts else {}
         if not (_follows([methods], values) or _follows([methods, *shown.values()], values)):

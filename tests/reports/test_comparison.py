@@ -58,10 +58,10 @@ def test_one_run_or_runs_of_different_kinds_have_no_best(make):
 
 
 def test_cold_frames_have_a_table_of_their_own_and_compete_among_themselves(make, rows_with_cold):
-    runs = [make("a"), *(make(label, rows_with_cold) for label in "bc")]
-    table, cold = comparison(as_lines(runs), {})
-    assert [line[:2] for line in table.lines] == [("a", "30.46"), ("b", "30.46"), ("c", "30.46")]
-    assert [line[:2] for line in cold.lines] == [("b", "27.46"), ("c", "27.46")]
+    others = make("b", rows_with_cold), make("c", rows_with_cold, psnr=20.0)
+    table, cold = comparison(as_lines([make("a"), *others]), {})
+    assert [line[:2] for line in table.lines] == [("a", "30.46"), ("b", "30.46"), ("c", "20.00")]
+    assert [line[:2] for line in cold.lines] == [("b", "27.46"), ("c", "20.00")]
     assert cold.columns[-1] == "ms / frame ↓"
     assert cold.lines[0][-1] == "400.0"
     assert ("b", "PSNR, dB ↑") in bold(cold)
@@ -69,10 +69,13 @@ def test_cold_frames_have_a_table_of_their_own_and_compete_among_themselves(make
 
 def test_a_mean_shares_the_rank_of_a_better_one_within_their_intervals(make):
     def line(*psnr: float) -> Repeated:
-        return Repeated("", [make("m", psnr=each) for each in psnr])
+        return Repeated("", [changed(make("m", psnr=x), {}, seed=n) for n, x in enumerate(psnr)])
 
-    best, close, far = line(31.0, 31.2), line(30.9, 31.1), line(20.0, 20.01)
+    best, close, far = line(31.0, 31.2), line(30.9, 31.25), line(20.0, 20.2)
     assert ranks([best, close, far], "psnr") == {0: 1, 1: 1, 2: 2}
+    assert ranks([best, close], "psnr") == {}  # all alike
+    paired = line(30.9, 31.1)  # 0.1 dB below the best with each seed
+    assert ranks([best, paired, far], "psnr") == {0: 1, 1: 2}
     single = [line(31.1), line(31.0), line(20.0)]  # nothing is known of their spread
     assert ranks(single, "psnr") == {0: 1, 1: 2}
 
@@ -94,7 +97,6 @@ def test_a_figure_is_written_in_its_unit(metric, label, text):
 def test_a_metric_without_a_better_side_has_no_best(make, rows):
     renamed = rows.replace({"metric": {"ssim": "warp_1_true"}})
     lines = [Repeated(x, [make(x, renamed, warp_1_true=by)]) for x, by in (("a", 0.1), ("b", 0.2))]
-    assert ranks(lines, "psnr") == {0: 1, 1: 1}
     assert ranks(lines, "warp_1_true") == {}
 
 

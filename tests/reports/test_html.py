@@ -123,7 +123,7 @@ def test_every_line_and_mark_leads_to_its_run_and_every_link_somewhere(several, 
     assert {link["href"] for link in parsed.of("a") if link.get("class") == "origin"} == {
         f"#run-{key}" for key in keys
     }
-    assert all("steerbench run method=offset" in line["title"] for line in parsed.of("tr") if line)
+    assert all("steerbench run seed=5" in line["title"] for line in parsed.of("tr") if line)
     ids = parsed.values("id")
     assert len(ids) == len(set(ids))
     assert {link["href"][1:] for link in parsed.of("a")} <= set(ids)
@@ -248,6 +248,6 @@ def test_pictures_lie_under_a_divider_and_marks_and_rows_show_their_run(page, st
     assert found["hidden"]
     for shown in (found["mark"], found["row"]):
         assert stored_run in shown
-        assert "steerbench run method=offset" in shown
+        assert "steerbench run seed=5" in shown
     assert re.search(r"first: PSNR [\d.]+ dB, [\d.]+ ms a frame", found["mark"])
     assert found["row"].splitlines()[1].startswith("first: PSNR, dB ")

@@ -33,7 +33,7 @@ def make(rows):
 def test_runs_that_differ_in_their_seed_make_one_line_with_mean_and_interval(make):
     runs = [make({"frames": n}, seed, 30 + n + seed) for n in (0, 2) for seed in (0, 1)]
     lines = as_lines(runs)
-    assert [line.label for line in lines.lines] == ["m, L=0", "m, L=2"]
+    assert [line.label for line in lines.lines] == ["L=0", "L=2"]
     table = lines.frame(["psnr"])
     assert table[["method", "L", "seeds", "psnr"]].to_numpy().tolist() == [
         ["m", "0", 2, 30.5],

@@ -108,7 +108,7 @@ def test_a_page_of_several_runs_has_all_of_them_beside_each_other(several, tmp_p
         assert f"\n| {label} |" in text
         assert f"| run, {label} | {key} |" in text
     # What all runs have in common is listed once.
-    assert text.count("steerbench run method=offset") == 1
+    assert text.count("steerbench run seed=5") == 1
     assert text.count("| seed | 5 |") == 1
     assert "| machine, copy 4 | another," in text
 
