@@ -67,6 +67,9 @@ def _table(
     metrics: Sequence[str],
 ) -> Table:
     columns = dict(settings)
+    phases = [str(line.runs[0].headline["phase"].iloc[0]) for line in lines]
+    if len(set(phases)) > 1:  # the path is shorter than the method looks back
+        columns["frames"] = phases
     if any(len(line.runs) > 1 for line in lines):
         columns["seeds"] = [str(len(line.runs)) for line in lines]
     figures = {

@@ -99,7 +99,7 @@ def test_what_the_document_makes_is_listed_measured_and_studied(steerbench, mine
 
 def test_the_method_of_the_document_has_a_line_in_a_table(mine, monkeypatch):
     seen = captured(monkeypatch, typed("table table1"))
-    (table,) = chosen(seen.table, seen.overrides, seen.methods)
+    (table,) = chosen(seen.table, seen.overrides, seen.beside)
     assert "mean_colour" in [job.label for job in plan(table, seen.overrides)]
     assert captured(monkeypatch, typed("report .* --table table1")).beside == seen.beside
 
@@ -113,7 +113,8 @@ def test_the_table_of_the_document_is_measured_reported_and_the_same_sweep(steer
     assert "| method.shade=1.0 | **19.83** |" in written  # 20 log10(255 / 26)
     assert "seed 0 / 1" in written
     page.unlink()
-    steerbench(*typed("report --config-dir configs --table shades"), *WITHOUT_LPIPS).ok()
+    report = typed("report --config-dir configs --table shades")
+    assert r"1.0 & \textbf{19.83}" in steerbench(*report, *WITHOUT_LPIPS).ok().out
     assert page.read_text() == written
     swept = steerbench(*typed("run -m"), *WITHOUT_LPIPS).ok()
     assert swept.err.count("already measured") == 4
