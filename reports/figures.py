@@ -97,15 +97,15 @@ def quality_against(
     """Write a PNG: PSNR of each of `lines` against its `metric`, one of `COSTS`, with its name.
 
     With several seeds, error bars show the intervals of both. More than a few lines have a legend
-    instead of names, and so has an ablation. It is made of their `settings`: a colour for each
+    instead of names, and so has an ablation of one method. It is made of their `settings`: a colour for each
     value of the first that differs, a marker for the others.
     """
     _, unit, label = COSTS[metric]
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
     _label(axes, label)
-    many = len(lines) > MOST_NAMES or any(len(set(of)) > 1 for of in list(settings.values())[1:])
-    legend = _Legend(settings) if settings and many else None
+    first = next(iter(settings.values()), range(len(lines)))  # methods
+    legend = _Legend(settings) if len(set(first)) < len(lines) or len(lines) > MOST_NAMES else None
     points = []
     for number, line in enumerate(lines):
         across, up = line.mean(metric), line.mean("psnr")
@@ -123,7 +123,16 @@ def quality_against(
     axes.margins(0.1)
     low, high = axes.get_xlim()
     decades = math.log10(high / low)  # the more of them, the fewer ticks in each
-    ticks = (1, 2, 3, 5, 7) if decades < 1.5 else (1, 2, 5) if decades < 3 else (1,)
+    fine = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9)
+    ticks = (
+        fine
+        if decades < 0.7
+        else (1, 2, 3, 5, 7)
+        if decades < 1.5
+        else (1, 2, 5)
+        if decades < 3
+        else (1,)
+    )
     axes.xaxis.set_major_locator(LogLocator(subs=ticks))
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_locator(NullLocator())

@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 
 from bench.results import Store, content_key
-from reports.runs import Repeated, Run, over_common_frames, readable
+from reports.runs import Repeated, Run, flat, over_common_frames, readable
 
 METHOD = "method"  # the first column
 
@@ -70,9 +70,13 @@ def as_lines(runs: Sequence[Run]) -> Lines:
     columns = list(settings.items())
     lines = []
     for index, of_line in enumerate(by_line.values()):
-        own = [f"{name}={values[index]}" for name, values in columns[1:] if values[index]]
-        several = len(set(settings[METHOD])) > 1 or not own
-        lines.append(Repeated(", ".join([settings[METHOD][index]] * several + own), of_line))
+        method = settings[METHOD][index]
+        own = [f"{name}={of[index]}" for name, of in columns[1:] if of[index] not in ("", "none")]
+        alone = settings[METHOD].count(method) == 1
+        shown = [method] if alone or not own else own
+        if not alone and len(set(settings[METHOD])) > 1:
+            shown = [method, *own]
+        lines.append(Repeated(", ".join(shown), of_line))
     return Lines(lines, settings)
 
 
@@ -143,8 +147,7 @@ def _line_of(run: Run) -> str:
 def _settings(run: Run) -> dict[str, str]:
     """The settings of a run by name, without seeds, as text; none for scored pictures."""
     config = run.record["made_of"].get("config", {})
-    (flat,) = pd.json_normalize(config).to_dict("records") or [{}]
-    kept = {str(name): value for name, value in flat.items() if name not in HIDDEN}
+    kept = {name: value for name, value in flat(config) if name not in HIDDEN}
     return {name: _text(name, value) for name, value in kept.items() if not _is_seed(name)}
 
 

@@ -60,7 +60,7 @@ def _heading(lines: Lines, failures: Mapping[str, str]) -> Iterator[Part]:
     if first.bold:
         reading += (
             " The best figure of each column is **bold**, with those that differ from it by no more"
-            " than the intervals, among runs with the same frames, protocol and machine."
+            " than the interval, among lines with the same frames, protocol and machine."
         )
     days = sorted(str(datetime.fromtimestamp(run.record["stored"], UTC).date()) for run in runs)
     when = " to ".join(dict.fromkeys((days[0], days[-1])))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
@@ -166,8 +166,7 @@ class Run:
     def settings(self) -> dict[str, str]:
         """The settings of the method by the names that one types; none for scored pictures."""
         method = self.record["made_of"].get("config", {}).get("method", {})
-        found = pd.json_normalize({"method": method}).to_dict("records")
-        named = [(str(name), str(value)) for each in found for name, value in each.items()]
+        named = ((name, str(value)) for name, value in flat({"method": method}))
         return dict(pair for pair in named if "._" not in pair[0])  # Hydra's own, as `_target_`
 
 
@@ -270,6 +269,15 @@ def _label(command: object, rows: pd.DataFrame) -> str:
     """The method, as it was typed if it was: a choice may have other settings than its method."""
     typed = [word for word in shlex.split(str(command)) if word.startswith("method=")]
     return typed[-1].partition("=")[2] if typed else str(rows["method"].iloc[0])
+
+
+def flat(node: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    """The values of nested settings by the names that one types."""
+    for name, value in node.items():
+        if isinstance(value, Mapping) and value:
+            yield from flat(value, f"{before}{name}.")
+        else:
+            yield f"{before}{name}", value
 
 
 def missing_figures(runs: Sequence[Run]) -> list[str]:

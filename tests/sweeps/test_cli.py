@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pandas as pd
@@ -20,6 +21,10 @@ def test_without_a_command_the_help_shows_every_command_and_examples(steerbench)
     outcome = steerbench().ok()
     for word in (*COMMANDS, "+experiment=demo"):
         assert word in outcome.out
+
+
+def test_the_version_is_that_of_the_package(steerbench):
+    assert steerbench("--version").ok().out == f"{version('steerbench')}\n"
 
 
 def test_help_of_run_lists_choices_settings_and_examples(run):
