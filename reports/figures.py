@@ -47,6 +47,14 @@ STEP_TICKS = (10, 100, 1000, 10_000, RELEASE_STEPS)
 
 MARK = "mark-{}"  # the `gid` of the mark of the line with this number
 
+TICKS = {
+    0.7: (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9),
+    1.5: (1, 2, 3, 5, 7),
+    3: (1, 2, 5),
+    math.inf: (1,),
+}
+"""Ticks in each decade of a logarithmic axis with fewer decades than that."""
+
 NAME_SIZE = (160, 13)  # width and height in pixels of the name of a setting on a plot
 
 
@@ -97,8 +105,8 @@ def quality_against(
     """Write a PNG: PSNR of each of `lines` against its `metric`, one of `COSTS`, with its name.
 
     With several seeds, error bars show the intervals of both. More than a few lines have a legend
-    instead of names, and so has an ablation of one method. It is made of their `settings`: a colour for each
-    value of the first that differs, a marker for the others.
+    instead of names, and so has an ablation of one method. It is made of their `settings`: a
+    colour for each value of the first that differs, a marker for the others.
     """
     _, unit, label = COSTS[metric]
     figure = Figure(figsize=(8, 4.5), layout="constrained")
@@ -123,16 +131,7 @@ def quality_against(
     axes.margins(0.1)
     low, high = axes.get_xlim()
     decades = math.log10(high / low)  # the more of them, the fewer ticks in each
-    fine = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9)
-    ticks = (
-        fine
-        if decades < 0.7
-        else (1, 2, 3, 5, 7)
-        if decades < 1.5
-        else (1, 2, 5)
-        if decades < 3
-        else (1,)
-    )
+    ticks = next(ticks for most, ticks in TICKS.items() if decades < most)
     axes.xaxis.set_major_locator(LogLocator(subs=ticks))
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_locator(NullLocator())

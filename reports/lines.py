@@ -72,11 +72,10 @@ def as_lines(runs: Sequence[Run]) -> Lines:
     for index, of_line in enumerate(by_line.values()):
         method = settings[METHOD][index]
         own = [f"{name}={of[index]}" for name, of in columns[1:] if of[index] not in ("", "none")]
-        alone = settings[METHOD].count(method) == 1
-        shown = [method] if alone or not own else own
-        if not alone and len(set(settings[METHOD])) > 1:
-            shown = [method, *own]
-        lines.append(Repeated(", ".join(shown), of_line))
+        if settings[METHOD].count(method) == 1:
+            own = []
+        several = len(set(settings[METHOD])) > 1
+        lines.append(Repeated(", ".join([method, *own] if several or not own else own), of_line))
     return Lines(lines, settings)
 
 
