@@ -22,7 +22,7 @@ import pandas as pd
 
 from bench.errors import explained, unexpected
 from bench.results import IMPORTED, STEADY, Measurement
-from bench.rows import UNITS, score_rows, single
+from bench.rows import row_table, score_rows, single
 from bench.scenes.files import describe, read_json
 from bench.types import Camera
 
@@ -144,9 +144,7 @@ def read_results(file: Path) -> tuple[Measurement, dict[str, Any]]:
         **dict.fromkeys(("resolution", "backend", "engine", "precision", "field_precision"), "-"),
         "seed": 0,
     }
-    rows = pd.DataFrame([{"phase": STEADY, **row} for row in summary]).assign(
-        unit=lambda of: [UNITS.get(name, "1") for name in of["metric"]], **facts
-    )
+    rows = row_table([{"phase": STEADY, **row} for row in summary], **facts)
     about: dict[str, object] = {
         "protocol": {"name": protocol},
         "budget": {"name": budget},

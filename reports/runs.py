@@ -14,10 +14,9 @@ import pandas as pd
 
 from bench.clock import OTHER
 from bench.errors import SteerbenchError
-from bench.intervals import half_interval
 from bench.neighbours import Neighbours
 from bench.results import COLD, STEADY, WHOLE, Store, content_key, unreadable
-from bench.rows import phase_rows
+from bench.rows import half_interval, phase_rows
 from bench.study import part_of
 from reports.tables import phases, run_tables
 
