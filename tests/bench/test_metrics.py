@@ -182,5 +182,5 @@ def test_scoring_leaves_nothing_on_a_gpu(gpu, lpips_weights, quiet_log):
     assert math.isfinite(lpips(*pictures))
     truth = torch.zeros(40, 40, 3, dtype=torch.uint8)
     scoring.score(0, pictures[0], truth, scored=False, cut=False)
-    kept = [*lpips._model.parameters(), *lpips._model.buffers(), *scoring.path._last[-1][:2]]
+    kept = [*lpips._model.parameters(), *lpips._model.buffers(), *scoring._last[-1][:2]]
     assert {tensor.device.type for tensor in kept} == {"cpu"}
