@@ -16,8 +16,6 @@ import torch
 from torch import Tensor
 
 from bench.cameras import project
-from bench.errors import unexpected
-from bench.scenes.embedded.shadows import Tiles
 from bench.scenes.embedded.solids import (
     Carved,
     Pierced,
@@ -40,6 +38,7 @@ Rays = tuple[Tensor, Tensor, Tensor]
 
 LIGHT = (0.48, -0.6, 0.64)  # unit direction to the light
 LIFT = 1e-4  # distance of a shadow ray's start above the surface, in the model's units
+TILES = 32  # into which the light's view of the points is divided, each way
 
 SKY, GROUND, SUN = 0.52, 0.24, 0.62
 """Light from above, from below, and from the light's direction, as shares of a surface's colour."""
@@ -74,12 +73,12 @@ class SceneModel(Protocol):
         alpha, which comes between them. A part is never seen outside its span."""
 
 
-def render(model: SceneModel, camera: Camera, background: Tensor, samples: int) -> Frame:
-    """Render `model`, averaged over `samples` rays per pixel (a power of two).
+def render(model: SceneModel, camera: Camera, samples: int) -> Frame:
+    """Render `model` on black, averaged over `samples` rays per pixel (a power of two).
 
-    `camera` is in the model's units; rays that hit nothing show `background` [3]. A pixel's alpha
-    and rgb are means over its rays, depth the mean z-depth weighted by opacity (+inf where alpha is
-    below EMPTY_ALPHA). A single sample is at the centre.
+    `camera` is in the model's units. A pixel's alpha and rgb are means over its rays, depth the
+    mean z-depth weighted by opacity (+inf where alpha is below EMPTY_ALPHA). A single sample is at
+    the centre.
     """
     device, width, height = camera.c2w.device, camera.width, camera.height
     offsets = sample_offsets(samples).to(device)
@@ -101,13 +100,11 @@ def render(model: SceneModel, camera: Camera, background: Tensor, samples: int) 
             picture[top:bottom, first:last] = seen.mean(2)
     empty = alpha < EMPTY_ALPHA
     depth = (depth / alpha.clamp(min=EMPTY_ALPHA)).masked_fill(empty, math.inf)
-    return Frame(rgb + (1 - alpha)[..., None] * background.to(device), depth, alpha)
+    return Frame(rgb, depth, alpha)
 
 
 def sample_offsets(samples: int) -> Tensor:
     """Hammersley points [samples, 2] in a pixel, one in each of `samples` rows and columns."""
-    if samples < 1 or samples & (samples - 1):
-        raise unexpected("samples", "a power of two", samples)
     bits = samples.bit_length() - 1
     index, mirrored = torch.arange(samples), torch.zeros(samples, dtype=torch.int64)
     for bit in range(bits):
@@ -299,6 +296,48 @@ class Solids:
         return torch.empty_like(dark).index_put_((tiles.order,), dark)
 
 
+class Tiles:
+    """Points [N, 3] seen from the light, sorted by tiles: a caster needs only those under it."""
+
+    def __init__(self, seen: Tensor) -> None:
+        """`seen` are two coordinates across the light, and one that grows towards it."""
+        self.low, self.high = seen.amin(0).cpu(), seen.amax(0).cpu()
+        self.size = ((self.high - self.low)[:2] / TILES).clamp(min=1e-6)
+        tile = ((seen - self.low.to(seen))[:, :2] / self.size.to(seen)).long().clamp(0, TILES - 1)
+        number = tile[:, 0] * TILES + tile[:, 1]
+        self.order = number.argsort()
+        counts = number.bincount(minlength=TILES * TILES)
+        self.starts = [0, *counts.cumsum(0).tolist()]
+        farthest = seen.new_full((TILES * TILES,), math.inf)
+        self.farthest = farthest.scatter_reduce(0, number, seen[:, 2], "amin").tolist()
+
+    def casters(self, low: Tensor, high: Tensor) -> list[int]:
+        """Which of the boxes from `low` to `high` [P, 3] may lie between a point and the light."""
+        candidates = (low <= self.high)[:, :2].all(1) & (high >= self.low).all(1)
+        return candidates.nonzero()[:, 0].tolist()
+
+    def runs(self, low: Tensor, high: Tensor) -> list[slice]:
+        """The sorted points in the tiles that a box [3] covers, unless all are nearer than it."""
+        first, last = (self._tile(corner) for corner in (low, high))
+        nearest = high[2].item()
+        runs: list[slice] = []
+        for row in range(first[0], last[0] + 1):
+            for tile in range(row * TILES + first[1], row * TILES + last[1] + 1):
+                if self.farthest[tile] > nearest:  # so is the tile of no points
+                    continue
+                start, end = self.starts[tile], self.starts[tile + 1]
+                if runs and runs[-1].stop == start:
+                    runs[-1] = slice(runs[-1].start, end)
+                else:
+                    runs.append(slice(start, end))
+        return runs
+
+    def _tile(self, corner: Tensor) -> Sequence[int]:
+        """The column and the row of the tile nearest to a point."""
+        place = ((corner - self.low)[:2] / self.size).floor()
+        return place.clamp(0, TILES - 1).int().tolist()
+
+
 def rotation(x: float, y: float, z: float) -> Tensor:
     """[3, 3] rotation by degrees about x, then y, then z."""
     turns = torch.eye(3, dtype=torch.float64)
@@ -309,6 +348,15 @@ def rotation(x: float, y: float, z: float) -> Tensor:
         turn[a, a], turn[a, b], turn[b, a], turn[b, b] = c, -s, s, c
         turns = turn @ turns
     return turns.float()
+
+
+def along(start: Triple, end: Triple) -> tuple[float, Triple, Triple]:
+    """Length and middle of a line, and the turn of a part whose z axis lies on it."""
+    x, y, z = (b - a for a, b in zip(start, end, strict=True))
+    cx, cy, cz = ((a + b) / 2 for a, b in zip(start, end, strict=True))
+    length = math.sqrt(x * x + y * y + z * z)
+    turn = (0.0, math.degrees(math.acos(z / length)), math.degrees(math.atan2(y, x)))
+    return length, (cx, cy, cz), turn
 
 
 @dataclass(frozen=True)
