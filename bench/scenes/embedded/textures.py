@@ -186,7 +186,7 @@ def panes(dark: Colour, light: Colour, size: Triple, points: Tensor) -> Tensor:
 
 def noise(points: Tensor) -> Tensor:
     """[N] in [0, 1]: random values at integer coordinates, smooth in between, with period 32."""
-    table = lattice().to(points.device, points.dtype)
+    table = lattice().to(points.dtype)
     cell = points.floor()
     part = points - cell
     # Trilinear at smoothstep coordinates, which avoids creases at the borders of cells.
@@ -205,7 +205,7 @@ def lattice() -> Tensor:
 
 def pick(condition: Tensor, first: Colour, second: Colour) -> Tensor:
     """`first` where `condition` [N], else `second`: [N, 3]."""
-    palette = torch.tensor((second, first), device=condition.device)
+    palette = torch.tensor((second, first))
     return palette[condition.long()]
 
 

@@ -41,8 +41,8 @@ def test_16_samples_stand_for_the_16_quarter_pixel_cells():
     assert sample_offsets(1).tolist() == [[0.5, 0.5]]
 
 
-def test_depth_of_a_sphere_is_the_closed_form(device):
-    camera = camera_at((3.0, 1.0, 2.0), device=device)
+def test_depth_of_a_sphere_is_the_closed_form():
+    camera = camera_at((3.0, 1.0, 2.0))
     frame = render(Solids([sphere(0.7)]), camera, samples=1)
     rays = cast(camera)
     # |o + t d|^2 = r^2, the textbook's way, in double precision.
@@ -209,9 +209,9 @@ def test_highlights_move_with_the_viewer():
 
 
 @pytest.mark.parametrize("density", [0.01, 1.0, 30.0])
-def test_one_ball_through_its_middle(device, density):
+def test_one_ball_through_its_middle(density):
     model = Media([Ball((0.0, 0.0, 0.0), 0.5, density, (0.8, 0.4, 0.2))])
-    frame = render(model, camera_at((0.0, -4.0, 0.0), 1, device), samples=1)
+    frame = render(model, camera_at((0.0, -4.0, 0.0), 1), samples=1)
     alpha = 1 - math.exp(-density)
     # Mean of an exponential of rate k cut off at 1: 1 / k - 1 / (e^k - 1), from t = 3.5 on.
     depth = 3.5 + 1 / density - 1 / math.expm1(density)
