@@ -76,7 +76,15 @@ def write_results(
                 digest.update(file.read_bytes())
             file = (inner / "cameras" / frame.name).with_suffix(".npz")
             file.parent.mkdir(parents=True, exist_ok=True)
-            np.savez(file, **_arrays(frame.camera))  # type: ignore[arg-type]
+            camera = frame.camera
+            np.savez(
+                file,
+                poses=camera.c2w.numpy().astype(np.float32),
+                intrinsics=np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32),
+                camera_models=np.array(PINHOLE, np.int32),
+                distortion_parameters=np.zeros(0, np.float32),
+                image_sizes=np.array([camera.width, camera.height], np.int32),
+            )
         (inner / "info.json").write_text(json.dumps({**info, **rendered}, indent=2))
         lists = {
             theirs: [frame.figures[ours] for frame in frames]
@@ -154,16 +162,6 @@ def read_results(file: Path) -> tuple[Measurement, dict[str, Any]]:
         "imported": {key: value for key, value in record.items() if key != "metrics_raw"},
     }
     return Measurement(rows, frames, {}, about), facts
-
-
-def _arrays(camera: Camera) -> dict[str, np.ndarray]:
-    return {
-        "poses": camera.c2w.numpy().astype(np.float32),
-        "intrinsics": np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32),
-        "camera_models": np.array(PINHOLE, np.int32),
-        "distortion_parameters": np.zeros(0, np.float32),
-        "image_sizes": np.array([camera.width, camera.height], np.int32),
-    }
 
 
 def _encoded(values: Sequence[float]) -> str:

@@ -29,12 +29,10 @@ COLUMNS = ("flip", *video_metrics.NEEDS)  # further metrics that a protocol can 
 class EvaluationProtocol:
     """How pictures are scored and how frames are timed.
 
-    Its name is in every row, so that rows of two protocols are never mixed. The flicker needs true
-    pictures of consecutive frames: those with a ground truth have one ("split"), or the scene
-    renders it for the other frames ("exact"), which takes about half a second at 400 x 400. So do
-    the further `columns`. Of several `rounds`, the first is scored, and the others give times and
-    work. Methods that are measured in turns may be `compared`, picture by picture, with the first
-    of them.
+    The flicker and most of `columns` need true pictures of consecutive frames: those with a ground
+    truth have one ("split"), or the scene renders it for the other frames ("exact"), which takes
+    about half a second at 400 x 400. Of several `rounds`, the first is scored, and the others give
+    times and work.
     """
 
     name: str

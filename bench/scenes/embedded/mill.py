@@ -69,8 +69,7 @@ def put(
     gloss: float = 0.0,
     sharpness: float = 12.0,  # broad: few viewers are where a flat surface reflects the light to
 ) -> Part:
-    frame = rotation(*turn) if any(turn) else None
-    return Part(shape, placed(paint, frame, centre), centre, turn, gloss, sharpness)
+    return Part(shape, placed(paint, rotation(*turn), centre), centre, turn, gloss, sharpness)
 
 
 def block(low: Triple, high: Triple, paint: Texture, gloss: float = 0.0) -> Part:

@@ -217,14 +217,11 @@ class Solids:
     def surface(self, number: int, rays: Rays, depth: Tensor, band: Band) -> Surface:
         """What the `rays` of a band meet of a part at `depth` [N]."""
         part, (row, column, sample) = self.parts[number], rays
-        turned = any(part.turn)
         x, y = band.x[0, column, sample], band.y[row, 0, sample]
         directions = torch.stack((x, y, torch.ones_like(x)), 1) @ band.rotation.T
         points = band.origin + depth[:, None] * directions
-        local = points - torch.tensor(part.centre)
-        local = local @ part.frame if turned else local
-        normals = part.shape.normal(local)
-        normals = normals @ part.frame.T if turned else normals
+        local = (points - torch.tensor(part.centre)) @ part.frame
+        normals = part.shape.normal(local) @ part.frame.T
         # The normal points to the viewer's side of the surface.
         away = (normals * directions).sum(1, keepdim=True) > 0
         normals = torch.where(away, -normals, normals)

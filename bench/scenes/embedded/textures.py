@@ -104,10 +104,9 @@ def mottled(first: Colour, second: Colour, scale: float, points: Tensor) -> Tens
 
 
 @texture
-def placed(paint: Texture, frame: Tensor | None, centre: Triple, points: Tensor) -> Tensor:
-    """The texture of a part with this frame (None: not turned) as if it had the building's."""
-    turned = points if frame is None else points @ frame.T.to(points)
-    return paint(turned + points.new_tensor(centre))
+def placed(paint: Texture, frame: Tensor, centre: Triple, points: Tensor) -> Tensor:
+    """The texture of a part with this frame as if it had the building's."""
+    return paint(points @ frame.T + points.new_tensor(centre))
 
 
 @texture
