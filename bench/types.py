@@ -216,8 +216,14 @@ class Method(Protocol):
         show as docs/protocol.md explains."""
 
 
-class NullProbe(Probe):
+class NullProbe:
     """A probe that measures nothing, for when only pictures are wanted."""
 
     def stage(self, name: str) -> AbstractContextManager[None]:
         return nullcontext()
+
+    def count(self, name: str, done: int | Tensor, dense: int | None = None) -> None:
+        pass
+
+    def report(self, ns: int, stages_ns: Mapping[str, int], peak_bytes: int | None = None) -> None:
+        pass
