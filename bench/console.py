@@ -74,6 +74,7 @@ class _Bar:
     ) -> None:
         self._say, self._bars, self._label = say, bars, label
         self.id = bars.add_task(label, total=total, note="")
+        self._task = bars.tasks[-1]
         self._begun, self._shown = bars.get_time(), 0.0
 
     def advance(self, steps: int = 1, note: str = "") -> None:
@@ -83,9 +84,9 @@ class _Bar:
             return
         self._shown = elapsed
         if plain:
-            task = self._task()
-            left = "?" if task.time_remaining is None else _duration(task.time_remaining)
-            self.say(f"{task.percentage:.0f} %, {_duration(elapsed)} elapsed, {left} left")
+            left = self._task.time_remaining
+            more = "?" if left is None else _duration(left)
+            self.say(f"{self._task.percentage:.0f} %, {_duration(elapsed)} elapsed, {more} left")
         else:
             self._bars.refresh()
 
@@ -93,11 +94,8 @@ class _Bar:
         return self._bars.get_time() - self._begun
 
     def say(self, text: str) -> None:
-        note = self._task().fields["note"]
+        note = self._task.fields["note"]
         self._say(f"{self._label}: {text}" + (f", {note}" if note else ""))
-
-    def _task(self) -> progress.Task:
-        return next(task for task in self._bars.tasks if task.id == self.id)
 
 
 def _duration(seconds: float) -> str:

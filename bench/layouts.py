@@ -45,7 +45,7 @@ def export(scene: Scene, path: Trajectory, folder: Path, layout: str, log: Log) 
     with explained(folder):
         LAYOUTS[layout](replace(scene, splits=splits), folder, log)
         if layout == "nerfbaselines":
-            write_path(folder / "path.json", cameras, scene, form="nerfbaselines")
+            write_path(folder / "path.json", cameras, scene, nerfbaselines=True)
 
 
 class _Truths(Sequence[Tensor]):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import statistics
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
@@ -27,7 +28,7 @@ from bench.metrics import Lpips, psnr_of_mse
 from bench.neighbours import Neighbours, Watch
 from bench.protocol import EvaluationProtocol
 from bench.results import COLD, STEADY, Measurement
-from bench.rows import UNITS, phase_rows, single
+from bench.rows import phase_rows, row_table, single
 from bench.scoring import ERROR_RANGE, PICTURES, Scoring, check_frame
 from bench.study import study_of
 from bench.trajectories import Trajectory, spread
@@ -119,8 +120,10 @@ class _Take:
         scene = task.scene
         self.scoring = Scoring(task.protocol, lpips, scene.background, shown, scene.surface)
         self.rows: list[dict[str, Any]] = []  # of the first round
-        self.apart: list[ToFirst] = []  # of its steady frames with a ground truth
-        self.waits: list[dict[CodeLine, int]] = []  # of steady frames, if the protocol counts them
+        # Of its steady frames with a ground truth, how far they are from the first method's: MSE,
+        # and largest difference of any channel.
+        self.apart: list[tuple[float, float]] = []
+        self.waits: list[Counter[CodeLine]] = []  # of steady frames, if the protocol counts them
 
     def metered(self, *, warm: bool = False) -> AbstractContextManager[object]:
         """The meter, around a frame whose memory counts; around others, nothing.
@@ -170,20 +173,6 @@ class _Take:
         return rounds[means.index(statistics.median_low(means))], means
 
 
-@dataclass(frozen=True)
-class ToFirst:
-    """How far a picture is from that of the first method measured in turns, rounded alike."""
-
-    mse: float
-    worst: float  # largest difference of any channel, on a scale of 1
-
-    @classmethod
-    def of(cls, picture: Tensor, first: Tensor) -> ToFirst:
-        """Both [H, W, 3]."""
-        difference = picture.double() - first.double()
-        return cls(difference.square().mean().item(), difference.abs().max().item())
-
-
 def _measurement(
     take: _Take, task: Task, missing: Mapping[str, str], neighbours: Neighbours, in_turns: int
 ) -> Measurement:
@@ -196,19 +185,22 @@ def _measurement(
     rows_of_frames = [row | cost for row, cost in zip(take.rows, costs, strict=True)]
     frames = _frame_table(rows_of_frames, scoring.names)
     of_phases = ((phase, frames[frames["phase"] == phase]) for phase in (STEADY, COLD))
+    whole: dict[str, float] = {}
+    if protocol.rounds > 1:
+        whole |= {"frame_ms.fastest": min(means), "frame_ms.slowest": max(means)}
+    if take.apart:  # the PSNR from the MSE over all frames, inf if they are equal
+        mse, worst = zip(*take.apart, strict=True)
+        whole |= {"psnr_to_first": psnr_of_mse(statistics.fmean(mse)), "worst_to_first": max(worst)}
+    whole |= {f"size_bytes.{part}": size for part, size in sizes.items()}
+    whole |= {"size_bytes.total": sum(sizes.values())} if sizes else {}
+    whole |= {"peak_bytes": peak_bytes, "train_s": method.train_s, **scoring.whole()}
     summary = [
         *(row | {"phase": phase} for phase, of in of_phases if len(of) for row in phase_rows(of)),
-        *_of_rounds(means if protocol.rounds > 1 else []),
-        *_of_first(take.apart),
-        *(single(f"size_bytes.{part}", size) for part, size in sizes.items()),
-        *([single("size_bytes.total", sum(sizes.values()))] if sizes else []),
-        single("peak_bytes", peak_bytes),
-        single("train_s", method.train_s),
-        *(single(name, value) for name, value in scoring.whole().items()),
+        *(single(name, value) for name, value in whole.items()),
     ]
     known = [row["metric"] for row in summary if row["n"]]
-    rows = pd.DataFrame(summary).assign(
-        unit=lambda table: [UNITS.get(name.split(".")[0], "1") for name in table["metric"]],
+    rows = row_table(
+        summary,
         method=method.name,
         scene=scene.name,
         split=trajectory.split,
@@ -234,32 +226,11 @@ def _measurement(
     return Measurement(rows, frames, scoring.images, record)
 
 
-def _of_rounds(means: Sequence[float]) -> list[dict[str, Any]]:
-    """Rows of the fastest and the slowest of several rounds, by their mean time of a frame."""
-    if not means:
-        return []
-    return [single("frame_ms.fastest", min(means)), single("frame_ms.slowest", max(means))]
-
-
-def _of_first(apart: Sequence[ToFirst]) -> list[dict[str, Any]]:
-    """Rows of how far the pictures are from those of the first method in turns: the PSNR from the
-    MSE over all frames, inf if they are equal, and the largest difference of a channel."""
-    if not apart:
-        return []
-    mse = statistics.fmean(each.mse for each in apart)
-    worst = max(each.worst for each in apart)
-    return [single("psnr_to_first", psnr_of_mse(mse)), single("worst_to_first", worst)]
-
-
-def _waits(of_frames: Sequence[Mapping[CodeLine, int]]) -> list[dict[str, Any]]:
+def _waits(of_frames: Sequence[Counter[CodeLine]]) -> list[dict[str, Any]]:
     """Where the host waits for the GPU in a steady frame, the most frequent first."""
-    total: dict[CodeLine, int] = {}
-    for frame in of_frames:
-        for line, count in frame.items():
-            total[line] = total.get(line, 0) + count
     return [
         {"waits": count / len(of_frames), "line": line.place, "source": line.source}
-        for line, count in sorted(total.items(), key=lambda item: -item[1])
+        for line, count in sum(of_frames, Counter()).most_common()
     ]
 
 
@@ -324,7 +295,7 @@ def _draw(take: _Take, task: Task, index: int, first: Tensor | None, *, scored: 
         return frame.rgb
     phase = COLD if before < method.memory else STEADY
     if phase == STEADY and waits is not None:
-        take.waits.append(dict(waits))
+        take.waits.append(waits)
     figures: dict[str, Any] = {"frame": index, "phase": phase}
     truth: Tensor | None = None
     if step.truth is not None:
@@ -333,10 +304,10 @@ def _draw(take: _Take, task: Task, index: int, first: Tensor | None, *, scored: 
     elif protocol.flicker == "exact" and task.scene.exact is not None:
         truth = task.scene.exact(step.camera)
     if protocol.compared and phase == STEADY and step.truth is not None:
-        shown = protocol.rounded(frame.rgb).cpu()
-        take.apart.append(
-            ToFirst.of(shown, shown if first is None else protocol.rounded(first).cpu())
-        )
+        first = frame.rgb if first is None else first
+        shown, other = (protocol.rounded(rgb).cpu().double() for rgb in (frame.rgb, first))
+        apart = shown - other
+        take.apart.append((apart.square().mean().item(), apart.abs().max().item()))
     scores = take.scoring.score(
         index,
         frame.rgb,

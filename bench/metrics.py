@@ -10,7 +10,6 @@ import math
 import re
 import warnings
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import torch
@@ -92,9 +91,12 @@ class Lpips:
     def __init__(self, net: str, weights_dir: Path | None, log: Log) -> None:
         self.net = net
         path, features = load_features(net, weights_dir, log)
+        declare_torchvision()  # lpips needs it only for its network definitions
+        import lpips
+
         with warnings.catch_warnings():  # lpips calls torchvision with deprecated arguments
             warnings.simplefilter("ignore", UserWarning)
-            model = _lpips_package().LPIPS(net=net, version="0.1", pnet_rand=True, verbose=False)
+            model = lpips.LPIPS(net=net, version="0.1", pnet_rand=True, verbose=False)
         # lpips cuts the backbone into slices but keeps torchvision's index of every layer.
         names = {name: re.sub(r"^slice\d+", "features", name) for name in model.net.state_dict()}
         try:
@@ -115,14 +117,6 @@ class Lpips:
             distance = self._model.to(image.device)(pair[:1], pair[1:], normalize=True)
         self._model.cpu()  # on the GPU it would count as memory of the measured method
         return float(distance.item())
-
-
-def _lpips_package() -> ModuleType:
-    """Import `lpips`, which needs torchvision only for its network definitions."""
-    declare_torchvision()
-    import lpips
-
-    return lpips
 
 
 def declare_torchvision() -> None:

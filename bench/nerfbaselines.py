@@ -22,7 +22,7 @@ import pandas as pd
 
 from bench.errors import explained, unexpected
 from bench.results import IMPORTED, STEADY, Measurement
-from bench.rows import UNITS, score_rows, single
+from bench.rows import row_table, score_rows, single
 from bench.scenes.files import describe, read_json
 from bench.types import Camera
 
@@ -76,7 +76,15 @@ def write_results(
                 digest.update(file.read_bytes())
             file = (inner / "cameras" / frame.name).with_suffix(".npz")
             file.parent.mkdir(parents=True, exist_ok=True)
-            np.savez(file, **_arrays(frame.camera))  # type: ignore[arg-type]
+            camera = frame.camera
+            np.savez(
+                file,
+                poses=camera.c2w.numpy().astype(np.float32),
+                intrinsics=np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32),
+                camera_models=np.array(PINHOLE, np.int32),
+                distortion_parameters=np.zeros(0, np.float32),
+                image_sizes=np.array([camera.width, camera.height], np.int32),
+            )
         (inner / "info.json").write_text(json.dumps({**info, **rendered}, indent=2))
         lists = {
             theirs: [frame.figures[ours] for frame in frames]
@@ -144,9 +152,7 @@ def read_results(file: Path) -> tuple[Measurement, dict[str, Any]]:
         **dict.fromkeys(("resolution", "backend", "engine", "precision", "field_precision"), "-"),
         "seed": 0,
     }
-    rows = pd.DataFrame([{"phase": STEADY, **row} for row in summary]).assign(
-        unit=lambda of: [UNITS.get(name, "1") for name in of["metric"]], **facts
-    )
+    rows = row_table([{"phase": STEADY, **row} for row in summary], **facts)
     about: dict[str, object] = {
         "protocol": {"name": protocol},
         "budget": {"name": budget},
@@ -156,16 +162,6 @@ def read_results(file: Path) -> tuple[Measurement, dict[str, Any]]:
         "imported": {key: value for key, value in record.items() if key != "metrics_raw"},
     }
     return Measurement(rows, frames, {}, about), facts
-
-
-def _arrays(camera: Camera) -> dict[str, np.ndarray]:
-    return {
-        "poses": camera.c2w.numpy().astype(np.float32),
-        "intrinsics": np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32),
-        "camera_models": np.array(PINHOLE, np.int32),
-        "distortion_parameters": np.zeros(0, np.float32),
-        "image_sizes": np.array([camera.width, camera.height], np.int32),
-    }
 
 
 def _encoded(values: Sequence[float]) -> str:

@@ -11,7 +11,6 @@ import math
 from collections import ChainMap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 from bench.cameras import move_camera
 from bench.errors import unexpected
@@ -104,14 +103,13 @@ def write_path(
     cameras: Sequence[Camera],
     scene: Scene,
     fps: float = 30.0,
-    form: Literal["nerfstudio", "nerfbaselines"] | None = None,
+    nerfbaselines: bool = False,
 ) -> None:
-    """Write `cameras` (scene units, all of one size) as a path that nerfstudio's viewer reads, or
-    NerfBaselines; without a `form`, the viewer unless it has no words for a lens."""
+    """Write `cameras` (scene units, all of one size) as a path that nerfstudio's viewer reads; as
+    one of NerfBaselines if that is asked for, or the viewer has no words for a lens."""
     moved = [data_camera(scene, camera) for camera in cameras]
-    if form is None:
-        form = "nerfstudio" if all(map(_plain, cameras)) else "nerfbaselines"
-    record = (_viewers if form == "nerfstudio" else _nerfbaselines)(moved, fps)
+    form = _nerfbaselines if nerfbaselines or not all(map(_plain, cameras)) else _viewers
+    record = form(moved, fps)
     path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
 

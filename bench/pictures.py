@@ -19,7 +19,7 @@ from bench.errors import unexpected
 from bench.metrics import Lpips, check_size
 from bench.protocol import EvaluationProtocol
 from bench.results import STEADY, Measurement
-from bench.rows import UNITS, phase_rows, score_rows, single
+from bench.rows import phase_rows, row_table, score_rows, single
 from bench.scenes.images import contents, decode_bytes
 from bench.scoring import PICTURES, Scoring
 from bench.trajectories import resolution, spread
@@ -177,12 +177,7 @@ def score(
     of_frames = phase_rows(table) if times else score_rows(table, scoring.names)
     summary = [{**row, "phase": STEADY} for row in of_frames]
     summary += [single(name, value) for name, value in scoring.whole().items()]
-    rows = pd.DataFrame(summary).assign(
-        unit=lambda of: [UNITS.get(name.split(".")[0], "1") for name in of["metric"]],
-        resolution=resolution(sizes),
-        protocol=protocol.name,
-        **facts,
-    )
+    rows = row_table(summary, resolution=resolution(sizes), protocol=protocol.name, **facts)
     record = {
         "protocol": asdict(protocol),
         "pictures": seen.hexdigest(),

@@ -15,7 +15,7 @@ from bench import metrics, video_metrics
 from bench.errors import unexpected
 from bench.provenance import sha256
 from bench.trajectories import Trajectory
-from bench.types import BACKGROUNDS, Log, Scene, SteerbenchError, Unavailable, composite
+from bench.types import BACKGROUNDS, Log, Scene, SteerbenchError, Unavailable
 from bench.waits import device_waits
 from bench.weights import locate
 
@@ -29,12 +29,10 @@ COLUMNS = ("flip", *video_metrics.NEEDS)  # further metrics that a protocol can 
 class EvaluationProtocol:
     """How pictures are scored and how frames are timed.
 
-    Its name is in every row, so that rows of two protocols are never mixed. The flicker needs true
-    pictures of consecutive frames: those with a ground truth have one ("split"), or the scene
-    renders it for the other frames ("exact"), which takes about half a second at 400 x 400. So do
-    the further `columns`. Of several `rounds`, the first is scored, and the others give times and
-    work. Methods that are measured in turns may be `compared`, picture by picture, with the first
-    of them.
+    The flicker and most of `columns` need true pictures of consecutive frames: those with a ground
+    truth have one ("split"), or the scene renders it for the other frames ("exact"), which takes
+    about half a second at 400 x 400. Of several `rounds`, the first is scored, and the others give
+    times and work.
     """
 
     name: str
@@ -129,18 +127,16 @@ class EvaluationProtocol:
         return metrics.quantise(rgb.float())
 
     def score(
-        self, rgb: Tensor, reference: Tensor, background: Tensor, lpips: Mapping[str, metrics.Lpips]
+        self, rgb: Tensor, truth: Tensor, lpips: Mapping[str, metrics.Lpips]
     ) -> dict[str, float]:
-        """Every metric of a prediction `rgb` [H, W, 3] against its ground truth.
+        """Every metric of a prediction against its ground truth, both [H, W, 3] in [0, 1].
 
-        `reference` is uint8 [H, W, 3 or 4]; straight alpha is composited onto `background` [3].
         A backbone that is missing from `lpips` scores NaN.
         """
         image = self.rounded(rgb)
-        truth = composite(reference.to(rgb.device), background)
         scores = {"psnr": metrics.psnr(image, truth), "ssim": metrics.ssim(image, truth)}
         for net in self.lpips:
             scores[f"lpips_{net}"] = lpips[net](image, truth) if net in lpips else math.nan
-        return scores | (
-            {"flip": video_metrics.flip(image, truth)} if "flip" in self.columns else {}
-        )
+        if "flip" in self.columns:
+            scores["flip"] = video_metrics.flip(image, truth)
+        return scores

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from collections.abc import Callable, Collection, Mapping
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -28,12 +31,22 @@ def check_frame(frame: Frame, camera: Camera, method: str, index: int) -> None:
         )
 
 
+class Shot(NamedTuple):
+    """A frame of a path: pictures [H, W, 3] as they are scored; None: not known."""
+
+    image: Tensor
+    truth: Tensor | None
+    view: video_metrics.DepthView | None
+
+
 class Scoring:
     """Scores the frames of a sequence in order, alone and against the frames before them.
 
-    `surface` is that of the scene: without it, flow comes from the depth of the frames. `images`
+    `lpips` are the backbones that could be loaded. `surface` is that of the scene: with it, also
+    the true pictures have warping errors, `warp_1_true` and `warp_7_true`. Without, flow comes from
+    the depth of the frames, and warping errors are called `warp_1_own` and `warp_7_own`. `images`
     holds 8-bit pictures by file name: ground truth, rendering and error map of the `shown` frames,
-    once they are scored.
+    once they are scored. For the JOD all frames are kept.
     """
 
     def __init__(
@@ -47,10 +60,18 @@ class Scoring:
         self.images: dict[str, np.ndarray] = {}
         self._protocol, self._lpips, self._scored = protocol, lpips, 0
         self._background, self._shown, self._surface = background, shown, surface
-        self.path = video_metrics.PathScoring(
-            protocol.columns, protocol.lpips, lpips, exact_flow=surface is not None
-        )
-        self.names = (*protocol.metric_names, *self.path.names)  # of a frame's figures, in order
+        wanted, own = protocol.columns, "_own" if surface is None else ""
+        self._warps = {f"warp_{k}{own}": k for k in video_metrics.OFFSETS if "warp" in wanted}
+        self._of_path = [
+            *(["tpsnr"] if "tpsnr" in wanted else []),
+            *(f"tlpips_{net}" for net in protocol.lpips if "tlpips" in wanted),
+            *self._warps,
+            *(f"{name}_true" for name in self._warps if not own),
+        ]
+        # Of the figures of a frame, in their order.
+        self.names = (*protocol.metric_names, "flicker", *self._of_path)
+        self._last: deque[Shot] = deque(maxlen=1 + max([1, *self._warps.values()]))
+        self._films: list[list[tuple[np.ndarray, np.ndarray]]] = []  # consecutive, with a truth
 
     def score(
         self,
@@ -71,31 +92,79 @@ class Scoring:
         """
         figures: dict[str, float] = {}
         true = None if truth is None else composite(truth.to(rgb.device), self._background)
-        if truth is not None and true is not None and scored:
+        if true is not None and scored:
             self._scored += 1
             nets = {} if self._scored % self._protocol.lpips_every else self._lpips
-            figures |= self._protocol.score(rgb, truth, self._background, nets)
+            figures |= self._protocol.score(rgb, true, nets)
             if index in self._shown:
                 self.images |= _pictures(index, rgb, true)
         view = None
-        if camera is not None and self.path.warps:
+        if camera is not None and self._warps:
             depth = depth if self._surface is None else self._surface(camera)
             view = None if depth is None else video_metrics.DepthView(camera, depth.cpu())
         # On a GPU these would count as memory of the method.
         kept = self._protocol.rounded(rgb).cpu(), None if true is None else true.cpu()
-        return figures | self.path.add(video_metrics.Shot(*kept, view), cut, rgb.device)
+        return figures | self._path(Shot(*kept, view), cut, rgb.device)
+
+    def _path(self, shot: Shot, cut: bool, device: torch.device) -> dict[str, float]:
+        """The figures of the next frame against those before it, LPIPS computed on `device`."""
+        figures: dict[str, float] = {}
+        if cut or (self._last and self._last[-1].image.shape != shot.image.shape):
+            self._last.clear()
+        before = self._last[-1] if self._last else None
+        self._last.append(shot)
+        if shot.truth is not None:
+            if before is None or before.truth is None:
+                self._films.append([])
+            else:
+                pictures = shot.image, shot.truth, before.image, before.truth
+                figures |= self._step(*(picture.to(device) for picture in pictures))
+            if "jod" in self._protocol.columns:
+                shown = metrics.as_bytes(shot.image.clamp(0, 1))
+                self._films[-1].append((shown, metrics.as_bytes(shot.truth)))
+        for name, offset in self._warps.items():
+            then = self._last[-1 - offset] if len(self._last) > offset else None
+            if then is not None and then.view is not None and shot.view is not None:
+                now, old = shot.view, then.view
+                figures[name] = video_metrics.warping_error(shot.image, now, then.image, old)
+                if self._surface and shot.truth is not None and then.truth is not None:
+                    error = video_metrics.warping_error(shot.truth, now, then.truth, old)
+                    figures[f"{name}_true"] = error
+        return figures
+
+    def _step(self, now: Tensor, true: Tensor, old: Tensor, true_old: Tensor) -> dict[str, float]:
+        """The figures of a frame and its truth, and those of the frame before.
+
+        tPSNR is the PSNR of the change from frame to frame, tLPIPS the absolute difference of its
+        LPIPS from that of the truth: tLP of Chu et al. 2020 (TecoGAN), who print 100 times as much.
+        """
+        figures = {"flicker": metrics.flicker(now, true, old, true_old)}
+        if "tpsnr" in self._protocol.columns:
+            figures["tpsnr"] = metrics.psnr_of_mse(figures["flicker"] ** 2)
+        for net, lpips in self._lpips.items() if "tlpips" in self._protocol.columns else ():
+            figures[f"tlpips_{net}"] = abs(lpips(old, now) - lpips(true_old, true))
+        return figures
 
     def missing(self, found: Collection[str]) -> dict[str, str]:
         """Why wanted metrics are not among those `found`, but for networks that are not there."""
+        names = [*self._of_path, *(["jod"] if "jod" in self._protocol.columns else [])]
+        needs = {name: video_metrics.NEEDS[name.split("_")[0]] for name in names}
+        why = {name: f"needs {what}" for name, what in needs.items() if name not in found}
         every = self._protocol.lpips_every
-        if self._scored not in range(1, every):
-            return self.path.missing(found)
-        why = f"protocol.lpips_every is {every}, and the path has {self._scored} frames to score"
-        return {**self.path.missing(found), **{f"lpips_{net}": why for net in self._lpips}}
+        if self._scored in range(1, every):
+            have = f"the path has {self._scored} frames to score"
+            few = f"protocol.lpips_every is {every}, and {have}"
+            why |= {f"lpips_{net}": few for net in self._lpips}
+        return why
 
     def whole(self) -> dict[str, float]:
-        """The figures of the whole sequence."""
-        return self.path.whole(self._protocol.fps, self._protocol.display)
+        """The JOD of all frames: the mean over its films, weighted by their frames."""
+        if "jod" not in self._protocol.columns:
+            return {}
+        films, how = [film for film in self._films if len(film) > 1], self._protocol
+        found = [video_metrics.jod(film, how.fps, how.display) for film in films]
+        weights = [len(film) for film in films]
+        return {"jod": float(np.average(found, weights=weights)) if films else math.nan}
 
 
 def _pictures(index: int, rgb: Tensor, truth: Tensor) -> dict[str, np.ndarray]:

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -21,7 +20,7 @@ from torch import Tensor
 
 from bench.cameras import pixel_grid, project, unproject
 from bench.errors import Unavailable, install_command, unexpected
-from bench.metrics import as_bytes, check_pair, declare_torchvision, flicker, psnr_of_mse
+from bench.metrics import check_pair, declare_torchvision
 from bench.types import Camera, check_shape
 
 NEEDS = {
@@ -68,25 +67,6 @@ def extra(name: str, of: str) -> Iterator[None]:
     except ImportError as error:
         how = f"{install_command(name)}, or take it out of protocol.columns"
         raise Unavailable(f"{of} needs {error.name}: {how}") from error
-
-
-def tpsnr(flicker: float) -> float:
-    """tPSNR in dB, the PSNR of the change from frame to frame: `flicker` in another unit."""
-    return psnr_of_mse(flicker**2)
-
-
-def tlpips(
-    lpips: Callable[[Tensor, Tensor], float],
-    image: Tensor,
-    reference: Tensor,
-    previous_image: Tensor,
-    previous_reference: Tensor,
-) -> float:
-    """The difference of LPIPS steps: that of `image` from its predecessor, less the true one.
-
-    Absolute, as tLP of Chu et al. 2020 (TecoGAN), who print a hundred times as much.
-    """
-    return abs(lpips(previous_image, image) - lpips(previous_reference, reference))
 
 
 class DepthView(NamedTuple):
@@ -152,88 +132,3 @@ def color_video_vdp(display: str) -> Any:
     except pycvvdp.vq_exception as error:
         known = "a display that `cvvdp --display ?` lists"
         raise unexpected("protocol.display", known, repr(display)) from error
-
-
-class Shot(NamedTuple):
-    """A frame of a path: pictures [H, W, 3] as they are scored; None: not known."""
-
-    image: Tensor
-    truth: Tensor | None
-    view: DepthView | None
-
-
-class PathScoring:
-    """Scores frames against the frames before them; keeps the last ones, for the JOD all.
-
-    `wanted` are of `NEEDS`, `nets` the backbones of LPIPS, of which `lpips` has those that could be
-    loaded. With `exact_flow` there are also the warping errors of the true pictures, `warp_1_true`
-    and `warp_7_true`. Without, the views come from the method's own depth, and the warping errors
-    are named `warp_1_own` and `warp_7_own`.
-    """
-
-    def __init__(
-        self,
-        wanted: Collection[str],
-        nets: Collection[str],
-        lpips: Mapping[str, Callable[[Tensor, Tensor], float]],
-        exact_flow: bool,
-    ) -> None:
-        own = "" if exact_flow else "_own"
-        self.warps = {f"warp_{k}{own}": k for k in OFFSETS if "warp" in wanted}
-        steps = [f"tlpips_{net}" for net in nets if "tlpips" in wanted]
-        tpsnr_too = ["tpsnr"] if "tpsnr" in wanted else []
-        true = [f"{name}_true" for name in self.warps if exact_flow]
-        self.names = ("flicker", *tpsnr_too, *steps, *self.warps, *true)
-        self._wanted, self._lpips = wanted, lpips
-        self._last: deque[Shot] = deque(maxlen=1 + max([1, *self.warps.values()]))
-        self._films: list[list[tuple[np.ndarray, np.ndarray]]] = []  # consecutive, with a truth
-
-    def add(self, shot: Shot, cut: bool, device: torch.device) -> dict[str, float]:
-        """The figures of the next frame, LPIPS computed on `device`.
-
-        Frames before a `cut`, or of another size, are not compared with.
-        """
-        figures: dict[str, float] = {}
-        if cut or (self._last and self._last[-1].image.shape != shot.image.shape):
-            self._last.clear()
-        before = self._last[-1] if self._last else None
-        self._last.append(shot)
-        if shot.truth is not None:
-            if before is None or before.truth is None:
-                self._films.append([])
-            else:
-                pictures = shot.image, shot.truth, before.image, before.truth
-                figures |= self._step([picture.to(device) for picture in pictures])
-            if "jod" in self._wanted:
-                self._films[-1].append((as_bytes(shot.image.clamp(0, 1)), as_bytes(shot.truth)))
-        for name, offset in self.warps.items():
-            then = self._last[-1 - offset] if len(self._last) > offset else None
-            if then is not None and then.view is not None and shot.view is not None:
-                figures[name] = warping_error(shot.image, shot.view, then.image, then.view)
-                true = f"{name}_true"
-                if true in self.names and shot.truth is not None and then.truth is not None:
-                    figures[true] = warping_error(shot.truth, shot.view, then.truth, then.view)
-        return figures
-
-    def _step(self, pictures: Sequence[Tensor]) -> dict[str, float]:
-        """The figures of a frame and its truth, and those of the frame before."""
-        figures = {"flicker": flicker(*pictures)}
-        if "tpsnr" in self._wanted:
-            figures["tpsnr"] = tpsnr(figures["flicker"])
-        for net, lpips in self._lpips.items() if "tlpips" in self._wanted else ():
-            figures[f"tlpips_{net}"] = tlpips(lpips, *pictures)
-        return figures
-
-    def whole(self, fps: float, display: str) -> dict[str, float]:
-        """The JOD of all frames: the mean over its films, weighted by their frames."""
-        if "jod" not in self._wanted:
-            return {}
-        films = [film for film in self._films if len(film) > 1]
-        found = [jod(film, fps, display) for film in films]
-        weights = [len(film) for film in films]
-        return {"jod": float(np.average(found, weights=weights)) if films else math.nan}
-
-    def missing(self, found: Collection[str]) -> dict[str, str]:
-        """What each wanted metric needs that is not among those `found`."""
-        names = [*self.names[1:], *(["jod"] if "jod" in self._wanted else [])]
-        return {name: f"needs {NEEDS[name.split('_')[0]]}" for name in names if name not in found}

@@ -29,10 +29,7 @@ class Ask:
 
 
 class Turns:
-    """The queue of browsers that wait for a picture, in the order in which they began to wait.
-
-    Only the newest request of a browser counts; older ones are dropped.
-    """
+    """The queue of browsers that wait for a picture, in the order in which they began to wait."""
 
     def __init__(self) -> None:
         self._waiting: dict[Hashable, Ask] = {}

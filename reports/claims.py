@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 import pandas as pd
 
-from bench.intervals import half_interval, path_interval
+from bench.rows import half_interval, path_interval
 from reports.comparison import shown_as
 from reports.runs import Repeated, Run
 from reports.tables import ABSENT, Table, decimal

@@ -10,8 +10,7 @@ from functools import partial
 import numpy as np
 
 from bench.errors import SteerbenchError
-from bench.intervals import half_interval
-from bench.rows import UNITS
+from bench.rows import UNITS, half_interval
 from reports.lines import Lines
 from reports.runs import Repeated, Run
 from reports.tables import NOT_AVAILABLE, QUALITY, Metric, Table, decimal, megabytes

@@ -74,7 +74,8 @@ def exported_tables(tables: Sequence[PaperTable], measured: Measured, form: str)
 def _latex(table: PaperTable, measured: Measured) -> str:
     blocks = table.shown(measured)
     runs = [run for block in blocks for line in block.measured for run in line.runs]
-    caption = f"{table.title}. " + (f"{conditions_of(runs)}." if runs else "")
+    where = f"{conditions_of(runs)}." if runs else ""
+    caption = f"{table.title}. {where[:1].upper()}{where[1:]}"
     heads = ["", *(shown_as(metric).heading for metric in table.metrics)]
     sides = f"l{'r' * len(table.metrics)}"
     return _tabular(caption.strip(), table.name, sides, heads, list(map(_rows, blocks)))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.errors import SteerbenchError
-from bench.intervals import half_interval, path_interval
+from bench.rows import half_interval, path_interval
 from reports.runs import Run
 from reports.tables import QUALITY, Table
 

@@ -16,11 +16,10 @@ from torch import Tensor
 
 from bench.clock import OTHER
 from bench.errors import SteerbenchError
-from bench.intervals import half_interval
 from bench.metrics import psnr
 from bench.neighbours import Neighbours
 from bench.results import COLD, STEADY, Store, content_key, unreadable
-from bench.rows import phase_rows
+from bench.rows import half_interval, phase_rows
 from bench.scenes.images import contents, decode_bytes
 from bench.study import part_of
 from reports.tables import phases, run_tables

@@ -25,7 +25,7 @@ from torch import Tensor
 from bench import neighbours
 from bench.console import ConsoleLog
 from bench.measure import Task, measure
-from bench.metrics import _lpips_package
+from bench.metrics import declare_torchvision
 from bench.nerfbaselines import VERSION
 from bench.results import Store
 from bench.trajectories import from_split
@@ -220,11 +220,14 @@ def lpips_weights(
     """A folder with the backbones of LPIPS: the real ones where they are, else random ones."""
     if real_lpips_weights:
         return real_lpips_weights
+    declare_torchvision()
+    import lpips
+
     folder = tmp_path_factory.mktemp("weights")
     with warnings.catch_warnings():  # torchvision deprecates how lpips calls it
         warnings.simplefilter("ignore", UserWarning)
         for net, (_, file) in BACKBONES.items():
-            state = _lpips_package().LPIPS(net=net, pnet_rand=True, verbose=False).net.state_dict()
+            state = lpips.LPIPS(net=net, pnet_rand=True, verbose=False).net.state_dict()
             names = {name: re.sub(r"^slice\d+", "features", name) for name in state}
             torch.save({names[name]: state[name] for name in state}, folder / file)
     return folder

@@ -71,8 +71,8 @@ def assemble(
     """The scene, scaled so that `box` fills the unit cube.
 
     The digest covers the bytes of `camera_files` and of all picture files, the background, the
-    resolution and the box.
-    Raises SteerbenchError if the box, or a camera in its units, exceeds the range of float32.
+    resolution and the box. Raises SteerbenchError if the box, or a camera in its units, exceeds
+    the range of float32.
     """
     if background not in BACKGROUNDS:
         raise unexpected("background", " or ".join(BACKGROUNDS), repr(background))
@@ -162,7 +162,7 @@ class Box:
         corners = torch.stack((self.lower, self.upper))
         return ((corners - self.origin) / self.side).float().clamp(0, 1)
 
-    def grown(self, share: float) -> Box:
+    def grown(self, share: float = MARGIN) -> Box:
         """The box, longer along every axis by `share` of its longest side."""
         return Box(self.lower - share * self.side / 2, self.upper + share * self.side / 2)
 
@@ -201,7 +201,7 @@ def hull_box(cameras: Sequence[Camera], images: Sequence[Tensor], space: Box) ->
         return None
     lower = space.lower + size * cells.amin(0)
     upper = space.lower + size * (cells.amax(0) + 1)
-    return Box(lower, upper).grown(MARGIN)
+    return Box(lower, upper).grown()
 
 
 def _grid(side: int) -> Tensor:

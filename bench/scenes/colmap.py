@@ -14,15 +14,7 @@ from torch import Tensor
 
 from bench.cameras import scale_camera
 from bench.errors import Unavailable, install_command, unexpected
-from bench.scenes.assemble import (
-    MARGIN,
-    Box,
-    assemble,
-    describe_splits,
-    every_nth,
-    leave_out,
-    parse_box,
-)
+from bench.scenes.assemble import Box, assemble, describe_splits, every_nth, leave_out, parse_box
 from bench.scenes.files import data_folder, inside, rigid_pose
 from bench.scenes.images import Lens, View, image_size
 from bench.types import Camera, Log, Scene
@@ -69,7 +61,7 @@ def load(
         raise unexpected(folder, "points, or scene.bounds=[[x,y,z],[x,y,z]]", "no point")
     else:
         points = reconstruction.compute_bounding_box(STRAY, 1 - STRAY)
-        box = Box(torch.tensor(points.min), torch.tensor(points.max)).grown(MARGIN)
+        box = Box(torch.tensor(points.min), torch.tensor(points.max)).grown()
     pictures = describe_splits(splits, downscale, log)
     files = sorted(folder.glob(f"*{_kind(folder)}"))
     return assemble(root.name, pictures, box, background=background, camera_files=files)

@@ -49,19 +49,17 @@ def write_blender(scene: Scene, folder: Path, files: Mapping[str, str], log: Log
         images = scene.splits[split].images
 
         def write(number: int, split: str = split, images: Sequence[Tensor] = images) -> None:
-            _write_picture(folder / picture_file(split, number), images[number])
+            pixels = images[number]
+            if pixels.shape[2] == 3:
+                pixels = torch.cat((pixels, torch.full_like(pixels[..., :1], 255)), dim=2)
+            file = folder / picture_file(split, number)
+            Image.fromarray(pixels.numpy()).save(file, compress_level=1)  # quickly
 
         in_parallel(write, range(len(images)), f"write pictures of {scene.name}", log)
     for name, split in files.items():
         cameras = [data_camera(scene, camera) for camera in scene.splits[split].cameras]
         record = _transforms(cameras, split)
         (folder / camera_file(name)).write_text(json.dumps(record, indent=1) + "\n")
-
-
-def _write_picture(path: Path, pixels: Tensor) -> None:
-    if pixels.shape[2] == 3:
-        pixels = torch.cat((pixels, torch.full_like(pixels[..., :1], 255)), dim=2)
-    Image.fromarray(pixels.numpy()).save(path, compress_level=1)  # quickly
 
 
 def _transforms(cameras: list[Camera], split: str) -> dict[str, object]:

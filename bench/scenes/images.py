@@ -127,7 +127,7 @@ def decode(picture: ScaledView) -> Tensor:
         raise unexpected(view.path, "the picture that was there at the start", "another one")
     image = decode_bytes(content, view.path)
     if view.lens:
-        image = undistort(image, view.camera, view.lens, view.path)
+        image = undistort(image, view.camera, view.lens)
     return shrink(image, picture.downscale)
 
 
@@ -211,12 +211,12 @@ class Fisheye:
         return distort_points_kannala_brandt(points, points.new_tensor(plain + self.coefficients))
 
 
-def undistort(image: Tensor, camera: Camera, lens: Lens, where: Path) -> Tensor:
+def undistort(image: Tensor, camera: Camera, lens: Lens) -> Tensor:
     """Undistort `image`, uint8 [H, W, C], to the pinhole picture of `undistorted_camera`.
 
-    `camera` has the intrinsics of both. Raises if the lens folds the picture over itself.
+    `camera` has the intrinsics of both. ValueError if the distortion cannot be undone.
     """
-    source, _, _ = _window(camera, lens, where)
+    source, _, _ = _window(camera, lens)
     planes = image.permute(2, 0, 1)[None].float()
     alpha = planes[:, 3:] / 255
     planes[:, :3] *= alpha if alpha.numel() else 1  # interpolate premultiplied colours
@@ -230,17 +230,17 @@ def undistort(image: Tensor, camera: Camera, lens: Lens, where: Path) -> Tensor:
 
 def undistorted_camera(camera: Camera, lens: Lens, where: Path) -> Camera:
     """The camera of the undistorted picture, cropped to where the lens saw every pixel."""
-    source, left, top = _window(camera, lens, where)
-    return crop_camera(camera, left, top, source.shape[1], source.shape[0])
-
-
-def _window(camera: Camera, lens: Lens, where: Path) -> tuple[Tensor, int, int]:
-    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     try:
-        return pinhole_window(camera.width, camera.height, intrinsics, lens)
+        source, left, top = _window(camera, lens)
     except ValueError as error:
         expected = "a lens distortion that can be undone"
         raise unexpected(where, expected, f"{lens}: {error}") from error
+    return crop_camera(camera, left, top, source.shape[1], source.shape[0])
+
+
+def _window(camera: Camera, lens: Lens) -> tuple[Tensor, int, int]:
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    return pinhole_window(camera.width, camera.height, intrinsics, lens)
 
 
 @lru_cache(maxsize=2)  # most captures have one lens

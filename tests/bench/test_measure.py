@@ -13,11 +13,11 @@ import torch
 import bench.measure
 from bench.clock import FrameRecord
 from bench.console import ConsoleLog
-from bench.intervals import path_interval
 from bench.measure import MethodFailed, Task, _Take, measure
 from bench.metrics import psnr, quantise
 from bench.protocol import EvaluationProtocol
 from bench.results import COLUMNS
+from bench.rows import path_interval
 from bench.trajectories import from_split
 from bench.types import Budget, Frame, SteerbenchError, composite
 from tests.conftest import QUICK, STEERBENCH_1, OffsetMethod

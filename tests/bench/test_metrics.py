@@ -63,35 +63,6 @@ def test_pictures_of_different_size_are_refused():
         psnr(small, large)
 
 
-def plain_ssim(a: Tensor, b: Tensor, weights: Tensor) -> float:
-    """Wang et al. 2004, Eq. 13, summed window by window over the valid region."""
-    side = weights.shape[0]
-    windows = [
-        picture.double().unfold(0, side, 1).unfold(1, side, 1) for picture in (a, b)
-    ]  # [H', W', 3, side, side]
-
-    def mean(values: Tensor) -> Tensor:
-        return (values * weights).sum(dim=(-2, -1))
-
-    mean_a, mean_b = map(mean, windows)
-    var_a, var_b = (mean(w * w) - m * m for w, m in zip(windows, (mean_a, mean_b), strict=True))
-    covariance = mean(windows[0] * windows[1]) - mean_a * mean_b
-    c1, c2 = 0.01**2, 0.03**2
-    luminance = (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1)
-    structure = (2 * covariance + c2) / (var_a + var_b + c2)
-    return (luminance * structure).mean().item()
-
-
-def test_ssim_is_the_plain_computation_over_the_valid_region(device):
-    a = noise(19, 23, 3, device)
-    b = (0.7 * a + 0.3 * noise(19, 23, 4, device)).clamp(0, 1)
-    x = torch.arange(11, dtype=torch.float64, device=device) - 5
-    line = torch.exp(-(x**2) / (2 * 1.5**2))
-    weights = torch.outer(line, line) / line.sum() ** 2
-    # Two orders of summing 121 products in float64, divided by numbers no smaller than c2.
-    assert ssim(a, b) == pytest.approx(plain_ssim(a, b, weights), abs=1e-10)
-
-
 READ = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}
 """The layers of torchvision's `features` whose output LPIPS reads."""
 
@@ -143,8 +114,9 @@ def waves() -> tuple[Tensor, Tensor]:
     return first, second
 
 
-def test_figures_are_those_of_nerfbaselines():
-    pictures = waves()
+def test_figures_are_those_of_nerfbaselines(device):
+    """So is which variant of the SSIM it is: its window, covariance, constants and region."""
+    pictures = [picture.to(device) for picture in waves()]
     assert psnr(*pictures) == pytest.approx(NERFBASELINES["psnr"], rel=1e-6)
     assert ssim(*pictures) == pytest.approx(NERFBASELINES["ssim"], abs=2e-6)
 
@@ -182,5 +154,5 @@ def test_scoring_leaves_nothing_on_a_gpu(gpu, lpips_weights, quiet_log):
     assert math.isfinite(lpips(*pictures))
     truth = torch.zeros(40, 40, 3, dtype=torch.uint8)
     scoring.score(0, pictures[0], truth, scored=False, cut=False)
-    kept = [*lpips._model.parameters(), *lpips._model.buffers(), *scoring.path._last[-1][:2]]
+    kept = [*lpips._model.parameters(), *lpips._model.buffers(), *scoring._last[-1][:2]]
     assert {tensor.device.type for tensor in kept} == {"cpu"}

@@ -43,13 +43,12 @@ def nerfbaselines(**others: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("form", "lens"),
-    [("nerfstudio", {}), ("nerfbaselines", {}), (None, {}), (None, {"cx": 9.0, "fx": 30.0})],
+    ("asked", "lens"), [(True, {}), (False, {}), (False, {"cx": 9.0, "fx": 30.0})]
 )
-def test_a_path_comes_back_as_it_was_written(scene, tmp_path, form, lens):
+def test_a_path_comes_back_as_it_was_written(scene, tmp_path, asked, lens):
     first = replace(scene.splits["test"].cameras[0], **lens)
     second = replace(first, c2w=first.c2w + torch.tensor([0.0, 0, 0, 0.125]))
-    write_path(tmp_path / "there.json", [first, second], scene, form=form)
+    write_path(tmp_path / "there.json", [first, second], scene, nerfbaselines=asked)
     read = read_path(tmp_path / "there.json", scene)
     for camera, written in zip(read, (first, second), strict=True):
         torch.testing.assert_close(camera.c2w, written.c2w)

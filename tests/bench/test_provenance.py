@@ -46,13 +46,9 @@ def test_without_git_or_in_another_repository_the_version_is_named(tree, monkeyp
 
 
 def test_the_machine_record_names_what_matters():
-    record = provenance.machine()
-    assert record["cuda"] == torch.version.cuda
-    assert record["threads"] == torch.get_num_threads()
-    assert record["cores"] >= 1
-    assert record["memory_bytes"] > 1 << 28
-    assert record["cpu"]
-    assert len(record["gpus"]) == torch.cuda.device_count()
+    assert MACHINE["memory_bytes"] > 1 << 28
+    assert MACHINE["cpu"]
+    assert len(MACHINE["gpus"]) == torch.cuda.device_count()
 
 
 @pytest.mark.parametrize(

@@ -15,12 +15,12 @@ from torch import Tensor
 
 from bench.cameras import cast, pixel_grid
 from bench.measure import Task, measure
-from bench.metrics import as_bytes, flicker, psnr
+from bench.metrics import as_bytes, psnr
 from bench.scenes import embedded
 from bench.scoring import Scoring
 from bench.trajectories import from_split
 from bench.types import Budget, Camera, SteerbenchError, Unavailable, composite
-from bench.video_metrics import DepthView, flip, jod, tlpips, tpsnr, warping_error
+from bench.video_metrics import DepthView, flip, jod, warping_error
 from tests.bench.test_metrics import noise, waves
 from tests.conftest import QUICK
 
@@ -41,31 +41,28 @@ def program(start: str, *words: object) -> str:
     return done.stdout
 
 
-def test_tpsnr_is_the_psnr_of_the_change_from_frame_to_frame():
-    now, true, before, true_before = (noise(9, 8, seed).double() for seed in range(4))
-    blink = flicker(now, true, before, true_before)
-    assert tpsnr(blink) == pytest.approx(psnr(now - before, true - true_before), rel=1e-12)
-    assert tpsnr(0.0) == math.inf
-
-
-def test_tlpips_is_the_difference_of_the_distances_from_frame_to_frame():
+def test_tpsnr_and_tlpips_are_those_of_the_change_from_frame_to_frame():
     """Of LPIPS itself, `test_metrics.py` shows that it is that of the package."""
-    now, true, before, true_before = (noise(16, 12, seed) for seed in range(4))
+    pictures = [torch.from_numpy(as_bytes(noise(16, 12, seed))) for seed in range(4)]
+    now, true, before, true_before = (picture / 255 for picture in pictures)
 
     def lpips(one: Tensor, other: Tensor) -> float:
         return (one - other).square().mean().item()
 
-    expected = abs(lpips(before, now) - lpips(true_before, true))
-    assert tlpips(lpips, now, true, before, true_before) == expected > 0
-    protocol = replace(QUICK, name="path", lpips=("alex",), columns=("tlpips",))
+    protocol = replace(QUICK, name="path", lpips=("alex",), columns=("tlpips", "tpsnr"))
     scoring = Scoring(protocol, {"alex": lpips}, WHITE, ())
-    pairs = ((before, as_bytes(true_before)), (now, as_bytes(true)))
-    found = [
-        scoring.score(k, rgb, torch.from_numpy(truth), cut=False)
-        for k, (rgb, truth) in enumerate(pairs)
-    ]
-    assert "tlpips_alex" not in found[0]
-    assert found[1]["tlpips_alex"] == pytest.approx(expected, abs=2e-3)  # of 8-bit pictures
+    first, second = (
+        scoring.score(k, rgb, truth, cut=False)
+        for k, (rgb, truth) in enumerate(((before, pictures[3]), (now, pictures[1])))
+    )
+    assert not {"tlpips_alex", "tpsnr"} & first.keys()
+    expected = abs(lpips(before, now) - lpips(true_before, true))
+    assert second["tlpips_alex"] == pytest.approx(expected, rel=1e-6)
+    assert expected > 0
+    expected = psnr(now - before, true - true_before)
+    assert second["tpsnr"] == pytest.approx(expected, rel=1e-6)
+    again = scoring.score(2, now, pictures[1], cut=False)
+    assert (again["flicker"], again["tpsnr"]) == (0, math.inf)
 
 
 @has("flip_evaluator", "flip")

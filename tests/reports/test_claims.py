@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.intervals import half_interval, path_interval
+from bench.rows import half_interval, path_interval
 from reports.claims import (
     AGREES,
     AS,

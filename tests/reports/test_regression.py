@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.intervals import half_interval, path_interval
+from bench.rows import half_interval, path_interval
 from reports.regression import LIMITS, Change, Figures, Limit, changes
 
 OLD = Figures(

@@ -92,7 +92,7 @@ def load(
     def surface(camera: Camera) -> Tensor:
         moved = move_camera(camera, scene.unit_length, scene.origin)
         with torch.no_grad():
-            return render(model, moved, torch.zeros(3), samples=1).depth / scene.unit_length
+            return render(model, moved, samples=1).depth / scene.unit_length
 
     return replace(scene, exact=exact, surface=surface if isinstance(model, Solids) else None)
 
@@ -115,7 +115,7 @@ def find(name: str) -> SceneModel:
 def picture(model: SceneModel, camera: Camera) -> Tensor:
     """The exact picture, uint8 [H, W, 4] with straight alpha; `camera` is in the model's units."""
     with torch.inference_mode():  # with less bookkeeping, threads wait less for Python's lock
-        frame = render(model, camera, torch.zeros(3), samples=16)
+        frame = render(model, camera, samples=16)
         alpha = frame.alpha[..., None]
         straight = frame.rgb / alpha.clamp(min=1e-6)
         pixels = (torch.cat((straight, alpha), dim=-1).clamp(0, 1) * 255).round().to(torch.uint8)

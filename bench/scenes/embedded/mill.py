@@ -9,9 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from bench.scenes.embedded.building import block, put, rail, raised, rod, slope
-from bench.scenes.embedded.masonry import bricks, panes, planks, rough, setts, tiles
-from bench.scenes.embedded.raytrace import Part, Solids
+from bench.scenes.embedded.raytrace import Part, Solids, along, rotation
 from bench.scenes.embedded.solids import (
     Carved,
     Common,
@@ -20,10 +18,20 @@ from bench.scenes.embedded.solids import (
     Ellipsoid,
     Gable,
     Pierced,
+    Shape,
     Triple,
     ball,
 )
-from bench.scenes.embedded.textures import Texture
+from bench.scenes.embedded.textures import (
+    Texture,
+    bricks,
+    panes,
+    placed,
+    planks,
+    rough,
+    setts,
+    tiles,
+)
 
 SUNK = 0.53  # how far the ground lies below the centre of the pictures
 
@@ -53,12 +61,72 @@ STOREYS, BAYS = 3, (7, 4)  # rows of windows, and windows in a row of a long and
 WINDOW = (0.0525, 0.085)  # half sizes
 
 
+def put(
+    shape: Shape,
+    paint: Texture,
+    centre: Triple,
+    turn: Triple = (0.0, 0.0, 0.0),
+    gloss: float = 0.0,
+    sharpness: float = 12.0,  # broad: few viewers are where a flat surface reflects the light to
+) -> Part:
+    return Part(shape, placed(paint, rotation(*turn), centre), centre, turn, gloss, sharpness)
+
+
+def block(low: Triple, high: Triple, paint: Texture, gloss: float = 0.0) -> Part:
+    """A box between two corners."""
+    x, y, z = ((b - a) / 2 for a, b in zip(low, high, strict=True))
+    _, middle, _ = along(low, high)
+    return put(Cuboid((x, y, z)), paint, middle, gloss=gloss)
+
+
+def rod(start: Triple, end: Triple, radius: float, paint: Texture, gloss: float = 0.0) -> Part:
+    length, middle, turn = along(start, end)
+    return put(Cylinder(radius, length / 2), paint, middle, turn, gloss)
+
+
+def rail(start: Triple, end: Triple, height: float, paint: Texture) -> Part:
+    """A railing whose lower edge goes from `start` to `end`, also up a stair."""
+    length, (x, y, z), (_, _, azimuth) = along(start, end)
+    count = round(length / 0.035)
+    hole = (length / count / 2 - 0.0035, height / 2 - 0.006)
+    shape = Pierced((length / 2, 0.005, height / 2), (count, 1), hole)
+    pitch = -math.degrees(math.asin((end[2] - start[2]) / length))
+    return put(shape, paint, (x, y, z + height / 2), (0.0, pitch, azimuth))
+
+
+def slope(
+    ridge: Triple,  # the middle of the upper edge
+    length: float,  # half of the edge
+    run: float,  # how far the slope reaches, measured on the level
+    pitch: float,  # in degrees
+    turn: float,  # about z; at 0 the slope falls to -y
+    tile: Texture,
+    timber: Texture,
+) -> list[Part]:
+    """Tiles, and under the eaves the ends of rafters."""
+    c, t, a = math.cos(math.radians(pitch)), math.tan(math.radians(pitch)), math.radians(turn)
+    half, thick, eave = run / c / 2, 0.010, 0.09
+
+    def below(away: float, lift: float) -> Triple:
+        """The point `away` from the ridge, on the level, and `lift` above the slope."""
+        x, y, z = ridge
+        return (x + math.sin(a) * away, y - math.cos(a) * away, z - away * t + lift / c)
+
+    count = round(2 * length / 0.06)
+    hole = (length / count - 0.008, eave - 0.012)
+    rafters = Pierced((length - 0.01, thick, eave), (count, 1), hole)
+    return [
+        Part(Cuboid((length, half, thick)), tile, below(run / 2, thick), (pitch, 0.0, turn)),
+        put(rafters, timber, below(run - (eave + 0.02) * c, -thick), (pitch - 90.0, 0.0, turn)),
+    ]
+
+
 def mill() -> Solids:
     """A mill with rows of windows, a water wheel, a porch, a shed and an outside stair."""
     house = [*walls(), *gables(), *bands(), *roof(), *gutters(), *crown(), *hoist()]
     around = [*porch(), *door(), *wheel(), *flume(), *shed(), *stair(), *yard(), *goods()]
-    parts = house + around
-    return Solids([replace(part, centre=raised(part.centre, -SUNK)) for part in parts])
+    places = ((part, *part.centre) for part in house + around)
+    return Solids([replace(part, centre=(x, y, z - SUNK)) for part, x, y, z in places])
 
 
 def walls() -> list[Part]:

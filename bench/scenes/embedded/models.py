@@ -7,7 +7,7 @@ from collections.abc import Callable
 from itertools import pairwise
 
 from bench.scenes.embedded.mill import mill
-from bench.scenes.embedded.raytrace import Ball, Media, Part, SceneModel, Solids
+from bench.scenes.embedded.raytrace import Ball, Media, Part, SceneModel, Solids, along
 from bench.scenes.embedded.solids import (
     Capsule,
     Carved,
@@ -118,12 +118,8 @@ def wires() -> Solids:
 
 
 def wire(start: Triple, end: Triple, radius: float, colour: Colour) -> Part:
-    x, y, z = (b - a for a, b in zip(start, end, strict=True))
-    length = math.sqrt(x * x + y * y + z * z)
-    tilt, azimuth = math.degrees(math.acos(z / length)), math.degrees(math.atan2(y, x))
-    cx, cy, cz = ((a + b) / 2 for a, b in zip(start, end, strict=True))
-    rod = Capsule(radius, length / 2)
-    return Part(rod, plain(colour), (cx, cy, cz), (0, tilt, azimuth), gloss=0.3)
+    length, middle, turn = along(start, end)
+    return Part(Capsule(radius, length / 2), plain(colour), middle, turn, gloss=0.3)
 
 
 def cage() -> list[Part]:

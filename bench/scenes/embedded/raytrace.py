@@ -16,8 +16,6 @@ import torch
 from torch import Tensor
 
 from bench.cameras import project
-from bench.errors import unexpected
-from bench.scenes.embedded.shadows import Tiles
 from bench.scenes.embedded.solids import (
     Carved,
     Pierced,
@@ -40,6 +38,7 @@ Rays = tuple[Tensor, Tensor, Tensor]
 
 LIGHT = (0.48, -0.6, 0.64)  # unit direction to the light
 LIFT = 1e-4  # distance of a shadow ray's start above the surface, in the model's units
+TILES = 32  # into which the light's view of the points is divided, each way
 
 SKY, GROUND, SUN = 0.52, 0.24, 0.62
 """Light from above, from below, and from the light's direction, as shares of a surface's colour."""
@@ -74,21 +73,19 @@ class SceneModel(Protocol):
         alpha, which comes between them. A part is never seen outside its span."""
 
 
-def render(model: SceneModel, camera: Camera, background: Tensor, samples: int) -> Frame:
-    """Render `model`, averaged over `samples` rays per pixel (a power of two).
+def render(model: SceneModel, camera: Camera, samples: int) -> Frame:
+    """Render `model` on black, averaged over `samples` rays per pixel (a power of two).
 
-    `camera` is in the model's units; rays that hit nothing show `background` [3]. A pixel's alpha
-    and rgb are means over its rays, depth the mean z-depth weighted by opacity (+inf where alpha is
-    below EMPTY_ALPHA). A single sample is at the centre.
+    `camera` is in the model's units. A pixel's alpha and rgb are means over its rays, depth the
+    mean z-depth weighted by opacity (+inf where alpha is below EMPTY_ALPHA). A single sample is at
+    the centre.
     """
-    device, width, height = camera.c2w.device, camera.width, camera.height
-    offsets = sample_offsets(samples).to(device)
-    x = (torch.arange(width, device=device)[:, None] + offsets[:, 0] - camera.cx) / camera.fx
-    y = (torch.arange(height, device=device)[:, None] + offsets[:, 1] - camera.cy) / camera.fy
-    rgb = torch.zeros(height, width, 3, device=device)
-    alpha, depth = torch.zeros(2, height, width, device=device)
+    width, height, offsets = camera.width, camera.height, sample_offsets(samples)
+    x = (torch.arange(width)[:, None] + offsets[:, 0] - camera.cx) / camera.fx
+    y = (torch.arange(height)[:, None] + offsets[:, 1] - camera.cy) / camera.fy
+    rgb, (alpha, depth) = torch.zeros(height, width, 3), torch.zeros(2, height, width)
     rows = max(BAND_RAYS // (width * samples), 1)
-    boxes = ProjectedBoxes(camera, model.boxes().to(device))
+    boxes = ProjectedBoxes(camera, model.boxes())
     for top in range(0, height, rows):
         bottom = min(top + rows, height)
         spans = boxes.spans(top, bottom)
@@ -101,13 +98,11 @@ def render(model: SceneModel, camera: Camera, background: Tensor, samples: int) 
             picture[top:bottom, first:last] = seen.mean(2)
     empty = alpha < EMPTY_ALPHA
     depth = (depth / alpha.clamp(min=EMPTY_ALPHA)).masked_fill(empty, math.inf)
-    return Frame(rgb + (1 - alpha)[..., None] * background.to(device), depth, alpha)
+    return Frame(rgb, depth, alpha)
 
 
 def sample_offsets(samples: int) -> Tensor:
     """Hammersley points [samples, 2] in a pixel, one in each of `samples` rows and columns."""
-    if samples < 1 or samples & (samples - 1):
-        raise unexpected("samples", "a power of two", samples)
     bits = samples.bit_length() - 1
     index, mirrored = torch.arange(samples), torch.zeros(samples, dtype=torch.int64)
     for bit in range(bits):
@@ -123,7 +118,7 @@ class ProjectedBoxes:
         self.width = camera.width
         self.in_front = (depth.reshape(-1, 8) > 0).all(1)
         self.behind = (depth.reshape(-1, 8) <= 0).all(1)
-        pairs = torch.combinations(torch.arange(8, device=boxes.device))
+        pairs = torch.combinations(torch.arange(8))
         # The outline of a convex box lies in the hull of the segments between pairs of corners.
         corners = pixels.reshape(-1, 8, 2)
         self.start, self.end = corners[:, pairs[:, 0]], corners[:, pairs[:, 1]]  # [P, 28, 2]
@@ -162,10 +157,6 @@ class Part:
     def __post_init__(self) -> None:
         object.__setattr__(self, "frame", rotation(*self.turn))
 
-    @property
-    def turned(self) -> bool:
-        return any(self.turn)
-
 
 @dataclass(frozen=True)
 class Surface:
@@ -184,7 +175,7 @@ class Solids:
 
     def __init__(self, parts: Sequence[Part]) -> None:
         self.parts = parts
-        light = torch.tensor(LIGHT)
+        self.light = light = torch.tensor(LIGHT)
         across = unit(torch.linalg.cross(light, torch.tensor((0.0, 0.0, 1.0)))[None])[0]
         self.light_axes = torch.stack((across, torch.linalg.cross(light, across), light), dim=1)
         self.corners = self.boxes()
@@ -199,16 +190,15 @@ class Solids:
         """Find the nearest surface over all parts, then shade only that."""
         shape = (band.y.shape[0], *band.x.shape[1:])
         depth = band.x.new_full(shape, math.inf)
-        owner = torch.full(shape, -1, dtype=torch.int16, device=depth.device)
+        owner = torch.full(shape, -1, dtype=torch.int16)
         # From front to back, so that a part whose box lies behind all that was met can be left out.
-        ahead = ((self.corners.to(depth) - band.origin) @ band.rotation[:, 2]).amin(1).tolist()
+        ahead = ((self.corners - band.origin) @ band.rotation[:, 2]).amin(1).tolist()
         for number, first, last in sorted(spans, key=lambda span: ahead[span[0]]):
             part, columns = self.parts[number], slice(first, last)
             if ahead[number] > depth[:, columns].amax():
                 continue
-            frame = part.frame.to(depth)
-            x, y, z = ((band.origin - depth.new_tensor(part.centre)) @ frame).tolist()
-            t = part.shape.hit((x, y, z), band.directions(frame, columns))
+            x, y, z = ((band.origin - torch.tensor(part.centre)) @ part.frame).tolist()
+            t = part.shape.hit((x, y, z), band.directions(part.frame, columns))
             nearest = depth[:, columns]
             owner[:, columns].masked_fill_(t < nearest, number)
             torch.minimum(nearest, t, out=nearest)
@@ -230,12 +220,8 @@ class Solids:
         x, y = band.x[0, column, sample], band.y[row, 0, sample]
         directions = torch.stack((x, y, torch.ones_like(x)), 1) @ band.rotation.T
         points = band.origin + depth[:, None] * directions
-        local = points - points.new_tensor(part.centre)
-        if part.turned:
-            local = local @ part.frame.to(points)
-        normals = part.shape.normal(local)
-        if part.turned:
-            normals = normals @ part.frame.T.to(points)
+        local = (points - torch.tensor(part.centre)) @ part.frame
+        normals = part.shape.normal(local) @ part.frame.T
         # The normal points to the viewer's side of the surface.
         away = (normals * directions).sum(1, keepdim=True) > 0
         normals = torch.where(away, -normals, normals)
@@ -252,20 +238,19 @@ class Solids:
         )
         counts = [len(surface.points) for surface in surfaces]
         numbers = torch.tensor([surface.number for surface in surfaces], dtype=torch.int16)
-        owners = numbers.repeat_interleave(torch.tensor(counts)).to(points.device)
-        lit = normals @ points.new_tensor(LIGHT) > 0
+        owners = numbers.repeat_interleave(torch.tensor(counts))
+        lit = normals @ self.light > 0
         lit[lit.clone()] = ~self.shadowed(owners[lit], (points + LIFT * normals)[lit])
         return list(lit.split(counts))
 
     def shade(self, surface: Surface, lit: Tensor) -> Tensor:
         """Lambert and Blinn-Phong colours [N, 3] of the points of a surface."""
         part, normals = self.parts[surface.number], surface.normals
-        light = normals.new_tensor(LIGHT)
         height = 0.5 + 0.5 * normals[:, 2:]
-        sun = (normals * light).sum(1, keepdim=True) * lit[:, None]
+        sun = (normals * self.light).sum(1, keepdim=True) * lit[:, None]
         colour = part.texture(surface.local) * (GROUND + (SKY - GROUND) * height + SUN * sun)
         if part.gloss:
-            half = unit(light - unit(surface.directions))
+            half = unit(self.light - unit(surface.directions))
             highlight = (normals * half).sum(1, keepdim=True).clamp(min=0) ** part.sharpness
             colour = colour + part.gloss * highlight * lit[:, None]
         return colour.clamp(max=1)
@@ -275,21 +260,20 @@ class Solids:
 
         A convex part is skipped for itself: it casts no shadow on its own lit side.
         """
-        dark = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+        dark = torch.zeros(len(points), dtype=torch.bool)
         if not len(points):
             return dark
-        light, tiles = points.new_tensor(LIGHT), Tiles(points @ self.light_axes.to(points))
+        tiles = Tiles(points @ self.light_axes)
         columns, owners = points[tiles.order].T.contiguous(), owners[tiles.order]
         for number in tiles.casters(self.low, self.high):
             caster = self.parts[number]
             runs = tiles.runs(self.low[number], self.high[number])
             if not runs:
                 continue
-            frame = caster.frame.to(points)
-            centre = points.new_tensor(caster.centre)[:, None]
+            centre = torch.tensor(caster.centre)[:, None]
             below = torch.cat([columns[:, run] for run in runs], dim=1) - centre
-            x, y, z = (frame.T @ below if caster.turned else below).unbind(0)
-            u, v, w = (light @ frame).unbind(0)
+            x, y, z = (caster.frame.T @ below if any(caster.turn) else below).unbind(0)
+            u, v, w = (self.light @ caster.frame).unbind(0)
             found = caster.shape.hit((x, y, z), (u, v, w)) < math.inf
             if not isinstance(caster.shape, Carved | Pierced):
                 found &= torch.cat([owners[run] for run in runs]) != number
@@ -297,6 +281,48 @@ class Solids:
             for run, part in zip(runs, found.split(counts), strict=True):
                 dark[run].logical_or_(part)
         return torch.empty_like(dark).index_put_((tiles.order,), dark)
+
+
+class Tiles:
+    """Points [N, 3] seen from the light, sorted by tiles: a caster needs only those under it."""
+
+    def __init__(self, seen: Tensor) -> None:
+        """`seen` are two coordinates across the light, and one that grows towards it."""
+        self.low, self.high = seen.amin(0), seen.amax(0)
+        self.size = ((self.high - self.low)[:2] / TILES).clamp(min=1e-6)
+        tile = ((seen - self.low)[:, :2] / self.size).long().clamp(0, TILES - 1)
+        number = tile[:, 0] * TILES + tile[:, 1]
+        self.order = number.argsort()
+        counts = number.bincount(minlength=TILES * TILES)
+        self.starts = [0, *counts.cumsum(0).tolist()]
+        farthest = seen.new_full((TILES * TILES,), math.inf)
+        self.farthest = farthest.scatter_reduce(0, number, seen[:, 2], "amin").tolist()
+
+    def casters(self, low: Tensor, high: Tensor) -> list[int]:
+        """Which of the boxes from `low` to `high` [P, 3] may lie between a point and the light."""
+        candidates = (low <= self.high)[:, :2].all(1) & (high >= self.low).all(1)
+        return candidates.nonzero()[:, 0].tolist()
+
+    def runs(self, low: Tensor, high: Tensor) -> list[slice]:
+        """The sorted points in the tiles that a box [3] covers, unless all are nearer than it."""
+        first, last = (self._tile(corner) for corner in (low, high))
+        nearest = high[2].item()
+        runs: list[slice] = []
+        for row in range(first[0], last[0] + 1):
+            for tile in range(row * TILES + first[1], row * TILES + last[1] + 1):
+                if self.farthest[tile] > nearest:  # so is the tile of no points
+                    continue
+                start, end = self.starts[tile], self.starts[tile + 1]
+                if runs and runs[-1].stop == start:
+                    runs[-1] = slice(runs[-1].start, end)
+                else:
+                    runs.append(slice(start, end))
+        return runs
+
+    def _tile(self, corner: Tensor) -> Sequence[int]:
+        """The column and the row of the tile nearest to a point."""
+        place = ((corner - self.low)[:2] / self.size).floor()
+        return place.clamp(0, TILES - 1).int().tolist()
 
 
 def rotation(x: float, y: float, z: float) -> Tensor:
@@ -309,6 +335,15 @@ def rotation(x: float, y: float, z: float) -> Tensor:
         turn[a, a], turn[a, b], turn[b, a], turn[b, b] = c, -s, s, c
         turns = turn @ turns
     return turns.float()
+
+
+def along(start: Triple, end: Triple) -> tuple[float, Triple, Triple]:
+    """Length and middle of a line, and the turn of a part whose z axis lies on it."""
+    x, y, z = (b - a for a, b in zip(start, end, strict=True))
+    cx, cy, cz = ((a + b) / 2 for a, b in zip(start, end, strict=True))
+    length = math.sqrt(x * x + y * y + z * z)
+    turn = (0.0, math.degrees(math.acos(z / length)), math.degrees(math.atan2(y, x)))
+    return length, (cx, cy, cz), turn
 
 
 @dataclass(frozen=True)
@@ -344,11 +379,11 @@ class Media:
         """Integrate all balls in `spans` together, for the rays that hit any of them."""
         shape = (band.y.shape[0], *band.x.shape[1:])
         balls = [self.balls[number] for number, _, _ in spans]
-        directions = band.directions(torch.eye(3, device=band.x.device), slice(None))
+        directions = band.directions(torch.eye(3), slice(None))
         enter, leave = band.x.new_zeros(2, len(balls), *shape)
         for k, ((_, first, last), ball) in enumerate(zip(spans, balls, strict=True)):
             columns = slice(first, last)
-            origin = (band.origin - torch.tensor(ball.centre).to(band.origin)).tolist()
+            origin = (band.origin - torch.tensor(ball.centre)).tolist()
             a, b = ball_interval(origin, [d[:, columns] for d in directions], ball.radius)
             missed = (a > b) | (b <= 0)
             enter[k, :, columns] = a.clamp_(min=0).masked_fill_(missed, 0)

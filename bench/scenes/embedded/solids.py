@@ -124,7 +124,7 @@ class Gable(Convex):
         end, foot = signs * points.new_tensor((1, 0, 0)), points.new_tensor((0, 0, -1))
         planes = torch.stack((end, foot.expand_as(end), unit(slope)), dim=1)
         nearest = self._beyond(points).argmax(1)
-        return planes[torch.arange(len(points), device=points.device), nearest]
+        return planes[torch.arange(len(points)), nearest]
 
     def _beyond(self, points: Tensor) -> Tensor:
         """How far points are beyond an end, the foot and a slope, [N, 3]."""

@@ -16,12 +16,10 @@ from bench.cameras import look_at
 from bench.types import Camera
 
 
-def camera_at(
-    eye: tuple[float, float, float], size: int = 96, device: str | torch.device = "cpu"
-) -> Camera:
+def camera_at(eye: tuple[float, float, float], size: int = 96) -> Camera:
     """A camera of size x size pixels that looks at the origin, z up."""
     c2w = look_at(torch.tensor(eye), torch.zeros(3), torch.tensor((0.0, 0.0, 1.0)))
-    return Camera(c2w.to(device), 1.3 * size, 1.3 * size, size / 2, size / 2, size, size)
+    return Camera(c2w, 1.3 * size, 1.3 * size, size / 2, size / 2, size, size)
 
 
 def png(header: bytes, data: bytes) -> bytes:

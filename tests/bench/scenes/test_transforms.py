@@ -16,8 +16,6 @@ from bench.scenes.images import Fisheye, RadialTangential, undistort, undistorte
 from bench.types import Camera, SteerbenchError
 from tests.bench.scenes.conftest import edit_json, picture, pose
 
-HERE = Path("picture.png")
-
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
@@ -188,8 +186,8 @@ def test_undistortion_recovers_the_pinhole_picture(name):
     seen = undistort_points(grid, matrix, torch.tensor(lens, dtype=torch.float64), num_iters=60)
     x, y = (seen[:, 0] - camera.cx) / camera.fx, (seen[:, 1] - camera.cy) / camera.fy
     distorted = wave(x, y).reshape(camera.height, camera.width, 3).round().to(torch.uint8)
-    straight = undistort(distorted, camera, RadialTangential(lens), HERE)
-    cropped = undistorted_camera(camera, RadialTangential(lens), HERE)
+    straight = undistort(distorted, camera, RadialTangential(lens))
+    cropped = undistorted_camera(camera, RadialTangential(lens), Path("picture.png"))
     assert straight.shape == (cropped.height, cropped.width, 3)
     # The crop loses a border only: most of the picture stays.
     assert cropped.width * cropped.height > 0.85 * camera.width * camera.height
@@ -207,7 +205,7 @@ def test_colours_between_pixels_weigh_by_their_alpha():
     image[..., 0] = 200
     image[:, 50:, 3] = 255
     image[:, :50, :3] = 90  # not seen: alpha is 0
-    straight = undistort(image, pinhole(), RadialTangential(LENSES["pincushion"]), HERE)
+    straight = undistort(image, pinhole(), RadialTangential(LENSES["pincushion"]))
     colours = straight[straight[..., 3] > 0][:, :3]
     assert (colours.float() - torch.tensor([200.0, 0, 0])).abs().max() <= 1
 

@@ -79,7 +79,7 @@ def test_a_scene_knows_its_picture_at_any_camera_as_its_splits_have_it(tmp_path,
 def test_a_model_fills_but_does_not_leave_its_pictures(name, height, samples, least, most):
     for pose in orbit_poses(24, VIEWS.get(name, MOST))[::6]:
         camera = Camera(pose.float(), 133.5, 133.5, 48, height / 2, 96, height)
-        alpha = render(find(name), camera, torch.ones(3), samples).alpha
+        alpha = render(find(name), camera, samples).alpha
         border = torch.cat((alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]))
         assert (border == 0).all()
         assert least < alpha.mean() < most

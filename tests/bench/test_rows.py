@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import signal, stats
 
-from bench.intervals import half_interval, path_interval
+from bench.rows import half_interval, path_interval
 
 BOTH = pytest.mark.parametrize("half", [half_interval, path_interval])
 
