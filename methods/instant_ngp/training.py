@@ -98,7 +98,6 @@ class PixelTraining(loop.Training, ABC):
     """
 
     advice = "Try a smaller learning rate (method.training.rate)."
-    asked: loop.Asked | None = None
 
     def __init__(
         self,
@@ -109,11 +108,10 @@ class PixelTraining(loop.Training, ABC):
         options: PixelOptions,
         seed: int,
     ) -> None:
-        self.options, self.samples = options, samples
+        self.options, self.samples, self.steps = options, samples, steps
         self.batches = PixelBatches(scene.splits["train"], device)
         self.errors = ErrorMap(len(self.batches), device) if options.by_error else None
         self.background = scene.background.to(device)
-        self.step, self.steps, self.seconds = 0, steps, 0.0
         self.rays = min(1024, options.max_rays)
         self.generator = torch.Generator(device).manual_seed(seed)
 
@@ -121,10 +119,6 @@ class PixelTraining(loop.Training, ABC):
     def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
         """Render R `rays` on `background` [3] or [R, 3], differentiably; also return the number of
         samples that were composited. `jitter` [R] in [0, 1) is the phase of the samples."""
-
-    @abstractmethod
-    def optimisers(self) -> checkpoint.Optimisers:
-        """The optimisers, which a checkpoint keeps."""
 
     @abstractmethod
     def _update(self) -> None:
@@ -182,18 +176,15 @@ class PixelTraining(loop.Training, ABC):
         self.rays = min(max(int(self.rays * change), MIN_RAYS), self.options.max_rays)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """Optimisers, random numbers, number of rays, error map."""
-        tensors = checkpoint.of_optimisers(self.optimisers())
-        tensors["generator"] = self.generator.get_state()
+        """Of any training, with the number of rays and the error map."""
+        tensors, _ = super().state()
         if self.errors is not None:
             tensors |= {"errors": self.errors.errors, "error_ends": self.errors.ends}
         return tensors, {"rays": self.rays}
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        self.restore_result(tensors)
-        checkpoint.restore_optimisers(self.optimisers(), tensors)
+        super().restore(tensors, figures)
         self.rays = int(figures["rays"])
-        self.generator.set_state(tensors["generator"].cpu())
         if self.errors is not None:
             self.errors.errors.copy_(tensors["errors"])
             self.errors.ends.copy_(tensors["error_ends"])

@@ -15,6 +15,7 @@ from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.types import expect
 from methods.kilonerf.field import Grid, KiloField, Pieces, place_networks
 from methods.students.fields import FieldLessons, FieldStudent, StudentTraining
+from methods.students.method import IN_FP32
 from methods.training import checkpoint
 
 MOST = 32  # maximum number of networks along an axis: they are numbered in int16
@@ -80,14 +81,11 @@ class KiloNerf(FieldStudent):
     training: KiloLessons
     networks: int
 
-    kind = "kilonerf"
+    kind, model, computed = "kilonerf", ("networks",), IN_FP32
 
     def __post_init__(self) -> None:
         super().__post_init__()
         expect(1 <= self.networks <= MOST, "networks", f"1 to {MOST}", self.networks)
-
-    def model_settings(self) -> Mapping[str, object]:
-        return {"networks": self.networks}
 
     def new_field(self) -> KiloField:
         """Make the networks of the grid that was placed or restored last."""
@@ -106,6 +104,3 @@ class KiloNerf(FieldStudent):
         parts = checkpoint.part(tensors, "field.")
         self.grid = Grid(parts["networks"], parts["corner"], parts["side"])
         super().restore(tensors)
-
-    def settings(self) -> dict[str, str]:
-        return super().settings() | {"field_precision": "fp32"}

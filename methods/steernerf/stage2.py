@@ -97,28 +97,29 @@ def train_stage2(
     return pipeline, key, training.seconds
 
 
-class JointTraining:
-    """Stage 2 as a `loop.Training`: trains `renderer` in place, on patches from `patches`, and the
-    field `trained`, unless that is None: then it is frozen."""
+class JointTraining(loop.Training):
+    """Stage 2: trains `renderer` in place, on patches from `patches`, and the field `trained`,
+    unless that is None: then it is frozen."""
 
     advice = "Try smaller learning rates (method.joint.rate, method.joint.field_rate)."
-    asked: loop.Asked | None = None
 
     def __init__(
         self, renderer: UNet, patches: Patches, steps: int, trained: TrainedField | None
     ) -> None:
-        self.renderer, self.patches = renderer, patches
+        self.renderer, self.patches, self.steps, self.trained = renderer, patches, steps, trained
         self.options, self.generator = patches.options, patches.generator
-        self.step, self.steps, self.seconds = 0, steps, 0.0
-        self.trained = trained
         if trained is not None:
             self.field_optimiser = FieldOptimiser(trained.field)
             seed = self.generator.initial_seed()
             self._visits = torch.Generator(trained.field.device).manual_seed(seed)
 
+    def optimisers(self) -> checkpoint.Optimisers:
+        """Those of the renderer, and of a field that learns."""
+        return {**self._of_renderer, **(self.field_optimiser.parts if self.trained else {})}
+
     @cached_property
-    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """Of the renderer's parameters; created when first needed, like that of the field."""
+    def _of_renderer(self) -> dict[str, torch.optim.Optimizer]:
+        """Created when first needed, like that of the field."""
         parameters, rate = list(self.renderer.parameters()), self.options.rate
         if self.options.optimiser == "adam":
             return {"adam": torch.optim.Adam(parameters, lr=rate, fused=True)}
@@ -143,7 +144,7 @@ class JointTraining:
         loss.backward()
         errors = loop.look(self, {"": error}, {"loss": error, "picture": pictures})
         rate = self.rate_now(self.options.rate)
-        for name, optimiser in self.optimisers.items():
+        for name, optimiser in self._of_renderer.items():
             loop.step_at(optimiser, MUON * rate if name == "muon" else rate)
         if self.trained:
             self.field_optimiser.step(self.rate_now(self.options.field_rate))
@@ -176,21 +177,15 @@ class JointTraining:
             self.patches.pipeline.occupancy = self.trained.grid.occupancy
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """Optimisers, random numbers, and the examples that patches are cut from."""
-        tensors = {f"patches.{name}": x for name, x in self.patches.state().items()}
-        tensors |= checkpoint.of_optimisers(self.optimisers)
-        tensors["generator"] = self.generator.get_state()
+        """Of any training, with the examples that patches are cut from."""
+        tensors, figures = super().state()
+        tensors |= {f"patches.{name}": x for name, x in self.patches.state().items()}
         if self.trained:
-            tensors |= checkpoint.of_optimisers(self.field_optimiser.parts)
             tensors["visits"] = self._visits.get_state()
-        return tensors, {}
+        return tensors, figures
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        """Restore what `result` and `state` returned."""
-        self.restore_result(tensors)
-        checkpoint.restore_optimisers(self.optimisers, tensors)
+        super().restore(tensors, figures)
         self.patches.restore(checkpoint.part(tensors, "patches."))
-        self.generator.set_state(tensors["generator"].cpu())
         if self.trained:
-            checkpoint.restore_optimisers(self.field_optimiser.parts, tensors)
             self._visits.set_state(tensors["visits"].cpu())

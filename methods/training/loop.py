@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -28,15 +28,19 @@ Asked = Callable[[], dict[str, float]]
 class Training(Protocol):
     """What the loop drives."""
 
+    advice: ClassVar[str]  # what to try if the training breaks down
     steps: int  # how many there are in all
-    step: int  # how many are done
-    seconds: float  # the time they took, over all the processes the training was continued in
-    advice: str  # what to try if the training breaks down
-    asked: Asked | None  # the errors that `look` requested last; None at first
+    step = 0  # how many are done
+    seconds = 0.0  # the time they took, over all the processes the training was continued in
+    asked: Asked | None = None  # the errors that `look` requested last
+    generator: torch.Generator
 
     def advance(self) -> Mapping[str, float]:
         """Take one step; return what `look` returns, the mean squared errors to show by label (""
         for the main one)."""
+
+    def optimisers(self) -> checkpoint.Optimisers:
+        """The optimisers, which a checkpoint keeps."""
 
     def watched(self) -> Mapping[str, Tensor]:
         """The tensors that must be finite in a good state, by name."""
@@ -49,9 +53,14 @@ class Training(Protocol):
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
         """What a checkpoint must hold, besides the result, to go on as if never stopped."""
+        tensors = checkpoint.of_optimisers(self.optimisers())
+        return tensors | {"generator": self.generator.get_state()}, {}
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
         """Restore result and state."""
+        self.restore_result(tensors)
+        checkpoint.restore_optimisers(self.optimisers(), tensors)
+        self.generator.set_state(tensors["generator"].cpu())
 
 
 def trained(
