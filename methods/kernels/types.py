@@ -198,23 +198,24 @@ class Pixels:
     def take(self, index: Tensor | slice) -> Pixels:
         """The rays at `index`."""
         if isinstance(index, slice):
-            return Pixels(*(x[index] for x in self._columns))
-        return Pixels(*(x.index_select(0, index) for x in self._columns))
+            return Pixels(*(x[index] for x in self.columns))
+        return Pixels(*(x.index_select(0, index) for x in self.columns))
 
     def copy(self) -> Pixels:
         """Contiguous tensors of their own."""
-        return Pixels(*(x.clone(memory_format=torch.contiguous_format) for x in self._columns))
+        return Pixels(*(x.clone(memory_format=torch.contiguous_format) for x in self.columns))
 
     def put(self, index: Tensor | slice, pixels: Pixels) -> None:
         """Replace, in place, the rays at `index`."""
-        for column, new in zip(self._columns, pixels._columns, strict=True):
+        for column, new in zip(self.columns, pixels.columns, strict=True):
             if isinstance(index, slice):
                 column[index] = new
             else:  # a row at a time; `x[index]` goes number by number
                 column.index_copy_(0, index, new)
 
     @property
-    def _columns(self) -> tuple[Tensor, Tensor, Tensor]:
+    def columns(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Values, depth sums and opacities."""
         return self.values, self.depth_sum, self.alpha
 
     def over(self, background: Tensor) -> Pixels:

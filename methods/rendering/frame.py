@@ -7,7 +7,7 @@ that the host need not wait.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -76,7 +76,7 @@ def everywhere(field: Field, occupancy: Occupancy, probe: Probe, how: Sampling) 
 
     def render(seen: Tensor, rays: Rays) -> Pixels:
         window = None if how.window is None else how.window[seen]
-        return render_rays(field, rays, occupancy, probe, how.within(window))
+        return render_rays(field, rays, occupancy, probe, replace(how, window=window))
 
     return render
 

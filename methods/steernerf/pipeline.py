@@ -102,7 +102,7 @@ class Pipeline:
                 expected = reduction.depth == "expected"
                 cloud = preceding[0].expected() if expected else preceding[0]
                 near_far = cloud.interval(view.low, reduction.epsilon, self.backend)
-                how = how.within(near_far.view(-1, 2))
+                how = replace(how, window=near_far.view(-1, 2))
         with probe.stage("field"):
             where = self.occupancy if rendering.skip.empty else self._cube
             render = everywhere(self.field, where, probe, how)

@@ -57,11 +57,11 @@ class _TritonComposite(torch.autograd.Function):
         pixels = Pixels.blank(rays, channels, sigma.device) if carry is None else carry.copy()
         front = 1 - pixels.alpha
         samples = [x.contiguous() for x in (sigma, values, t, delta, offsets)]
-        outputs = pixels.values, pixels.depth_sum, pixels.alpha
-        launch(_forward, (rays,), *samples, front, stop, *outputs, CHANNELS=channels, num_warps=1)
+        given = *samples, front, stop, *pixels.columns
+        launch(_forward, (rays,), *given, CHANNELS=channels, num_warps=1)
         ctx.save_for_backward(*samples, front)
         ctx.stop = stop
-        return outputs
+        return pixels.columns
 
     @staticmethod
     def backward(ctx, *grads):

@@ -126,7 +126,7 @@ def render(field: Solid, interval: Tensor | None = None) -> tuple[FeatureFrame, 
     """The frame, in the interval [h, w, 2] or everywhere, and how many samples it took."""
     probe, how = Work(), Sampling(step=4 * STEP)
     if interval is not None:
-        how = how.within(interval.view(-1, 2))
+        how = replace(how, window=interval.view(-1, 2))
     by = everywhere(field, EVERYWHERE, probe, how)
     return render_frame(along_x(), EVERYWHERE, torch.ones(4), probe, by), probe.done["samples"]
 

@@ -82,7 +82,7 @@ def render_segments(
         f32(voxels.resolution),
         tuple(arrays(*parts)),
         (f64(f32(stop)), f64(f32(faint))),
-        tuple(arrays(pixels.values, pixels.depth_sum, pixels.alpha, crossed, shaded)),
+        tuple(arrays(*pixels.columns, crossed, shaded)),
     )
     return pixels, crossed, shaded
 
