@@ -117,7 +117,6 @@ class Diver(Student):
         expect(0 <= self.faint < 1, "faint", "a weight of 0 or more and less than 1", self.faint)
 
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> DiverTraining:
-        """Make the training of corners that start as the trained field encodes them."""
         generator = torch.Generator().manual_seed(self.teacher.seed)
         model = CornerModel.taught(teacher, self.resolution, generator)
         return DiverTraining(model, scene, budget, self.training, self.teacher.seed)

@@ -50,7 +50,6 @@ class OpenVino(Engine):
             )
 
     def computed(self, device: torch.device) -> str:
-        """As of any engine; beside int8, this CPU may compute in bfloat16."""
         computed = super().computed(device)
         return computed.replace("+fp32", "+bf16") if self._half else computed
 
@@ -60,7 +59,6 @@ class OpenVino(Engine):
         return torch.bfloat16 if self._half else torch.float32
 
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
-        """Convert `network`, for int8 quantised, and compile it."""
 
         def write(path: Path) -> None:
             model = self._channels_last(self._convert(network, samples()))

@@ -52,7 +52,6 @@ class TensorRt(Engine):
             self.import_library(library)
 
     def check(self, device: torch.device) -> None:
-        """Raise `Unavailable` unless `device` is the first CUDA GPU."""
         if device.type != "cuda" or device.index:
             raise Unavailable(
                 f"engine=tensorrt computes on the first CUDA GPU, this is device={device}: use "
@@ -64,7 +63,6 @@ class TensorRt(Engine):
         return super().key() | {"gpu": torch.cuda.get_device_name()}
 
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
-        """Export `network` as an ONNX model, of which plans are built."""
         import onnx
 
         path = folder() / "network.onnx"

@@ -34,17 +34,14 @@ class TorchEngine(Engine):
     precisions = ("fp32", "bf16", "fp16")
 
     def check(self, device: torch.device) -> None:
-        """Raise `Unavailable` for fp16 on a CPU."""
         if self.precision == "fp16" and device.type == "cpu":
             raise Unavailable("precision=fp16: engine=torch has it on a GPU, on a CPU use bf16")
 
     def computed(self, device: torch.device) -> str:
-        """The precision of products: bf16 may be emulated on `device`."""
         emulated = self.precision == "bf16" and not multiplies_bf16(device.type)
         return "bf16 in fp32" if emulated else super().computed(device)
 
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
-        """Make `network` compute at this precision, on a GPU as CUDA graphs."""
         dtype = DTYPES[self.precision]
 
         def run(*inputs: Tensor) -> Inputs:

@@ -94,12 +94,10 @@ class External:
 
     @property
     def name(self) -> str:
-        """What the worker calls itself."""
         return self._about["name"]
 
     @property
     def memory(self) -> int:
-        """Preceding frames that it uses."""
         return self._about["memory"]
 
     @property
@@ -233,7 +231,6 @@ class External:
         return {**{name: getattr(camera, name) for name in names}, "c2w": pose}
 
     def reset(self) -> None:
-        """Begin a new sequence."""
         self._worker.ask("reset", self.frame_s, {})
 
     def render(self, camera: Camera, probe: Probe) -> Frame:
@@ -272,7 +269,6 @@ class External:
         self._worker.expect(holds, "render", expected, got)
 
     def sizes(self) -> dict[str, int]:
-        """Bytes by component, as the worker tells."""
         told, _ = self._worker.ask("sizes", self.frame_s, {})
         sizes: Any = told.get("sizes")
         self._worker.expect(_counts(sizes), "sizes", "sizes in bytes", told)

@@ -119,14 +119,12 @@ class GaussianSplatting:
 
     @torch.no_grad()
     def render(self, camera: Camera, probe: Probe) -> Frame:
-        """Render one frame at the camera's full resolution."""
         camera = place_camera(camera, self.setup.device)
         pixels = self.gaussians.render(camera, self.stop, probe, self.setup.backend)
         with probe.stage("finish"):
             return FeatureFrame.of(camera, pixels, self.background).picture()
 
     def sizes(self) -> dict[str, int]:
-        """Bytes of the Gaussians' parameters, as they are stored."""
         plain = sum(4 * x.numel() for x in self.gaussians.parameters())
         return {"gaussians": plain if self.stored == "fp32" else stored_bytes(self.gaussians)}
 

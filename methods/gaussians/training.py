@@ -98,7 +98,6 @@ class GaussianTraining(loop.Training):
         return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def advance(self) -> dict[str, float]:
-        """Take one step; return its mean squared error, where `loop.look` does."""
         options, gaussians = self.options, self.gaussians
         share = self.step / self.steps
         camera, target = self._picture(half=share < options.half)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -18,9 +18,18 @@ from methods.kernels.encode import HashGrid
 from methods.rendering.frame import everywhere, render_frame
 
 
+@dataclass(kw_only=True, eq=False)
 class InstantNgp:
     """Instant-NGP as a `bench.types.Method`: the field of a `Setup`, rendered with rays that end at
     the transmittance `stop`, less than 1."""
+
+    grid: HashGrid
+    training: TrainingOptions
+    precision: FieldPrecision
+    stop: float
+    backend: str
+    device: str
+    seed: int
 
     name, memory = "ngp", 0
     study = Study(
@@ -37,24 +46,13 @@ class InstantNgp:
         chosen=("stop",),
     )
 
-    def __init__(
-        self,
-        *,
-        grid: HashGrid,
-        training: TrainingOptions,
-        precision: FieldPrecision,
-        stop: float,
-        backend: str,
-        device: str,
-        seed: int,
-    ) -> None:
-        self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
-        check_stop(stop)
-        self.stop = stop
+    def __post_init__(self) -> None:
+        where = self.backend, self.device, self.seed
+        self.setup = Setup.resolved(self.grid, self.training, self.precision, *where)
+        check_stop(self.stop)
         self.train_s = 0.0
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
-        """Train the field, or load it if it was trained before."""
         with torch_threads(budget.threads):
             self.trained = train_field(self.setup, scene, budget, log)
         self.train_s = self.trained.train_s
@@ -65,7 +63,6 @@ class InstantNgp:
 
     @torch.no_grad()
     def render(self, camera: Camera, probe: Probe) -> Frame:
-        """Render one frame at the camera's full resolution."""
         camera = place_camera(camera, self.setup.device)
         field, occupancy = self.trained.field, self.trained.occupancy
         sampling = replace(self.trained.sampling, stop=self.stop)
@@ -73,9 +70,7 @@ class InstantNgp:
         return render_frame(camera, occupancy, self.background, probe, render).picture()
 
     def sizes(self) -> dict[str, int]:
-        """Bytes of table, networks and occupancy bits."""
         return self.trained.sizes()
 
     def settings(self) -> dict[str, str]:
-        """The settings that a row of results shows, as they really are."""
         return self.setup.settings(type(self))

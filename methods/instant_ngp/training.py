@@ -129,7 +129,6 @@ class PixelTraining(loop.Training, ABC):
         return self.options.rate * loop.cosine(self.step / self.steps, self.options.final_rate)
 
     def advance(self) -> dict[str, float]:
-        """Take one step; return its mean squared error, as `loop.look` does."""
         numbers, alike = self._numbers()
         rays, colours = self.batches.at(numbers)
         target, background = self._target(colours)
@@ -176,7 +175,6 @@ class PixelTraining(loop.Training, ABC):
         self.rays = min(max(int(self.rays * change), MIN_RAYS), self.options.max_rays)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """Of any training, with the number of rays and the error map."""
         tensors, _ = super().state()
         if self.errors is not None:
             tensors |= {"errors": self.errors.errors, "error_ends": self.errors.ends}
@@ -206,7 +204,6 @@ class FieldTraining(PixelTraining):
         self.optimiser = FieldOptimiser(field)
 
     def advance(self) -> dict[str, float]:
-        """Take one step; return its mean squared error."""
         if self.step % EVERY == 0:
             times = 4 if self.step < GRID_YOUTH_STEPS else 1
             self.grid.update(self.field, self.generator, times * self.options.grid_samples)
@@ -227,13 +224,11 @@ class FieldTraining(PixelTraining):
             super()._fit_batch(samples)
 
     def watched(self) -> dict[str, Tensor]:
-        """Table and its moments, networks."""
         moments = self.optimiser.table
         both = moments.first + moments.second
         return {"table": self.field.table, "table moments": both, **self.field.layers}
 
     def result(self) -> dict[str, Tensor]:
-        """Field and density grid."""
         tensors = {f"field.{name}": value for name, value in self.field.state_dict().items()}
         return tensors | {"grid.density": self.grid.density}
 

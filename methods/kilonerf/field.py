@@ -121,7 +121,6 @@ class KiloField(StudentField):
         return densities(local, numbers, self._layers, backend=self.backend)
 
     def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """Density [S], and what `features` needs of each sample [S, 33]."""
         raw, geometry = self.raw_density(positions)
         return raw.relu() / REACH, geometry
 
@@ -131,7 +130,6 @@ class KiloField(StudentField):
         return encode_frequencies(unit, DIRECTION_FREQUENCIES, backend=self.backend)
 
     def features(self, geometry: Tensor, encoded: Tensor) -> Tensor:
-        """Colours [S, 3]."""
         return colours(geometry, encoded, self._layers, backend=self.backend)
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:

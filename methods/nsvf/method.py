@@ -35,12 +35,10 @@ class Nsvf(FieldStudent):
         expect(channels == EMBEDDING, "teacher.grid", as_many, channels)
 
     def occupied(self, teacher: TrainedField) -> Occupancy:
-        """The voxels, as cells."""
         size = self.resolution
         return Occupancy.at(occupied_voxels(teacher.occupancy, size), size)
 
     def sampling(self, budget: Budget) -> Sampling:
-        """Samples `step` voxels apart."""
         return Sampling(step=self.step / self.resolution)
 
     def new_field(self) -> NsvfField:

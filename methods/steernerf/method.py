@@ -139,15 +139,12 @@ class SteerNerf:
         renderer.engine = self.built = build(engine)
 
     def reset(self) -> None:
-        """Forget preceding frames."""
         self.buffer.clear()
 
     def render(self, camera: Camera, probe: Probe) -> Frame:
-        """Render the next frame of the sequence."""
         return self.pipeline.render(camera, self.buffer, self.rendering, probe)
 
     def sizes(self) -> dict[str, int]:
-        """Bytes of table, networks, occupancy bits and 2D renderer."""
         return self.trained.sizes() | {"renderer2d": self.built.size}
 
     def settings(self) -> dict[str, str]:

@@ -114,7 +114,6 @@ class JointTraining(loop.Training):
             self._visits = torch.Generator(trained.field.device).manual_seed(seed)
 
     def optimisers(self) -> checkpoint.Optimisers:
-        """Those of the renderer, and of a field that learns."""
         return {**self._of_renderer, **(self.field_optimiser.parts if self.trained else {})}
 
     @cached_property
@@ -128,8 +127,7 @@ class JointTraining(loop.Training):
         return {"adam": torch.optim.Adam(others, lr=rate, fused=True), "muon": Muon(weights, rate)}
 
     def advance(self) -> dict[str, float]:
-        """Take one step; return the mean squared error of the pictures, as `loop.look` does, which
-        raises SteerbenchError if it is not finite. The density grid follows the field."""
+        """Take one step; return the error of the pictures. The density grid follows the field."""
         if self.trained and self.options.grid_samples and self.step % EVERY == 0:
             grid = self.trained.grid
             grid.update(self.trained.field, self._visits, self.options.grid_samples)
@@ -157,12 +155,10 @@ class JointTraining(loop.Training):
         return first * loop.cosine(self.step / self.steps, final, waves)
 
     def watched(self) -> dict[str, Tensor]:
-        """The parameters of the renderer, and of a field that learns."""
         field = self.trained.field.named_parameters("field") if self.trained else ()
         return dict([*self.renderer.named_parameters("renderer"), *field])
 
     def result(self) -> dict[str, Tensor]:
-        """Renderer, and field and density grid if they learn."""
         result = self.renderer.state_dict(prefix="renderer.")
         if self.trained:
             result |= self.trained.field.state_dict(prefix="field.")
@@ -170,14 +166,12 @@ class JointTraining(loop.Training):
         return result
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore what `result` returned."""
         self.renderer.load_state_dict(checkpoint.part(tensors, "renderer."))
         if self.trained:
             restore_field(self.trained.field, self.trained.grid, tensors)
             self.patches.pipeline.occupancy = self.trained.grid.occupancy
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """Of any training, with the examples that patches are cut from."""
         tensors, figures = super().state()
         tensors |= {f"patches.{name}": x for name, x in self.patches.state().items()}
         if self.trained:

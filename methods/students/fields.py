@@ -84,12 +84,10 @@ class FieldStudent(Student):
         return self.teacher.training.sampling(budget)
 
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> StudentTraining:
-        """Make the training of a new field."""
         self.occupancy = self.occupied(teacher)
         return StudentTraining(self, self.new_field(), teacher, scene, budget)
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Load a field, and where it is occupied."""
         self.occupancy = Occupancy(tensors["cells"].to(self.teacher.device))
         self.field = self.new_field()
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
@@ -100,11 +98,9 @@ class FieldStudent(Student):
         self.how = replace(self.sampling(budget), stop=self.stop)
 
     def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
-        """The occupied cells, and a march through them."""
         return self.occupancy, everywhere(self.field, self.occupancy, probe, self.how)
 
     def sizes(self) -> dict[str, int]:
-        """Bytes of the field and of the occupancy bits."""
         return self.field.sizes() | {"occupancy": self.occupancy.cells.numel() // 8}
 
 
@@ -183,7 +179,6 @@ class StudentTraining(PixelTraining):
         return dict(self.field.named_parameters())
 
     def result(self) -> dict[str, Tensor]:
-        """The field, and the occupied cells."""
         tensors = {f"field.{name}": value for name, value in self.field.state_dict().items()}
         return tensors | {"cells": self.occupancy.cells}
 

@@ -75,13 +75,11 @@ class Student(ABC):
 
     @torch.no_grad()
     def render(self, camera: Camera, probe: Probe) -> Frame:
-        """Render one frame at the camera's full resolution."""
         camera = place_camera(camera, self.teacher.device)
         occupancy, render = self.renderer(probe)
         return render_frame(camera, occupancy, self.background, probe, render).picture()
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
-        """Train the field and the model, or load their results if they were trained before."""
         budget = replace(budget, renderer_steps=self.steps or budget.renderer_steps)
         with torch_threads(budget.threads):
             teacher = train_field(self.teacher, scene, budget, log)
@@ -105,5 +103,4 @@ class Student(ABC):
         """Do nothing: every frame stands alone."""
 
     def settings(self) -> dict[str, str]:
-        """What a row says of how it ran."""
         return {**self.teacher.settings(type(self)), **self.computed}

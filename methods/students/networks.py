@@ -67,7 +67,6 @@ class Dense(nn.Linear):
             self.bias.zero_()
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Map [S, I] to [S, O]."""
         return self.forward_with(inputs, self.weight, self.bias)
 
     def forward_with(self, inputs: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
