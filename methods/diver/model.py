@@ -75,11 +75,9 @@ class CornerModel(nn.Module):
     def taught(
         cls, teacher: TrainedField, resolution: int, generator: torch.Generator
     ) -> CornerModel:
-        """Make a model with voxels where the trained field is occupied, and a random decoder.
-
-        The features of a corner are its hash encoding, 16 levels of 2, divided by their standard
-        deviation; ValueError if it has more than 32 channels.
-        """
+        """Make a model with voxels where the trained field is occupied, and a random decoder. The
+        features of a corner are its hash encoding, 16 levels of 2, divided by their standard
+        deviation; ValueError if it has more than 32 channels."""
         field = teacher.field
         few = f"at most the {CHANNELS} channels of a corner: choose fewer levels or features"
         expect(field.grid.channels <= CHANNELS, "grid", few, field.grid.channels)

@@ -31,11 +31,9 @@ PRODUCTS = ("Conv", "Gemm", "MatMul")
 
 
 class TensorRt(Engine):
-    """TensorRT on a CUDA GPU.
-
-    It builds plans. A plan is valid for one GPU model, one version, and pictures of one size; it is
-    built when that size first occurs. With int8, everything not quantised is computed in float32.
-    """
+    """TensorRT on a CUDA GPU. It builds plans. A plan is valid for one GPU model, one version, and
+    pictures of one size; it is built when that size first occurs. With int8, everything not
+    quantised is computed in float32."""
 
     name = "tensorrt"
     precisions = ("fp32", "fp16", "int8")
@@ -169,10 +167,8 @@ def _fixed_ranges(prepared: Path) -> dict[str, Any]:
 
 
 class _Plans:
-    """The plans of a model, one for each size of its inputs.
-
-    `exact`: compute float32 in float32, not in TF32.
-    """
+    """The plans of a model, one for each size of its inputs. `exact`: compute float32 in float32,
+    not in TF32."""
 
     def __init__(self, model: Path, *, exact: bool, log: Log) -> None:
         import tensorrt

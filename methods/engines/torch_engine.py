@@ -24,11 +24,9 @@ WARM_UP = 3  # runs before recording, in which libraries choose algorithms and a
 
 
 class TorchEngine(Engine):
-    """Runs the network itself; below fp32, products and convolutions are in half precision.
-
-    A device without bfloat16 products multiplies numbers rounded to bfloat16 in float32; rows then
-    say `bf16 in fp32`.
-    """
+    """Runs the network itself; below fp32, products and convolutions are in half precision. A
+    device without bfloat16 products multiplies numbers rounded to bfloat16 in float32; rows then
+    say `bf16 in fp32`."""
 
     name = "torch"
     precisions = ("fp32", "bf16", "fp16")
@@ -67,11 +65,9 @@ Replay = tuple[Callable[[], Any], Inputs]
 
 
 class Replayed:
-    """Replays `run`; it is recorded for every input size when that size first occurs.
-
-    The next call, of any size, overwrites the outputs, because all recordings share memory. `run`
-    computes on a CUDA GPU, without waiting for it.
-    """
+    """Replays `run`; it is recorded for every input size when that size first occurs. The next
+    call, of any size, overwrites the outputs, because all recordings share memory. `run` computes
+    on a CUDA GPU, without waiting for it."""
 
     def __init__(self, run: Callable[..., Inputs]) -> None:
         self._run = run

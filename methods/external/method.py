@@ -45,9 +45,7 @@ UNTOLD: dict[str, Any] = {
 @dataclass(kw_only=True, eq=False)
 class External:
     """A renderer in another process, with the settings of `sweeps/configs/method/external.yaml`.
-
-    The process starts when something is asked of it, and ends with this object.
-    """
+    The process starts when something is asked of it, and ends with this object."""
 
     command: str
     python: str | None

@@ -25,10 +25,8 @@ END_S = 10.0  # a process that has been told to close is killed after so many se
 
 class Worker:
     """A process that was started with `command` and speaks the protocol of docs/external.md.
-
     Whatever it does wrong is one SteerbenchError with its name and its last words. It is killed
-    then, and so are the processes that it has started.
-    """
+    then, and so are the processes that it has started."""
 
     def __init__(self, command: Sequence[str], limit_s: float) -> None:
         self.name = command[-1]  # until it tells one
@@ -69,10 +67,8 @@ class Worker:
         fields: Mapping[str, object] | None = None,
         progress: Callable[[Header], object] | None = None,
     ) -> tuple[Header, dict[str, np.ndarray]]:
-        """Send a message, unless `fields` are None; the header and the arrays of its answer.
-
-        Before an answer, and before each message to `progress`, it may be silent for `limit_s`.
-        """
+        """Send a message, unless `fields` are None; the header and the arrays of its answer. Before
+        an answer, and before each message to `progress`, it may be silent for `limit_s`."""
         try:
             self._channel.until = time.monotonic() + limit_s
             if fields is not None:

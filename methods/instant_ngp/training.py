@@ -91,11 +91,9 @@ def new_grid(scene: Scene, device: torch.device) -> DensityGrid:
 
 
 class PixelTraining(loop.Training, ABC):
-    """A training whose steps render random pixels of the training pictures.
-
-    Subclasses say what is trained, how its rays are rendered and how its parameters are updated. A
-    step aims at `samples` samples with a gradient; the number of rays follows from it.
-    """
+    """A training whose steps render random pixels of the training pictures. Subclasses say what is
+    trained, how its rays are rendered and how its parameters are updated. A step aims at `samples`
+    samples with a gradient; the number of rays follows from it."""
 
     advice = "Try a smaller learning rate (method.training.rate)."
 
@@ -244,10 +242,8 @@ def restore_field(field: HashField, grid: DensityGrid, tensors: Mapping[str, Ten
 
 
 class FieldOptimiser:
-    """Adam for the networks of `field`, and for its table one that skips untouched entries.
-
-    Once this exists, the field collects the gradients of its samples in `gradients`, until `step`.
-    """
+    """Adam for the networks of `field`, and for its table one that skips untouched entries. Once
+    this exists, the field collects the gradients of its samples in `gradients`, until `step`."""
 
     def __init__(self, field: HashField) -> None:
         self._field = field

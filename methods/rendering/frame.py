@@ -89,11 +89,9 @@ def rays_at_matter(camera: Camera, occupancy: Occupancy) -> tuple[Tensor, Rays]:
 
 
 def sees_matter(camera: Camera, occupancy: Occupancy) -> Tensor:
-    """Which pixels may see an occupied cell: [h, w] bool.
-
-    A pixel may see an occupied brick if it lies in the bounding box of the brick's projected
-    corners; if one of the corners is not in front of the camera, every pixel may.
-    """
+    """Which pixels may see an occupied cell: [h, w] bool. A pixel may see an occupied brick if it
+    lies in the bounding box of the brick's projected corners; if one of the corners is not in front
+    of the camera, every pixel may."""
     device = camera.c2w.device
     bricks = occupancy.bricks.to(device)
     unit = torch.arange(2, device=device)

@@ -105,11 +105,9 @@ class FieldStudent(Student):
 
 
 class StudentTraining(PixelTraining):
-    """Trains on points of the teacher, then on rays of the photos, within occupied cells.
-
-    On rays, samples that the teacher's density hides are left out: it costs less than the density
-    of a large network. The training follows the settings of `student`.
-    """
+    """Trains on points of the teacher, then on rays of the photos, within occupied cells. On rays,
+    samples that the teacher's density hides are left out: it costs less than the density of a large
+    network. The training follows the settings of `student`."""
 
     def __init__(
         self,

@@ -29,11 +29,8 @@ IN_FP32 = {"field_precision": "fp32"}
 
 @dataclass(kw_only=True, eq=False)
 class Student(ABC):
-    """Base of the methods that start from the Instant-NGP field that all methods share.
-
-    `train_s` counts the training of the field, the initialisation of the model and its own
-    training.
-    """
+    """Base of the methods that start from the Instant-NGP field that all methods share. `train_s`
+    counts the training of the field, the initialisation of the model and its own training."""
 
     teacher: Setup  # the field that it starts from, and where it runs
     training: PixelOptions  # how the model is trained

@@ -130,10 +130,8 @@ def _drive(
 
 
 def save(training: Training, path: Path, done: bool = False) -> None:
-    """Write the result and, unless `done`, the state.
-
-    Something that is not finite raises `SteerbenchError` and leaves the last good file alone.
-    """
+    """Write the result and, unless `done`, the state. Something that is not finite raises
+    `SteerbenchError` and leaves the last good file alone."""
     check_finite(training)
     more, figures = training.state()
     figures |= {"step": training.step, "seconds": training.seconds}
@@ -161,11 +159,9 @@ def look(
     training: Training, errors: Mapping[str, Tensor], tensors: Mapping[str, Tensor]
 ) -> dict[str, float]:
     """Return the `errors` of a step as numbers; raise `SteerbenchError` if one is not finite, with
-    the names of the `tensors` that are not.
-
-    On a GPU this happens every `LOOK_EVERY` steps, with the errors that were requested the time
-    before, which have arrived meanwhile; in all other steps there are none.
-    """
+    the names of the `tensors` that are not. On a GPU this happens every `LOOK_EVERY` steps, with
+    the errors that were requested the time before, which have arrived meanwhile; in all other steps
+    there are none."""
     on_cpu = all(error.device.type == "cpu" for error in errors.values())
     if not on_cpu and training.step % LOOK_EVERY:
         return {}
@@ -204,10 +200,8 @@ def check_finite(training: Training, more: Mapping[str, Tensor] | None = None) -
 
 
 def cosine(done: float, final: float, half_waves: int = 1) -> float:
-    """Share of the learning rate left after a share `done` of the steps: from 1 to `final`.
-
-    One half wave falls all the way; three fall, rise to 1 again, and fall.
-    """
+    """Share of the learning rate left after a share `done` of the steps: from 1 to `final`. One
+    half wave falls all the way; three fall, rise to 1 again, and fall."""
     return final + (1 - final) * 0.5 * (1 + math.cos(half_waves * math.pi * done))
 
 

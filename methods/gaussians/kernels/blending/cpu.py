@@ -91,11 +91,9 @@ def _by_depth(depth: np.ndarray, extents: np.ndarray) -> np.ndarray:
 
 
 def _lists(boxes: np.ndarray, width: int, height: int) -> tuple[np.ndarray, ...]:
-    """Which Gaussians each tile shows: offsets, ranks, first and slots.
-
-    Tile t owns entries offsets[t] to offsets[t + 1] of ranks: Gaussians by depth, ascending. That
-    of rank r owns first[r] to first[r + 1] of slots: the indices of its entries, tile by tile.
-    """
+    """Which Gaussians each tile shows: offsets, ranks, first and slots. Tile t owns entries
+    offsets[t] to offsets[t + 1] of ranks: Gaussians by depth, ascending. That of rank r owns
+    first[r] to first[r + 1] of slots: the indices of its entries, tile by tile."""
     across, down = -(-width // TILE), -(-height // TILE)
     threads = numba.get_num_threads()
     counts, first = np.zeros(across * down, np.int64), np.zeros(len(boxes) + 1, np.int64)
