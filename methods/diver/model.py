@@ -112,8 +112,8 @@ class CornerModel(nn.Module):
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything that was trained."""
-        decoder = {f"decoder.{name}": value for name, value in self.decoder.state_dict().items()}
-        return decoder | {"coordinates": self.voxels.coordinates, "table": self.table.detach()}
+        own = {"coordinates": self.voxels.coordinates, "table": self.table.detach()}
+        return self.decoder.state_dict(prefix="decoder.") | own
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Restore what `tensors` returned."""

@@ -227,8 +227,7 @@ class FieldTraining(PixelTraining):
         return {"table": self.field.table, "table moments": both, **self.field.layers}
 
     def result(self) -> dict[str, Tensor]:
-        tensors = {f"field.{name}": value for name, value in self.field.state_dict().items()}
-        return tensors | {"grid.density": self.grid.density}
+        return self.field.state_dict(prefix="field.") | {"grid.density": self.grid.density}
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
         restore_field(self.field, self.grid, tensors)

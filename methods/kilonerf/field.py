@@ -103,9 +103,8 @@ class KiloField(StudentField):
 
     def __init__(self, grid: Grid, backend: str, generator: torch.Generator | None = None) -> None:
         super().__init__(backend)
-        self.register_buffer("networks", grid.networks)
-        self.register_buffer("corner", grid.corner)
-        self.register_buffer("side", grid.side)
+        for name, value in vars(grid).items():
+            self.register_buffer(name, value)
         self.weights, self.biases = nn.ParameterDict(), nn.ParameterDict()
         for name, (inputs, outputs) in SHAPES.items():
             # As in torch's linear layers: uniform, with a bound from the number of inputs.

@@ -177,8 +177,7 @@ class StudentTraining(PixelTraining):
         return dict(self.field.named_parameters())
 
     def result(self) -> dict[str, Tensor]:
-        tensors = {f"field.{name}": value for name, value in self.field.state_dict().items()}
-        return tensors | {"cells": self.occupancy.cells}
+        return self.field.state_dict(prefix="field.") | {"cells": self.occupancy.cells}
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
