@@ -88,11 +88,7 @@ class Pipeline:
         buffer.appendleft(PointCloud.of(frame))
 
     def features(
-        self,
-        view: TwoScales,
-        preceding: Sequence[PointCloud],
-        rendering: Rendering,
-        probe: Probe,
+        self, view: TwoScales, preceding: Sequence[PointCloud], rendering: Rendering, probe: Probe
     ) -> FeatureFrame:
         """Render features F and depth D at low resolution (Eq. 2 to 5). With range reduction, rays
         are sampled only near the depth of the newest of the `preceding` frames (Eq. 7, 8)."""

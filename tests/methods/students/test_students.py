@@ -16,12 +16,7 @@ from bench.types import Log, NullProbe, Scene
 from methods.instant_ngp.stage1 import train_field
 from methods.training import loop
 from tests.methods.small_students import SMALL, budget, extraction, fitted
-from tests.methods.trainings import (
-    EXACT_TEACHER,
-    PIXEL,
-    goes_on_after_a_kill,
-    shows_the_ball,
-)
+from tests.methods.trainings import EXACT_TEACHER, PIXEL, goes_on_after_a_kill, shows_the_ball
 from tests.methods.usual import lessons
 
 names = pytest.mark.parametrize("name", SMALL)
