@@ -17,7 +17,7 @@ from methods.gaussians import ply
 from methods.gaussians.model import Gaussians, rounded, stored_bytes
 from methods.gaussians.training import Fitting, GaussianTraining, on_surfaces, spacing
 from methods.instant_ngp.field import FieldPrecision
-from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
+from methods.instant_ngp.stage1 import Setup, train_field
 from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.composite import check_stop
 from methods.kernels.encode import HashGrid
@@ -95,7 +95,10 @@ class GaussianSplatting:
         finished = log.stage_dir("gaussians", key) / "gaussians.safetensors"
 
         def begin() -> GaussianTraining:
-            untrained = self._untrained(teacher, scene)
+            generator = torch.Generator(setup.device).manual_seed(setup.seed)
+            points, colours = on_surfaces(teacher, scene, self.count, generator)
+            scales = self.fitting.size * spacing(points)
+            untrained = Gaussians.at(points, colours, scales, self.fitting.opacity, self.degree)
             return GaussianTraining(untrained, scene, steps, self.fitting, setup)
 
         tensors, seconds = loop.trained(begin, finished, "gaussians", log)
@@ -106,13 +109,6 @@ class GaussianSplatting:
             ply.write(gaussians, scene, exported)
             log.info(f"Gaussians for other programs: {exported}")
         return gaussians
-
-    def _untrained(self, teacher: TrainedField, scene: Scene) -> Gaussians:
-        """The Gaussians before training."""
-        generator = torch.Generator(self.setup.device).manual_seed(self.setup.seed)
-        points, colours = on_surfaces(teacher, scene, self.count, generator)
-        scales = self.fitting.size * spacing(points)
-        return Gaussians.at(points, colours, scales, self.fitting.opacity, self.degree)
 
     def reset(self) -> None:
         """Do nothing: every frame stands alone."""

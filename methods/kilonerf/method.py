@@ -44,11 +44,8 @@ class KiloTraining(StudentTraining):
     field: KiloField
     pieces: Pieces
 
-    def _places(self) -> tuple[Tensor, Tensor]:
-        positions = self.pieces.draw(self.options.points_each, self.generator)
-        shape, device = positions.shape, positions.device
-        directions = torch.randn(shape, generator=self.generator, device=device)
-        return positions, functional.normalize(directions, dim=1)
+    def _places(self) -> Tensor:
+        return self.pieces.draw(self.options.points_each, self.generator)
 
     def _learned(self, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """As in the base class, with a density that may fall below 0."""

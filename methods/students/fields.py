@@ -132,21 +132,22 @@ class StudentTraining(PixelTraining):
         """Take one step; return its mean squared error, of opacities and colours or of pixels."""
         if self.step >= self.points_until:
             return super().advance()
-        loss = self._difference(*self._places())
+        positions = self._places()
+        shape, device = positions.shape, positions.device
+        directions = torch.randn(shape, generator=self.generator, device=device)
+        loss = self._difference(positions, functional.normalize(directions, dim=1))
         loss.backward()
         errors = loop.look(self, {"": loss}, {"loss": loss})
         self._update()
         self.step += 1
         return errors
 
-    def _places(self) -> tuple[Tensor, Tensor]:
-        """Random points [S, 3] in occupied cells, and random view directions [S, 3]."""
+    def _places(self) -> Tensor:
+        """Random points [S, 3] in occupied cells."""
         count, device, generator = self.samples, self.cells.device, self.generator
         chosen = torch.randint(len(self.cells), (count,), generator=generator, device=device)
         jitter = torch.rand(count, 3, generator=generator, device=device)
-        directions = torch.randn(count, 3, generator=generator, device=device)
-        positions = (self.cells[chosen] + jitter) / self.occupancy.resolution
-        return positions, functional.normalize(directions, dim=1)
+        return (self.cells[chosen] + jitter) / self.occupancy.resolution
 
     def _difference(self, positions: Tensor, directions: Tensor) -> Tensor:
         """Mean squared difference in opacity over `REACH`, plus those in red, green and blue,
