@@ -99,9 +99,6 @@ class GpuTensor(Tensor):
     def untyped_storage(self) -> torch.UntypedStorage:
         return self.held.untyped_storage()
 
-    def __repr__(self) -> str:
-        return f"GpuTensor({self.held})"
-
 
 class Graph(list[tuple[Callable[..., Any], tuple, dict, Any]]):
     """The operations that were captured, with their results."""
