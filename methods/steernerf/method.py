@@ -34,35 +34,6 @@ SKIPS = {
 }
 
 RANGES = turned("range", f"{HOW}.range.epsilon", (0.01, 0.03, 0.1), f"{HOW}.range.mode=paper")
-STUDY = Study(
-    knobs={
-        "skips": [
-            Variant(f"{name} not skipped", (f"{word}=false",)) for name, word in SKIPS.items()
-        ],
-        "step length": turned("step", f"{HOW}.step", (1.5, 2, 3)),
-        "stop": turned("stop", f"{HOW}.stop", ("1e-1", "3e-2", "1e-3", "1e-4")),
-        "range reduction": RANGES,
-    },
-    trained={"field, trained": turned("field", "method.precision", ("fp32",))},
-    exact=(
-        f"{HOW}.range.mode=off",
-        f"{HOW}.step=1",
-        f"{HOW}.skip.hidden=false",
-        f"{HOW}.skip.background=false",
-    ),
-    skips=SKIPS,
-    savings=(Variant("all, and range reduction", (f"{HOW}.range.mode=paper",)),),
-    parts={
-        "field": "field",
-        "depth_reprojection": "reprojection",
-        "feature_reprojection": "reprojection",
-        "renderer2d": "renderer2d",
-        "renderer2d/network": "network",
-        "finish": "finish",
-    },
-    chosen=("rendering", "after", "engine"),
-)
-"""What studies vary, and the stages of a frame."""
 
 
 class SteerNerf:
@@ -74,7 +45,34 @@ class SteerNerf:
     then computes the network of the U-Net. `rendering` may be replaced between frames.
     """
 
-    study = STUDY
+    study = Study(
+        knobs={
+            "skips": [
+                Variant(f"{name} not skipped", (f"{word}=false",)) for name, word in SKIPS.items()
+            ],
+            "step length": turned("step", f"{HOW}.step", (1.5, 2, 3)),
+            "stop": turned("stop", f"{HOW}.stop", ("1e-1", "3e-2", "1e-3", "1e-4")),
+            "range reduction": RANGES,
+        },
+        trained={"field, trained": turned("field", "method.precision", ("fp32",))},
+        exact=(
+            f"{HOW}.range.mode=off",
+            f"{HOW}.step=1",
+            f"{HOW}.skip.hidden=false",
+            f"{HOW}.skip.background=false",
+        ),
+        skips=SKIPS,
+        savings=(Variant("all, and range reduction", (f"{HOW}.range.mode=paper",)),),
+        parts={
+            "field": "field",
+            "depth_reprojection": "reprojection",
+            "feature_reprojection": "reprojection",
+            "renderer2d": "renderer2d",
+            "renderer2d/network": "network",
+            "finish": "finish",
+        },
+        chosen=("rendering", "after", "engine"),
+    )
 
     def __init__(
         self,
