@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -36,6 +36,7 @@ SKIPS = {
 RANGES = turned("range", f"{HOW}.range.epsilon", (0.01, 0.03, 0.1), f"{HOW}.range.mode=paper")
 
 
+@dataclass(kw_only=True, eq=False)
 class SteerNerf:
     """SteerNeRF: low-resolution features of a field, preceding frames and a 2D renderer.
 
@@ -44,6 +45,21 @@ class SteerNerf:
     `steps` steps (None: `budget.renderer_steps`), of which `Stage2` uses a share `after`. `engine`
     then computes the network of the U-Net. `rendering` may be replaced between frames.
     """
+
+    grid: HashGrid
+    training: TrainingOptions
+    model: ModelOptions
+    rendering: Rendering
+    renderer: partial[UNet]
+    joint: JointOptions
+    engine: Engine | Auto
+    steps: int | None = None
+    after: float = 1.0
+    precision: FieldPrecision = "bf16"
+    name: str = "steernerf"
+    backend: str = "auto"
+    device: str = "auto"
+    seed: int = 0
 
     study = Study(
         knobs={
@@ -74,36 +90,19 @@ class SteerNerf:
         chosen=("rendering", "after", "engine"),
     )
 
-    def __init__(
-        self,
-        *,
-        grid: HashGrid,
-        training: TrainingOptions,
-        model: ModelOptions,
-        rendering: Rendering,
-        renderer: partial[UNet],
-        joint: JointOptions,
-        engine: Engine | Auto,
-        steps: int | None = None,
-        after: float = 1.0,
-        precision: FieldPrecision = "bf16",
-        name: str = "steernerf",
-        backend: str = "auto",
-        device: str = "auto",
-        seed: int = 0,
-    ) -> None:
-        mode, possible = rendering.range.mode, "off without preceding frames (L = 0)"
-        expect(model.frames > 0 or mode == "off", "rendering.range.mode", possible, mode)
-        expect(steps is None or steps >= 1, "steps", "1 or more, or none", steps)
-        self.stage2 = Stage2(model, renderer, joint, after)
-        self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
-        engine.check(self.setup.device)
+    def __post_init__(self) -> None:
+        frames, mode = self.model.frames, self.rendering.range.mode
+        possible = "off without preceding frames (L = 0)"
+        expect(frames > 0 or mode == "off", "rendering.range.mode", possible, mode)
+        expect(self.steps is None or self.steps >= 1, "steps", "1 or more, or none", self.steps)
+        self.stage2 = Stage2(self.model, self.renderer, self.joint, self.after)
+        where = self.backend, self.device, self.seed
+        self.setup = Setup.resolved(self.grid, self.training, self.precision, *where)
+        self.engine.check(self.setup.device)
         with torch.random.fork_rng(devices=[]):  # refuses before hours of training
             self.stage2.make(self.setup)
-        self.rendering, self.name = rendering, name
-        self.engine = self.chosen = engine  # `chosen` computes the network after `fit`
-        self.steps, self.train_s = steps, 0.0
-        self.memory, self.buffer = model.frames, Buffer(maxlen=model.frames)
+        self.chosen, self.train_s = self.engine, 0.0  # the former computes the network after `fit`
+        self.memory, self.buffer = frames, Buffer(maxlen=frames)
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """Train both stages, or load their results if they were trained before; build the network
