@@ -15,10 +15,7 @@ from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.engines import Built, Engine
 from methods.engines.auto import Auto, EngineFigures
-from methods.instant_ngp.field import FieldPrecision
-from methods.instant_ngp.stage1 import Setup, train_field
-from methods.instant_ngp.training import TrainingOptions
-from methods.kernels.encode import HashGrid
+from methods.instant_ngp.stage1 import OnField, train_field
 from methods.kernels.types import expect
 from methods.steernerf.buffer import Buffer
 from methods.steernerf.options import JointOptions, ModelOptions, Rendering
@@ -37,7 +34,7 @@ RANGES = turned("range", f"{HOW}.range.epsilon", (0.01, 0.03, 0.1), f"{HOW}.rang
 
 
 @dataclass(kw_only=True, eq=False)
-class SteerNerf:
+class SteerNerf(OnField):
     """SteerNeRF: low-resolution features of a field, preceding frames and a 2D renderer.
 
     `grid`, `training` and `precision` are those of the field of stage 1, which other methods share.
@@ -46,20 +43,14 @@ class SteerNerf:
     then computes the network of the U-Net. `rendering` may be replaced between frames.
     """
 
-    grid: HashGrid
-    training: TrainingOptions
     model: ModelOptions
     rendering: Rendering
     renderer: partial[UNet]
     joint: JointOptions
     engine: Engine | Auto
-    steps: int | None = None
-    after: float = 1.0
-    precision: FieldPrecision = "bf16"
-    name: str = "steernerf"
-    backend: str = "auto"
-    device: str = "auto"
-    seed: int = 0
+    steps: int | None
+    after: float
+    name: str
 
     study = Study(
         knobs={
@@ -96,12 +87,11 @@ class SteerNerf:
         expect(frames > 0 or mode == "off", "rendering.range.mode", possible, mode)
         expect(self.steps is None or self.steps >= 1, "steps", "1 or more, or none", self.steps)
         self.stage2 = Stage2(self.model, self.renderer, self.joint, self.after)
-        where = self.backend, self.device, self.seed
-        self.setup = Setup.resolved(self.grid, self.training, self.precision, *where)
+        super().__post_init__()
         self.engine.check(self.setup.device)
         with torch.random.fork_rng(devices=[]):  # refuses before hours of training
             self.stage2.make(self.setup)
-        self.chosen, self.train_s = self.engine, 0.0  # the former computes the network after `fit`
+        self.chosen = self.engine  # `chosen` computes the network after `fit`
         self.memory, self.buffer = frames, Buffer(maxlen=frames)
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
@@ -147,4 +137,4 @@ class SteerNerf:
     def settings(self) -> dict[str, str]:
         """Those of the field, with the engine and precision of the 2D renderer."""
         engine, computed = self.chosen.name, self.chosen.computed(self.setup.device)
-        return self.setup.settings(type(self)) | {"engine": engine, "precision": computed}
+        return super().settings() | {"engine": engine, "precision": computed}

@@ -42,7 +42,7 @@ class Stage2:
     model: ModelOptions  # the settings it is trained for
     renderer: partial[UNet]  # makes the 2D renderer for K, L and s
     joint: JointOptions  # how it is trained
-    after: float = 1.0  # share of the steps whose weights are used, 1 or one of `MARKS`
+    after: float  # share of the steps whose weights are used, 1 or one of `MARKS`
 
     def __post_init__(self) -> None:
         marks = ", ".join(map(str, MARKS))
