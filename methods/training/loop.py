@@ -30,8 +30,8 @@ class Training(Protocol):
 
     advice: ClassVar[str]  # what to try if the training breaks down
     steps: int  # how many there are in all
-    step = 0  # how many are done
-    seconds = 0.0  # the time they took, over all the processes the training was continued in
+    step: int = 0  # how many are done
+    seconds: float = 0.0  # the time they took, over all the processes the training was continued in
     asked: Asked | None = None  # the errors that `look` requested last
     generator: torch.Generator
 
