@@ -11,8 +11,9 @@ from methods.steernerf.options import RangeReduction
 from tests.methods.models import small_joint, small_model, small_motion, small_rendering
 from tests.methods.small_students import SMALL, extraction
 from tests.methods.trainings import GRID, QUICK
-from tests.methods.usual import field_options, lessons, new_gaussians
+from tests.methods.usual import field_options, lessons, new_gaussians, new_ngp
 
+NGP = partial(new_ngp, grid=GRID, training=QUICK)
 GAUSSIANS = partial(new_gaussians, grid=GRID, training=QUICK)
 RANGE = partial(RangeReduction, mode="paper", depth="sum")
 
@@ -24,8 +25,10 @@ REFUSED: list[tuple[Callable[..., Any], str, Any]] = [
         for name in ("max_rays", "rays", "grid_samples", "by_error", "stop")
     ),
     *((field_options, "share", 1.5), (field_options, "final_rate", 2.0)),
+    *((NGP, "device", name) for name in ("", "gpu", "cpu:0", "meta")),
     *((GAUSSIANS, "count", 0), (GAUSSIANS, "degree", 4), (GAUSSIANS, "stored", "fp8")),
-    *((make, "stop", 1.0) for make in (GAUSSIANS, small_model, small_rendering, *SMALL.values())),
+    *((make, "stop", 1.0) for make in (NGP, GAUSSIANS, small_model, small_rendering)),
+    *((make, "stop", 1.0) for make in SMALL.values()),
     *((make, "step", 0.0) for make in (small_model, small_rendering, SMALL["nsvf"])),
     *((small_model, "channels", x) for x in (2, 257)),
     *((small_model, "frames", x) for x in (-1, 65)),
