@@ -25,7 +25,6 @@ from unittest.mock import MagicMock
 import pytest
 import torch
 from torch import Tensor
-from torch.nn.utils import clip_grad
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from methods.kernels.dispatch import availability, multiplies_bf16
@@ -99,9 +98,6 @@ class GpuTensor(Tensor):
 
     def untyped_storage(self) -> torch.UntypedStorage:
         return self.held.untyped_storage()
-
-    def __repr__(self) -> str:
-        return f"GpuTensor({self.held})"
 
 
 class Graph(list[tuple[Callable[..., Any], tuple, dict, Any]]):
@@ -326,7 +322,6 @@ def _of_torch_cuda(gpu: PretendedGpu) -> dict[str, Any]:
 def _patch_torch(patch: pytest.MonkeyPatch, gpu: PretendedGpu) -> None:
     """What makes and moves tensors, and what asks C++, which sees the CPU, for their device."""
     convert, make, lower = Tensor.to, torch.tensor, torch.autocast.__init__
-    group = clip_grad._group_tensors_by_device_and_dtype
 
     def to(self, *args, copy=False, **kwargs):
         if args and isinstance(args[0], Tensor):
@@ -355,9 +350,6 @@ def _patch_torch(patch: pytest.MonkeyPatch, gpu: PretendedGpu) -> None:
     def autocast(self, device_type, *args, **kwargs):
         lower(self, "cpu", *args, **kwargs)
 
-    def grouped(*args):
-        return {(x[0][0][0].device, dtype): x for (_, dtype), x in group(*args).items()}
-
     # By these, Adam learns whether it is captured; a CUDA build without a driver would fail.
     stream = SimpleNamespace(is_capturing=lambda: gpu.graph is not None)
     patch.setattr(torch.accelerator, "current_accelerator", lambda *args, **kwargs: GPU)
@@ -370,7 +362,6 @@ def _patch_torch(patch: pytest.MonkeyPatch, gpu: PretendedGpu) -> None:
     # So that a module moves to the GPU and back in place, as it does on a real one.
     patch.setattr(torch.__future__, "get_swap_module_params_on_conversion", lambda: True)
     patch.setattr(torch.autocast, "__init__", autocast)
-    patch.setattr(clip_grad, "_group_tensors_by_device_and_dtype", grouped)
 
 
 def _patch_triton(patch: pytest.MonkeyPatch) -> None:

@@ -67,12 +67,6 @@ def masked(x: Tensor, value: float | Tensor, mask: Tensor) -> None:
     x[mask] = value
 
 
-def clipped(x: Tensor) -> None:
-    weights = torch.nn.Parameter(x.float())
-    weights.grad = x.float()
-    torch.nn.utils.clip_grad_norm_([weights], 1.0)
-
-
 WAITS: dict[str, tuple[int, Callable[[Tensor], object]]] = {
     "arithmetic": (0, lambda x: (x + 1).sum() * 2),
     "item": (1, lambda x: x.sum().item()),
@@ -93,7 +87,6 @@ WAITS: dict[str, tuple[int, Callable[[Tensor], object]]] = {
     "a number put at indices": (1, lambda x: masked(x, 0.0, x.long() % 3)),
     "where": (0, lambda x: torch.where(x > 0, x, 0.0)),
     "where, with a number of the CPU": (1, lambda x: torch.where(x > 0, x, HERE.sum())),
-    "gradients that are clipped": (0, clipped),
     "unique": (1, lambda x: x.unique()),
     "repeated by a tensor": (1, lambda x: x.repeat_interleave(x.long())),
     "repeated, how often is known": (0, lambda x: x.repeat_interleave(x.long(), output_size=6)),

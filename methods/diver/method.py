@@ -20,7 +20,7 @@ from methods.kernels.corner_gather import CORNERS
 from methods.kernels.types import Occupancy, Pixels, expect
 from methods.rendering.compaction import to_host
 from methods.rendering.frame import Render
-from methods.students.method import Student
+from methods.students.method import IN_FP32, Student
 from methods.students.networks import encode_directions
 
 Stored = Literal["bf16", "fp32"]
@@ -95,7 +95,7 @@ class Diver(Student):
     stored: Stored
     faint: float
 
-    kind = "diver"
+    kind, model, computed = "diver", ("resolution",), IN_FP32
     study = Study(
         knobs={
             "stop": turned("stop", "method.stop", ("1e-1", "1e-3", "1e-4")),
@@ -116,11 +116,7 @@ class Diver(Student):
         expect(self.stored in ("bf16", "fp32"), "stored", "bf16 or fp32", self.stored)
         expect(0 <= self.faint < 1, "faint", "a weight of 0 or more and less than 1", self.faint)
 
-    def model_settings(self) -> Mapping[str, object]:
-        return {"resolution": self.resolution}
-
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> DiverTraining:
-        """Make the training of corners that start as the trained field encodes them."""
         generator = torch.Generator().manual_seed(self.teacher.seed)
         model = CornerModel.taught(teacher, self.resolution, generator)
         return DiverTraining(model, scene, budget, self.training, self.teacher.seed)
@@ -140,6 +136,3 @@ class Diver(Student):
 
     def sizes(self) -> dict[str, int]:
         return self.baked.sizes()
-
-    def settings(self) -> dict[str, str]:
-        return super().settings() | {"field_precision": "fp32"}

@@ -75,11 +75,9 @@ class CornerModel(nn.Module):
     def taught(
         cls, teacher: TrainedField, resolution: int, generator: torch.Generator
     ) -> CornerModel:
-        """Make a model with voxels where the trained field is occupied, and a random decoder.
-
-        The features of a corner are its hash encoding, 16 levels of 2, divided by their standard
-        deviation; ValueError if it has more than 32 channels.
-        """
+        """Make a model with voxels where the trained field is occupied, and a random decoder. The
+        features of a corner are its hash encoding, 16 levels of 2, divided by their standard
+        deviation; ValueError if it has more than 32 channels."""
         field = teacher.field
         few = f"at most the {CHANNELS} channels of a corner: choose fewer levels or features"
         expect(field.grid.channels <= CHANNELS, "grid", few, field.grid.channels)
@@ -114,8 +112,8 @@ class CornerModel(nn.Module):
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything that was trained."""
-        decoder = {f"decoder.{name}": value for name, value in self.decoder.state_dict().items()}
-        return decoder | {"coordinates": self.voxels.coordinates, "table": self.table.detach()}
+        own = {"coordinates": self.voxels.coordinates, "table": self.table.detach()}
+        return self.decoder.state_dict(prefix="decoder.") | own
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Restore what `tensors` returned."""

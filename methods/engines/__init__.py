@@ -40,11 +40,9 @@ CALIBRATION = 16  # frames whose inputs determine the ranges of all 8-bit number
 
 
 class Engine(ABC):
-    """Builds networks at one of its `precisions`; only int8 depends on `calibration`.
-
-    The constructor raises `Unavailable` if the engine does not have the precision, or cannot be
-    used here.
-    """
+    """Builds networks at one of its `precisions`; only int8 depends on `calibration`. The
+    constructor raises `Unavailable` if the engine does not have the precision, or cannot be used
+    here."""
 
     name: ClassVar[str]  # as shown in rows
     precisions: ClassVar[tuple[Precision, ...]]
@@ -80,10 +78,8 @@ class Engine(ABC):
             )
 
     def computed(self, device: torch.device) -> str:
-        """The precision that products really have on `device`, as shown in rows.
-
-        For int8, a second part after `+` is the precision of everything that is not quantised.
-        """
+        """The precision that products really have on `device`, as shown in rows. For int8, a second
+        part after `+` is the precision of everything that is not quantised."""
         if self.precision != "int8":
             return self.precision
         return "int8 uncalibrated+fp32" if self.uncalibrated else "int8+fp32"

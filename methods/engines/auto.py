@@ -46,7 +46,6 @@ class Auto:
         """As of an engine; torch in fp32 can always be chosen."""
 
     def computed(self, device: torch.device) -> str:
-        """As of an engine: not known before one is chosen."""
         return self.name
 
     def _candidates(self, device: torch.device) -> Iterator[Engine]:

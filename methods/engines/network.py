@@ -26,10 +26,8 @@ class Built:
 
 
 class Network(nn.Module, ABC):
-    """A network that engines can run: it maps pictures [B, C, H, W] to a tuple of pictures.
-
-    Of an input, only C is always the same.
-    """
+    """A network that engines can run: it maps pictures [B, C, H, W] to a tuple of pictures. Of an
+    input, only C is always the same."""
 
     @abstractmethod
     def products(self, *inputs: Tensor) -> int:

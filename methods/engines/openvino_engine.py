@@ -44,23 +44,17 @@ class OpenVino(Engine):
         self._openvino = self.import_library("openvino")
         self._nncf = self.import_library("nncf") if precision == "int8" else None
         self._half = precision != "fp32" and "BF16" in _capabilities(self._openvino)
+        self._dtype = torch.bfloat16 if self._half else torch.float32  # of input pictures
         if precision == "bf16" and not self._half:
             raise Unavailable(
                 "precision=bf16: engine=openvino has no bfloat16 on this CPU, use precision=fp32"
             )
 
     def computed(self, device: torch.device) -> str:
-        """As of any engine; beside int8, this CPU may compute in bfloat16."""
         computed = super().computed(device)
         return computed.replace("+fp32", "+bf16") if self._half else computed
 
-    @property
-    def _dtype(self) -> torch.dtype:
-        """Of input pictures."""
-        return torch.bfloat16 if self._half else torch.float32
-
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
-        """Convert `network`, for int8 quantised, and compile it."""
 
         def write(path: Path) -> None:
             model = self._channels_last(self._convert(network, samples()))

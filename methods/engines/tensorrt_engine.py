@@ -31,11 +31,9 @@ PRODUCTS = ("Conv", "Gemm", "MatMul")
 
 
 class TensorRt(Engine):
-    """TensorRT on a CUDA GPU.
-
-    It builds plans. A plan is valid for one GPU model, one version, and pictures of one size; it is
-    built when that size first occurs. With int8, everything not quantised is computed in float32.
-    """
+    """TensorRT on a CUDA GPU. It builds plans. A plan is valid for one GPU model, one version, and
+    pictures of one size; it is built when that size first occurs. With int8, everything not
+    quantised is computed in float32."""
 
     name = "tensorrt"
     precisions = ("fp32", "fp16", "int8")
@@ -52,7 +50,6 @@ class TensorRt(Engine):
             self.import_library(library)
 
     def check(self, device: torch.device) -> None:
-        """Raise `Unavailable` unless `device` is the first CUDA GPU."""
         if device.type != "cuda" or device.index:
             raise Unavailable(
                 f"engine=tensorrt computes on the first CUDA GPU, this is device={device}: use "
@@ -64,7 +61,6 @@ class TensorRt(Engine):
         return super().key() | {"gpu": torch.cuda.get_device_name()}
 
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
-        """Export `network` as an ONNX model, of which plans are built."""
         import onnx
 
         path = folder() / "network.onnx"
@@ -171,10 +167,8 @@ def _fixed_ranges(prepared: Path) -> dict[str, Any]:
 
 
 class _Plans:
-    """The plans of a model, one for each size of its inputs.
-
-    `exact`: compute float32 in float32, not in TF32.
-    """
+    """The plans of a model, one for each size of its inputs. `exact`: compute float32 in float32,
+    not in TF32."""
 
     def __init__(self, model: Path, *, exact: bool, log: Log) -> None:
         import tensorrt

@@ -24,27 +24,22 @@ WARM_UP = 3  # runs before recording, in which libraries choose algorithms and a
 
 
 class TorchEngine(Engine):
-    """Runs the network itself; below fp32, products and convolutions are in half precision.
-
-    A device without bfloat16 products multiplies numbers rounded to bfloat16 in float32; rows then
-    say `bf16 in fp32`.
-    """
+    """Runs the network itself; below fp32, products and convolutions are in half precision. A
+    device without bfloat16 products multiplies numbers rounded to bfloat16 in float32; rows then
+    say `bf16 in fp32`."""
 
     name = "torch"
     precisions = ("fp32", "bf16", "fp16")
 
     def check(self, device: torch.device) -> None:
-        """Raise `Unavailable` for fp16 on a CPU."""
         if self.precision == "fp16" and device.type == "cpu":
             raise Unavailable("precision=fp16: engine=torch has it on a GPU, on a CPU use bf16")
 
     def computed(self, device: torch.device) -> str:
-        """The precision of products: bf16 may be emulated on `device`."""
         emulated = self.precision == "bf16" and not multiplies_bf16(device.type)
         return "bf16 in fp32" if emulated else super().computed(device)
 
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
-        """Make `network` compute at this precision, on a GPU as CUDA graphs."""
         dtype = DTYPES[self.precision]
 
         def run(*inputs: Tensor) -> Inputs:
@@ -70,11 +65,9 @@ Replay = tuple[Callable[[], Any], Inputs]
 
 
 class Replayed:
-    """Replays `run`; it is recorded for every input size when that size first occurs.
-
-    The next call, of any size, overwrites the outputs, because all recordings share memory. `run`
-    computes on a CUDA GPU, without waiting for it.
-    """
+    """Replays `run`; it is recorded for every input size when that size first occurs. The next
+    call, of any size, overwrites the outputs, because all recordings share memory. `run` computes
+    on a CUDA GPU, without waiting for it."""
 
     def __init__(self, run: Callable[..., Inputs]) -> None:
         self._run = run

@@ -46,9 +46,7 @@ UNTOLD: dict[str, Any] = {
 @dataclass(kw_only=True, eq=False)
 class External:
     """A renderer in another process, with the settings of `sweeps/configs/method/external.yaml`.
-
-    The process starts when something is asked of it, and ends with this object.
-    """
+    The process starts when something is asked of it, and ends with this object."""
 
     command: str
     python: str | None
@@ -102,12 +100,10 @@ class External:
 
     @property
     def name(self) -> str:
-        """What the worker calls itself."""
         return self._about["name"]
 
     @property
     def memory(self) -> int:
-        """Preceding frames that it uses."""
         return self._about["memory"]
 
     @property
@@ -241,7 +237,6 @@ class External:
         return {**{name: getattr(camera, name) for name in names}, "c2w": pose}
 
     def reset(self) -> None:
-        """Begin a new sequence."""
         self._worker.ask("reset", self.frame_s, {})
 
     def render(self, camera: Camera, probe: Probe) -> Frame:
@@ -280,7 +275,6 @@ class External:
         self._worker.expect(holds, "render", expected, got)
 
     def sizes(self) -> dict[str, int]:
-        """Bytes by component, as the worker tells."""
         told, _ = self._worker.ask("sizes", self.frame_s, {})
         sizes: Any = told.get("sizes")
         self._worker.expect(_counts(sizes), "sizes", "sizes in bytes", told)

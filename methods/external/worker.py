@@ -28,8 +28,7 @@ class Worker:
     environment has `variables`, too.
 
     Whatever it does wrong is one SteerbenchError with its name and its last words. It is killed
-    then, and so are the processes that it has started.
-    """
+    then, and so are the processes that it has started."""
 
     def __init__(
         self, command: Sequence[str], limit_s: float, variables: Mapping[str, str]
@@ -73,10 +72,8 @@ class Worker:
         fields: Mapping[str, object] | None = None,
         progress: Callable[[Header], object] | None = None,
     ) -> tuple[Header, dict[str, np.ndarray]]:
-        """Send a message, unless `fields` are None; the header and the arrays of its answer.
-
-        Before an answer, and before each message to `progress`, it may be silent for `limit_s`.
-        """
+        """Send a message, unless `fields` are None; the header and the arrays of its answer. Before
+        an answer, and before each message to `progress`, it may be silent for `limit_s`."""
         try:
             self._channel.until = time.monotonic() + limit_s
             if fields is not None:

@@ -16,23 +16,18 @@ from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.gaussians import ply
 from methods.gaussians.model import Gaussians, rounded, stored_bytes
 from methods.gaussians.training import Fitting, GaussianTraining, on_surfaces, spacing
-from methods.instant_ngp.field import FieldPrecision
-from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
-from methods.instant_ngp.training import TrainingOptions
+from methods.instant_ngp.stage1 import OnField, train_field
 from methods.kernels.composite import check_stop
-from methods.kernels.encode import HashGrid
 from methods.kernels.types import expect
 from methods.rendering.frame import FeatureFrame
 from methods.training import checkpoint, loop
 
 
 @dataclass(kw_only=True, eq=False)
-class GaussianSplatting:
+class GaussianSplatting(OnField):
     """3D Gaussians, with the settings of `sweeps/configs/method/gaussians.yaml`; `grid`, `training`
     and `precision` are those of the field that they start from."""
 
-    grid: HashGrid
-    training: TrainingOptions
     fitting: Fitting
     count: int
     steps: int | None  # None: `budget.renderer_steps`
@@ -40,13 +35,8 @@ class GaussianSplatting:
     checkpoint: str | None
     stored: Literal["fp32", "int8"]
     stop: float
-    precision: FieldPrecision
     name: str
-    backend: str
-    device: str
-    seed: int
 
-    memory = 0
     study = Study(
         knobs={
             "stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3")),
@@ -61,15 +51,13 @@ class GaussianSplatting:
     )
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         expect(self.count >= 1, "count", "1 or more", self.count)
         expect(self.steps is None or self.steps >= 1, "steps", "1 or more, or none", self.steps)
         expect(self.stored in ("fp32", "int8"), "stored", "fp32 or int8", self.stored)
         expect(self.degree in range(4), "degree", "0 to 3", self.degree)
         check_stop(self.stop)
-        where = self.backend, self.device, self.seed
-        self.setup = Setup.resolved(self.grid, self.training, self.precision, *where)
         self.reads = [] if self.checkpoint is None else [Path(self.checkpoint)]
-        self.train_s = 0.0
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """Train field and Gaussians, load what was trained before, or read the `checkpoint`."""
@@ -95,7 +83,10 @@ class GaussianSplatting:
         finished = log.stage_dir("gaussians", key) / "gaussians.safetensors"
 
         def begin() -> GaussianTraining:
-            untrained = self._untrained(teacher, scene)
+            generator = torch.Generator(setup.device).manual_seed(setup.seed)
+            points, colours = on_surfaces(teacher, scene, self.count, generator)
+            scales = self.fitting.size * spacing(points)
+            untrained = Gaussians.at(points, colours, scales, self.fitting.opacity, self.degree)
             return GaussianTraining(untrained, scene, steps, self.fitting, setup)
 
         tensors, seconds = loop.trained(begin, finished, "gaussians", log)
@@ -107,28 +98,16 @@ class GaussianSplatting:
             log.info(f"Gaussians for other programs: {exported}")
         return gaussians
 
-    def _untrained(self, teacher: TrainedField, scene: Scene) -> Gaussians:
-        """The Gaussians before training."""
-        generator = torch.Generator(self.setup.device).manual_seed(self.setup.seed)
-        points, colours = on_surfaces(teacher, scene, self.count, generator)
-        scales = self.fitting.size * spacing(points)
-        return Gaussians.at(points, colours, scales, self.fitting.opacity, self.degree)
-
-    def reset(self) -> None:
-        """Do nothing: every frame stands alone."""
-
     @torch.no_grad()
     def render(self, camera: Camera, probe: Probe) -> Frame:
-        """Render one frame at the camera's full resolution."""
         camera = place_camera(camera, self.setup.device)
         pixels = self.gaussians.render(camera, self.stop, probe, self.setup.backend)
         with probe.stage("finish"):
             return FeatureFrame.of(camera, pixels, self.background).picture()
 
     def sizes(self) -> dict[str, int]:
-        """Bytes of the Gaussians' parameters, as they are stored."""
         plain = sum(4 * x.numel() for x in self.gaussians.parameters())
         return {"gaussians": plain if self.stored == "fp32" else stored_bytes(self.gaussians)}
 
     def settings(self) -> dict[str, str]:
-        return self.setup.settings(type(self)) | {"field_precision": "fp32"}
+        return super().settings() | {"field_precision": "fp32"}

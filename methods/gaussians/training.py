@@ -68,17 +68,16 @@ class Fitting:
         expect(self.every > 0, "every", "1 or more", self.every)
 
 
-class GaussianTraining:
-    """A `methods.training.loop.Training` on one picture a step."""
+class GaussianTraining(loop.Training):
+    """Trains Gaussians on one picture a step."""
 
     advice = "Try a smaller rate (method.fitting.means)."
-    asked: loop.Asked | None = None
 
     def __init__(
         self, gaussians: Gaussians, scene: Scene, steps: int, options: Fitting, setup: Setup
     ) -> None:
         self.gaussians, self.options, self.backend = gaussians, options, setup.backend
-        self.step, self.steps, self.seconds = 0, steps, 0.0
+        self.steps = steps
         self.split, self.background = scene.splits["train"], scene.background.to(setup.device)
         self.generator = torch.Generator(setup.device).manual_seed(setup.seed)
         self.views: list[int] = []  # still to come in this pass over the pictures
@@ -99,7 +98,6 @@ class GaussianTraining:
         return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def advance(self) -> dict[str, float]:
-        """Take one step; return its mean squared error, where `loop.look` does."""
         options, gaussians = self.options, self.gaussians
         share = self.step / self.steps
         camera, target = self._picture(half=share < options.half)
@@ -140,6 +138,9 @@ class GaussianTraining:
             picture = shrunk[0].movedim(0, -1).contiguous()
         return place_camera(camera, device), picture
 
+    def optimisers(self) -> checkpoint.Optimisers:
+        return {"adam": self.optimiser}
+
     def watched(self) -> dict[str, Tensor]:
         return dict(self.gaussians.named_parameters())
 
@@ -150,14 +151,11 @@ class GaussianTraining:
         self.gaussians.load_state_dict({name: tensors[name] for name in self.result()})
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        views = torch.tensor(self.views, dtype=torch.int64)
-        more = {"generator": self.generator.get_state(), "views": views}
-        return checkpoint.of_optimisers({"adam": self.optimiser}) | more, {}
+        tensors, figures = super().state()
+        return tensors | {"views": torch.tensor(self.views, dtype=torch.int64)}, figures
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        self.restore_result(tensors)
-        checkpoint.restore_optimisers({"adam": self.optimiser}, tensors)
-        self.generator.set_state(tensors["generator"].cpu())
+        super().restore(tensors, figures)
         self.views = tensors["views"].tolist()
 
 

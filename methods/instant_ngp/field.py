@@ -87,7 +87,6 @@ class HashField(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """The device of table and networks."""
         return self.table.device
 
     def encode_directions(self, directions: Tensor) -> Tensor:
@@ -107,10 +106,7 @@ class HashField(nn.Module):
         )
 
     def density(self, positions: Tensor, encoded: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Density [S] float32 and geometry channels [S, 16] at `positions` [S, 3].
-
-        `encoded` is what `encode` returned for them; None: it is computed here.
-        """
+        """As of any `Encoder`: density [S] float32 and geometry channels [S, 16]."""
         weights = self._weights("density_in", "density_out")
         size = self._part(positions)
         parts = positions.split(size)
@@ -142,7 +138,6 @@ class HashField(nn.Module):
         return cat(parts)
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:
-        """Count the work of `samples` densities and `shaded` features."""
         density = self.layers["density_in"].numel() + self.layers["density_out"].numel()
         features = sum(self.layers[f"feature_{name}"].numel() for name in ("in", "mid", "out"))
         probe.count("table_reads", 8 * self.grid.levels * samples)

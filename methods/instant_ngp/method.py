@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -10,19 +10,19 @@ from bench.cameras import place_camera
 from bench.study import Study, turned
 from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
-from methods.instant_ngp.field import FieldPrecision
-from methods.instant_ngp.stage1 import Setup, train_field
-from methods.instant_ngp.training import TrainingOptions
+from methods.instant_ngp.stage1 import OnField, train_field
 from methods.kernels.composite import check_stop
-from methods.kernels.encode import HashGrid
 from methods.rendering.frame import everywhere, render_frame
 
 
-class InstantNgp:
+@dataclass(kw_only=True, eq=False)
+class InstantNgp(OnField):
     """Instant-NGP as a `bench.types.Method`: the field of a `Setup`, rendered with rays that end at
     the transmittance `stop`, less than 1."""
 
-    name, memory = "ngp", 0
+    stop: float
+
+    name = "ngp"
     study = Study(
         knobs={"stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3"))},
         trained={
@@ -37,35 +37,18 @@ class InstantNgp:
         chosen=("stop",),
     )
 
-    def __init__(
-        self,
-        *,
-        grid: HashGrid,
-        training: TrainingOptions,
-        precision: FieldPrecision,
-        stop: float,
-        backend: str,
-        device: str,
-        seed: int,
-    ) -> None:
-        self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
-        check_stop(stop)
-        self.stop = stop
-        self.train_s = 0.0
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_stop(self.stop)
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
-        """Train the field, or load it if it was trained before."""
         with torch_threads(budget.threads):
             self.trained = train_field(self.setup, scene, budget, log)
         self.train_s = self.trained.train_s
         self.background = scene.background.to(self.setup.device)
 
-    def reset(self) -> None:
-        """Do nothing: every frame stands alone."""
-
     @torch.no_grad()
     def render(self, camera: Camera, probe: Probe) -> Frame:
-        """Render one frame at the camera's full resolution."""
         camera = place_camera(camera, self.setup.device)
         field, occupancy = self.trained.field, self.trained.occupancy
         sampling = replace(self.trained.sampling, stop=self.stop)
@@ -73,9 +56,4 @@ class InstantNgp:
         return render_frame(camera, occupancy, self.background, probe, render).picture()
 
     def sizes(self) -> dict[str, int]:
-        """Bytes of table, networks and occupancy bits."""
         return self.trained.sizes()
-
-    def settings(self) -> dict[str, str]:
-        """The settings that a row of results shows, as they really are."""
-        return self.setup.settings(type(self))

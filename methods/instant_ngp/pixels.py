@@ -22,19 +22,15 @@ UNSEEN = 0.1  # estimate for a run that no ray has met yet: about that of an unt
 
 
 def one_from_each(count: int, generator: torch.Generator, device: torch.device) -> Tensor:
-    """Draw one number from each of `count` equal parts of [0, 1), in order: [count] float64.
-
-    It may be rounded up to where the next part begins, be it 1.
-    """
+    """Draw one number from each of `count` equal parts of [0, 1), in order: [count] float64. It may
+    be rounded up to where the next part begins, be it 1."""
     places = torch.rand(count, dtype=torch.float64, generator=generator, device=device)
     return (places + torch.arange(count, device=device)) / count
 
 
 class PixelBatches:
-    """Random pixels of the pictures of a split, with their rays.
-
-    Pixels are numbered picture by picture, strip by strip from left to right, row by row.
-    """
+    """Random pixels of the pictures of a split, with their rays. Pixels are numbered picture by
+    picture, strip by strip from left to right, row by row."""
 
     def __init__(self, split: Split, device: torch.device) -> None:
         self._device = device

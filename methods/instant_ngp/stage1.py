@@ -87,6 +87,31 @@ class Setup:
         }
 
 
+@dataclass(kw_only=True, eq=False)
+class OnField:
+    """Base of methods whose settings are those of a field, see `Setup`, and others."""
+
+    grid: HashGrid
+    training: TrainingOptions
+    precision: FieldPrecision
+    backend: str
+    device: str
+    seed: int
+
+    memory = 0
+
+    def __post_init__(self) -> None:
+        where = self.backend, self.device, self.seed
+        self.setup = Setup.resolved(self.grid, self.training, self.precision, *where)
+        self.train_s = 0.0
+
+    def reset(self) -> None:
+        """Do nothing: every frame stands alone."""
+
+    def settings(self) -> dict[str, str]:
+        return self.setup.settings(type(self))
+
+
 @dataclass(frozen=True)
 class TrainedField:
     """A trained field, the grid of its densities, how its rays are marched, and the seconds that

@@ -91,14 +91,11 @@ def new_grid(scene: Scene, device: torch.device) -> DensityGrid:
 
 
 class PixelTraining(loop.Training, ABC):
-    """A training whose steps render random pixels of the training pictures.
-
-    Subclasses say what is trained, how its rays are rendered and how its parameters are updated. A
-    step aims at `samples` samples with a gradient; the number of rays follows from it.
-    """
+    """A training whose steps render random pixels of the training pictures. Subclasses say what is
+    trained, how its rays are rendered and how its parameters are updated. A step aims at `samples`
+    samples with a gradient; the number of rays follows from it."""
 
     advice = "Try a smaller learning rate (method.training.rate)."
-    asked: loop.Asked | None = None
 
     def __init__(
         self,
@@ -109,11 +106,10 @@ class PixelTraining(loop.Training, ABC):
         options: PixelOptions,
         seed: int,
     ) -> None:
-        self.options, self.samples = options, samples
+        self.options, self.samples, self.steps = options, samples, steps
         self.batches = PixelBatches(scene.splits["train"], device)
         self.errors = ErrorMap(len(self.batches), device) if options.by_error else None
         self.background = scene.background.to(device)
-        self.step, self.steps, self.seconds = 0, steps, 0.0
         self.rays = min(1024, options.max_rays)
         self.generator = torch.Generator(device).manual_seed(seed)
 
@@ -121,10 +117,6 @@ class PixelTraining(loop.Training, ABC):
     def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
         """Render R `rays` on `background` [3] or [R, 3], differentiably; also return the number of
         samples that were composited. `jitter` [R] in [0, 1) is the phase of the samples."""
-
-    @abstractmethod
-    def optimisers(self) -> checkpoint.Optimisers:
-        """The optimisers, which a checkpoint keeps."""
 
     @abstractmethod
     def _update(self) -> None:
@@ -135,7 +127,6 @@ class PixelTraining(loop.Training, ABC):
         return self.options.rate * loop.cosine(self.step / self.steps, self.options.final_rate)
 
     def advance(self) -> dict[str, float]:
-        """Take one step; return its mean squared error, as `loop.look` does."""
         numbers, alike = self._numbers()
         rays, colours = self.batches.at(numbers)
         target, background = self._target(colours)
@@ -182,18 +173,14 @@ class PixelTraining(loop.Training, ABC):
         self.rays = min(max(int(self.rays * change), MIN_RAYS), self.options.max_rays)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """Optimisers, random numbers, number of rays, error map."""
-        tensors = checkpoint.of_optimisers(self.optimisers())
-        tensors["generator"] = self.generator.get_state()
+        tensors, _ = super().state()
         if self.errors is not None:
             tensors |= {"errors": self.errors.errors, "error_ends": self.errors.ends}
         return tensors, {"rays": self.rays}
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        self.restore_result(tensors)
-        checkpoint.restore_optimisers(self.optimisers(), tensors)
+        super().restore(tensors, figures)
         self.rays = int(figures["rays"])
-        self.generator.set_state(tensors["generator"].cpu())
         if self.errors is not None:
             self.errors.errors.copy_(tensors["errors"])
             self.errors.ends.copy_(tensors["error_ends"])
@@ -215,7 +202,6 @@ class FieldTraining(PixelTraining):
         self.optimiser = FieldOptimiser(field)
 
     def advance(self) -> dict[str, float]:
-        """Take one step; return its mean squared error."""
         if self.step % EVERY == 0:
             times = 4 if self.step < GRID_YOUTH_STEPS else 1
             self.grid.update(self.field, self.generator, times * self.options.grid_samples)
@@ -236,15 +222,12 @@ class FieldTraining(PixelTraining):
             super()._fit_batch(samples)
 
     def watched(self) -> dict[str, Tensor]:
-        """Table and its moments, networks."""
         moments = self.optimiser.table
         both = moments.first + moments.second
         return {"table": self.field.table, "table moments": both, **self.field.layers}
 
     def result(self) -> dict[str, Tensor]:
-        """Field and density grid."""
-        tensors = {f"field.{name}": value for name, value in self.field.state_dict().items()}
-        return tensors | {"grid.density": self.grid.density}
+        return self.field.state_dict(prefix="field.") | {"grid.density": self.grid.density}
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
         restore_field(self.field, self.grid, tensors)
@@ -258,10 +241,8 @@ def restore_field(field: HashField, grid: DensityGrid, tensors: Mapping[str, Ten
 
 
 class FieldOptimiser:
-    """Adam for the networks of `field`, and for its table one that skips untouched entries.
-
-    Once this exists, the field collects the gradients of its samples in `gradients`, until `step`.
-    """
+    """Adam for the networks of `field`, and for its table one that skips untouched entries. Once
+    this exists, the field collects the gradients of its samples in `gradients`, until `step`."""
 
     def __init__(self, field: HashField) -> None:
         self._field = field

@@ -129,9 +129,7 @@ def jit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 @jit(error_model="numpy")
 def exp(x):
     """e^x of a float32 to 3 u, for -87 <= x <= 87, and beyond that of the nearer end; NaN of NaN.
-
-    Unlike `math.exp`, it has neither a call nor a branch: loops with it become vectors.
-    """
+    Unlike `math.exp`, it has neither a call nor a branch: loops with it become vectors."""
     x = EDGE if x > EDGE else x
     x = -EDGE if x < -EDGE else x
     shifted = x * PER_LN2 + WHOLE
@@ -153,6 +151,12 @@ def slope(direction):
     """Change of t per length along an axis; 0 for a ray that does not move along it."""
     inverse = f32(1) / direction
     return inverse if abs(direction) >= PARALLEL else f32(0)
+
+
+@jit()
+def three(rows, i):
+    """The three numbers of a row."""
+    return rows[i, 0], rows[i, 1], rows[i, 2]
 
 
 @jit()

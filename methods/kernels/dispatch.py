@@ -76,10 +76,8 @@ def by_kernel(backend: str, method: type) -> str:
 
 @cache
 def multiplies_bf16(kind: str) -> bool:
-    """Whether devices of this kind ("cpu", "cuda") here have products of bfloat16.
-
-    A CPU without them, such as an x86 with only AVX2, needs ten times as long as for float32.
-    """
+    """Whether devices of this kind ("cpu", "cuda") here have products of bfloat16. A CPU without
+    them, such as an x86 with only AVX2, needs ten times as long as for float32."""
     if kind == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     instructions = torch.cpu.get_capabilities()
@@ -87,11 +85,9 @@ def multiplies_bf16(kind: str) -> bool:
 
 
 def implementation(kernel: str, backend: str, device: torch.device) -> ModuleType:
-    """The module that implements `kernel`, a package, for tensors on `device`.
-
-    The reference computes a kernel that has no such version; see `by_kernel`. Raises `Unavailable`
-    as `resolve` does.
-    """
+    """The module that implements `kernel`, a package, for tensors on `device`. The reference
+    computes a kernel that has no such version; see `by_kernel`. Raises `Unavailable` as `resolve`
+    does."""
     for called in _calls:
         called.add(kernel)
     name = resolve(_forced.get(kernel, backend), device)

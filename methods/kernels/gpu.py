@@ -18,10 +18,8 @@ def launch(
     kernel: triton.JITFunction, grid: tuple[int, ...], *arguments: Any, **options: Any
 ) -> None:
     """Run `kernel` on `grid`, unless that is empty, on the device of the first argument, a tensor.
-
     Multiply-adds are not fused, so that the march gives the same bits as the reference. Division
-    and exponential are within 2 ulp.
-    """
+    and exponential are within 2 ulp."""
     if all(grid):
         with torch.cuda.device_of(arguments[0]):
             kernel[grid](*arguments, enable_fp_fusion=False, **options)

@@ -39,11 +39,9 @@ def check_rays(rays: Rays) -> int:
 
 
 class Occupancy:
-    """Which cells of the unit cube may hold matter.
-
-    `cells` [G, G, G] bool is indexed (x, y, z); G is a multiple of 16, at most `LARGEST_SIDE`. The
-    derived properties let a ray cross all space known to be empty around it in one step.
-    """
+    """Which cells of the unit cube may hold matter. `cells` [G, G, G] bool is indexed (x, y, z); G
+    is a multiple of 16, at most `LARGEST_SIDE`. The derived properties let a ray cross all space
+    known to be empty around it in one step."""
 
     def __init__(self, cells: Tensor) -> None:
         size = cells.shape[0]
@@ -65,10 +63,8 @@ class Occupancy:
         return self.cells.shape[0]
 
     def holds(self, positions: Tensor) -> Tensor:
-        """Whether the cells of `positions` [..., 3] are occupied: [...] bool.
-
-        Positions outside the unit cube belong to the nearest cell.
-        """
+        """Whether the cells of `positions` [..., 3] are occupied: [...] bool. Positions outside the
+        unit cube belong to the nearest cell."""
         size = self.resolution
         return self.cells[(positions * size).long().clamp(0, size - 1).unbind(dim=-1)]
 
@@ -88,10 +84,8 @@ class Occupancy:
 
     @cached_property
     def clearance(self) -> Tensor:
-        """Chebyshev distance in bricks to the nearest non-empty brick: [G/4, G/4, G/4] uint8.
-
-        0 in a non-empty brick, at most G/4.
-        """
+        """Chebyshev distance in bricks to the nearest non-empty brick: [G/4, G/4, G/4] uint8. 0 in
+        a non-empty brick, at most G/4."""
         side = self.resolution // BRICK
         index = torch.arange(side, dtype=torch.uint8, device=self.cells.device)
         apart = torch.where(index > index[:, None], index - index[:, None], index[:, None] - index)
@@ -198,23 +192,24 @@ class Pixels:
     def take(self, index: Tensor | slice) -> Pixels:
         """The rays at `index`."""
         if isinstance(index, slice):
-            return Pixels(*(x[index] for x in self._columns))
-        return Pixels(*(x.index_select(0, index) for x in self._columns))
+            return Pixels(*(x[index] for x in self.columns))
+        return Pixels(*(x.index_select(0, index) for x in self.columns))
 
     def copy(self) -> Pixels:
         """Contiguous tensors of their own."""
-        return Pixels(*(x.clone(memory_format=torch.contiguous_format) for x in self._columns))
+        return Pixels(*(x.clone(memory_format=torch.contiguous_format) for x in self.columns))
 
     def put(self, index: Tensor | slice, pixels: Pixels) -> None:
         """Replace, in place, the rays at `index`."""
-        for column, new in zip(self._columns, pixels._columns, strict=True):
+        for column, new in zip(self.columns, pixels.columns, strict=True):
             if isinstance(index, slice):
                 column[index] = new
             else:  # a row at a time; `x[index]` goes number by number
                 column.index_copy_(0, index, new)
 
     @property
-    def _columns(self) -> tuple[Tensor, Tensor, Tensor]:
+    def columns(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Values, depth sums and opacities."""
         return self.values, self.depth_sum, self.alpha
 
     def over(self, background: Tensor) -> Pixels:

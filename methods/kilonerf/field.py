@@ -103,9 +103,8 @@ class KiloField(StudentField):
 
     def __init__(self, grid: Grid, backend: str, generator: torch.Generator | None = None) -> None:
         super().__init__(backend)
-        self.register_buffer("networks", grid.networks)
-        self.register_buffer("corner", grid.corner)
-        self.register_buffer("side", grid.side)
+        for name, value in vars(grid).items():
+            self.register_buffer(name, value)
         self.weights, self.biases = nn.ParameterDict(), nn.ParameterDict()
         for name, (inputs, outputs) in SHAPES.items():
             # As in torch's linear layers: uniform, with a bound from the number of inputs.
@@ -121,7 +120,6 @@ class KiloField(StudentField):
         return densities(local, numbers, self._layers, backend=self.backend)
 
     def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """Density [S], and what `features` needs of each sample [S, 33]."""
         raw, geometry = self.raw_density(positions)
         return raw.relu() / REACH, geometry
 
@@ -131,7 +129,6 @@ class KiloField(StudentField):
         return encode_frequencies(unit, DIRECTION_FREQUENCIES, backend=self.backend)
 
     def features(self, geometry: Tensor, encoded: Tensor) -> Tensor:
-        """Colours [S, 3]."""
         return colours(geometry, encoded, self._layers, backend=self.backend)
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:

@@ -15,6 +15,7 @@ from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.types import expect
 from methods.kilonerf.field import Grid, KiloField, Pieces, place_networks
 from methods.students.fields import FieldLessons, FieldStudent, StudentTraining
+from methods.students.method import IN_FP32
 from methods.training import checkpoint
 
 MOST = 32  # maximum number of networks along an axis: they are numbered in int16
@@ -43,11 +44,8 @@ class KiloTraining(StudentTraining):
     field: KiloField
     pieces: Pieces
 
-    def _places(self) -> tuple[Tensor, Tensor]:
-        positions = self.pieces.draw(self.options.points_each, self.generator)
-        shape, device = positions.shape, positions.device
-        directions = torch.randn(shape, generator=self.generator, device=device)
-        return positions, functional.normalize(directions, dim=1)
+    def _places(self) -> Tensor:
+        return self.pieces.draw(self.options.points_each, self.generator)
 
     def _learned(self, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """As in the base class, with a density that may fall below 0."""
@@ -80,14 +78,11 @@ class KiloNerf(FieldStudent):
     training: KiloLessons
     networks: int
 
-    kind = "kilonerf"
+    kind, model, computed = "kilonerf", ("networks",), IN_FP32
 
     def __post_init__(self) -> None:
         super().__post_init__()
         expect(1 <= self.networks <= MOST, "networks", f"1 to {MOST}", self.networks)
-
-    def model_settings(self) -> Mapping[str, object]:
-        return {"networks": self.networks}
 
     def new_field(self) -> KiloField:
         """Make the networks of the grid that was placed or restored last."""
@@ -106,6 +101,3 @@ class KiloNerf(FieldStudent):
         parts = checkpoint.part(tensors, "field.")
         self.grid = Grid(parts["networks"], parts["corner"], parts["side"])
         super().restore(tensors)
-
-    def settings(self) -> dict[str, str]:
-        return super().settings() | {"field_precision": "fp32"}

@@ -32,11 +32,9 @@ DENSITY = 1 / REACH
 
 
 class NerfField(NetworkField):
-    """One network of 595,844 parameters (Mildenhall et al. 2020, Figure 7).
-
-    Positions in the unit cube are mapped to [-1, 1], as in Section 5.1. `precision` is that of the
-    products, `backend` that of the kernels that render the field.
-    """
+    """One network of 595,844 parameters (Mildenhall et al. 2020, Figure 7). Positions in the unit
+    cube are mapped to [-1, 1], as in Section 5.1. `precision` is that of the products, `backend`
+    that of the kernels that render the field."""
 
     def __init__(
         self, precision: FieldPrecision, backend: str, generator: torch.Generator | None = None

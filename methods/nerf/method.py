@@ -33,7 +33,6 @@ class Nerf(FieldStudent):
     )
 
     def new_field(self) -> NerfField:
-        """Make the published network."""
         teacher = self.teacher
         generator = torch.Generator().manual_seed(teacher.seed)
         return NerfField(teacher.precision, teacher.backend, generator).to(teacher.device)

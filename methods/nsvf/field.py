@@ -33,7 +33,6 @@ class Norm(nn.LayerNorm):
     """LayerNorm in the dtype of its inputs; means and variances are float32 all the same."""
 
     def forward(self, input: Tensor) -> Tensor:
-        """Map [S, C] to [S, C]."""
         weight, bias = self.weight.to(input.dtype), self.bias.to(input.dtype)
         return functional.layer_norm(input, self.normalized_shape, weight, bias, self.eps)
 

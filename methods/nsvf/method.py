@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -25,7 +24,7 @@ class Nsvf(FieldStudent):
     resolution: int  # voxels along a side of the cube, a multiple of 16
     step: float  # length of a step of the rays in voxels, in training and rendering
 
-    kind = "nsvf"
+    kind, model = "nsvf", ("resolution", "step")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -35,17 +34,11 @@ class Nsvf(FieldStudent):
         channels, as_many = self.teacher.grid.channels, f"{EMBEDDING} channels (levels x features)"
         expect(channels == EMBEDDING, "teacher.grid", as_many, channels)
 
-    def model_settings(self) -> Mapping[str, object]:
-        """Voxels, and the steps of the rays."""
-        return {"resolution": self.resolution, "step": self.step}
-
     def occupied(self, teacher: TrainedField) -> Occupancy:
-        """The voxels, as cells."""
         size = self.resolution
         return Occupancy.at(occupied_voxels(teacher.occupancy, size), size)
 
     def sampling(self, budget: Budget) -> Sampling:
-        """Samples `step` voxels apart."""
         return Sampling(step=self.step / self.resolution)
 
     def new_field(self) -> NsvfField:

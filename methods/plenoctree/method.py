@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -25,7 +25,7 @@ from methods.plenoctree.octree import Extraction, Octree, extract
 from methods.rendering.compaction import to_host
 from methods.rendering.frame import Render
 from methods.rendering.sampling import Sampling
-from methods.students.method import Student
+from methods.students.method import IN_FP32, Student
 from methods.training import checkpoint
 
 SIDE = "method.extraction.resolution"
@@ -115,7 +115,7 @@ class PlenOctree(Student):
     extraction: Extraction
     stored: Literal["fp16", "fp32"]
 
-    kind = "plenoctree"
+    kind, model, computed = "plenoctree", ("extraction",), IN_FP32
     study = Study(
         knobs={
             "stop": turned("stop", "method.stop", ("1e-1", "1e-3", "1e-4")),
@@ -131,9 +131,6 @@ class PlenOctree(Student):
     def __post_init__(self) -> None:
         super().__post_init__()
         expect(self.stored in ("fp16", "fp32"), "stored", "fp16 or fp32", self.stored)
-
-    def model_settings(self) -> Mapping[str, object]:
-        return asdict(self.extraction)
 
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> OctreeTraining:
         setup = self.teacher
@@ -163,9 +160,6 @@ class PlenOctree(Student):
 
     def sizes(self) -> dict[str, int]:
         return self.octree.sizes(2 if self.stored == "fp16" else 4)
-
-    def settings(self) -> dict[str, str]:
-        return super().settings() | {"field_precision": "fp32"}
 
 
 def opaque_at_end(pixels: Pixels, stop: float) -> Pixels:

@@ -79,11 +79,9 @@ def query(
 
 
 def pad(samples: Tensor) -> Tensor:
-    """Pad [S, ...] with zeros to a multiple of `BATCH_QUANTUM`.
-
-    oneDNN prepares code for every new matrix size, which takes longer than the product itself, so a
-    field should see only a few round batch sizes.
-    """
+    """Pad [S, ...] with zeros to a multiple of `BATCH_QUANTUM`. oneDNN prepares code for every new
+    matrix size, which takes longer than the product itself, so a field should see only a few round
+    batch sizes."""
     padding = -len(samples) % BATCH_QUANTUM
     return functional.pad(samples, (0, 0) * (samples.dim() - 1) + (0, padding))
 

@@ -7,7 +7,7 @@ that the host need not wait.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -76,7 +76,7 @@ def everywhere(field: Field, occupancy: Occupancy, probe: Probe, how: Sampling) 
 
     def render(seen: Tensor, rays: Rays) -> Pixels:
         window = None if how.window is None else how.window[seen]
-        return render_rays(field, rays, occupancy, probe, how.within(window))
+        return render_rays(field, rays, occupancy, probe, replace(how, window=window))
 
     return render
 
@@ -89,11 +89,9 @@ def rays_at_matter(camera: Camera, occupancy: Occupancy) -> tuple[Tensor, Rays]:
 
 
 def sees_matter(camera: Camera, occupancy: Occupancy) -> Tensor:
-    """Which pixels may see an occupied cell: [h, w] bool.
-
-    A pixel may see an occupied brick if it lies in the bounding box of the brick's projected
-    corners; if one of the corners is not in front of the camera, every pixel may.
-    """
+    """Which pixels may see an occupied cell: [h, w] bool. A pixel may see an occupied brick if it
+    lies in the bounding box of the brick's projected corners; if one of the corners is not in front
+    of the camera, every pixel may."""
     device = camera.c2w.device
     bricks = occupancy.bricks.to(device)
     unit = torch.arange(2, device=device)

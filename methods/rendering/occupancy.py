@@ -75,9 +75,7 @@ def learnable_cells(bounds: Tensor, cameras: Sequence[Camera]) -> Tensor:
 
 class DensityGrid:
     """The running maximum of the density in [G, G, G] cells of the unit cube, and their occupancy.
-
-    Only `cells` [G, G, G] bool may ever be occupied.
-    """
+    Only `cells` [G, G, G] bool may ever be occupied."""
 
     def __init__(self, cells: Tensor) -> None:
         self.density = INITIAL * cells.float()

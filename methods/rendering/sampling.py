@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from torch import Tensor
 
@@ -48,7 +48,3 @@ class Sampling:
     def least_weight(self) -> float:
         """Weight of a sample below which its features are not evaluated."""
         return FAINT * self.stop
-
-    def within(self, window: Tensor | None) -> Sampling:
-        """The same within `window` [R, 2]."""
-        return replace(self, window=window)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -15,10 +15,7 @@ from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.engines import Built, Engine
 from methods.engines.auto import Auto, EngineFigures
-from methods.instant_ngp.field import FieldPrecision
-from methods.instant_ngp.stage1 import Setup, train_field
-from methods.instant_ngp.training import TrainingOptions
-from methods.kernels.encode import HashGrid
+from methods.instant_ngp.stage1 import OnField, train_field
 from methods.kernels.types import expect
 from methods.steernerf.buffer import Buffer
 from methods.steernerf.options import JointOptions, ModelOptions, Rendering
@@ -34,38 +31,10 @@ SKIPS = {
 }
 
 RANGES = turned("range", f"{HOW}.range.epsilon", (0.01, 0.03, 0.1), f"{HOW}.range.mode=paper")
-STUDY = Study(
-    knobs={
-        "skips": [
-            Variant(f"{name} not skipped", (f"{word}=false",)) for name, word in SKIPS.items()
-        ],
-        "step length": turned("step", f"{HOW}.step", (1.5, 2, 3)),
-        "stop": turned("stop", f"{HOW}.stop", ("1e-1", "3e-2", "1e-3", "1e-4")),
-        "range reduction": RANGES,
-    },
-    trained={"field, trained": turned("field", "method.precision", ("fp32",))},
-    exact=(
-        f"{HOW}.range.mode=off",
-        f"{HOW}.step=1",
-        f"{HOW}.skip.hidden=false",
-        f"{HOW}.skip.background=false",
-    ),
-    skips=SKIPS,
-    savings=(Variant("all, and range reduction", (f"{HOW}.range.mode=paper",)),),
-    parts={
-        "field": "field",
-        "depth_reprojection": "reprojection",
-        "feature_reprojection": "reprojection",
-        "renderer2d": "renderer2d",
-        "renderer2d/network": "network",
-        "finish": "finish",
-    },
-    chosen=("rendering", "after", "engine"),
-)
-"""What studies vary, and the stages of a frame."""
 
 
-class SteerNerf:
+@dataclass(kw_only=True, eq=False)
+class SteerNerf(OnField):
     """SteerNeRF: low-resolution features of a field, preceding frames and a 2D renderer.
 
     `grid`, `training` and `precision` are those of the field of stage 1, which other methods share.
@@ -74,38 +43,56 @@ class SteerNerf:
     then computes the network of the U-Net. `rendering` may be replaced between frames.
     """
 
-    study = STUDY
+    model: ModelOptions
+    rendering: Rendering
+    renderer: partial[UNet]
+    joint: JointOptions
+    engine: Engine | Auto
+    steps: int | None
+    after: float
+    name: str
 
-    def __init__(
-        self,
-        *,
-        grid: HashGrid,
-        training: TrainingOptions,
-        model: ModelOptions,
-        rendering: Rendering,
-        renderer: partial[UNet],
-        joint: JointOptions,
-        engine: Engine | Auto,
-        steps: int | None = None,
-        after: float = 1.0,
-        precision: FieldPrecision = "bf16",
-        name: str = "steernerf",
-        backend: str = "auto",
-        device: str = "auto",
-        seed: int = 0,
-    ) -> None:
-        mode, possible = rendering.range.mode, "off without preceding frames (L = 0)"
-        expect(model.frames > 0 or mode == "off", "rendering.range.mode", possible, mode)
-        expect(steps is None or steps >= 1, "steps", "1 or more, or none", steps)
-        self.stage2 = Stage2(model, renderer, joint, after)
-        self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
-        engine.check(self.setup.device)
+    study = Study(
+        knobs={
+            "skips": [
+                Variant(f"{name} not skipped", (f"{word}=false",)) for name, word in SKIPS.items()
+            ],
+            "step length": turned("step", f"{HOW}.step", (1.5, 2, 3)),
+            "stop": turned("stop", f"{HOW}.stop", ("1e-1", "3e-2", "1e-3", "1e-4")),
+            "range reduction": RANGES,
+        },
+        trained={"field, trained": turned("field", "method.precision", ("fp32",))},
+        exact=(
+            f"{HOW}.range.mode=off",
+            f"{HOW}.step=1",
+            f"{HOW}.skip.hidden=false",
+            f"{HOW}.skip.background=false",
+        ),
+        skips=SKIPS,
+        savings=(Variant("all, and range reduction", (f"{HOW}.range.mode=paper",)),),
+        parts={
+            "field": "field",
+            "depth_reprojection": "reprojection",
+            "feature_reprojection": "reprojection",
+            "renderer2d": "renderer2d",
+            "renderer2d/network": "network",
+            "finish": "finish",
+        },
+        chosen=("rendering", "after", "engine"),
+    )
+
+    def __post_init__(self) -> None:
+        frames, mode = self.model.frames, self.rendering.range.mode
+        possible = "off without preceding frames (L = 0)"
+        expect(frames > 0 or mode == "off", "rendering.range.mode", possible, mode)
+        expect(self.steps is None or self.steps >= 1, "steps", "1 or more, or none", self.steps)
+        self.stage2 = Stage2(self.model, self.renderer, self.joint, self.after)
+        super().__post_init__()
+        self.engine.check(self.setup.device)
         with torch.random.fork_rng(devices=[]):  # refuses before hours of training
             self.stage2.make(self.setup)
-        self.rendering, self.name = rendering, name
-        self.engine = self.chosen = engine  # `chosen` computes the network after `fit`
-        self.steps, self.train_s = steps, 0.0
-        self.memory, self.buffer = model.frames, Buffer(maxlen=model.frames)
+        self.chosen = self.engine  # `chosen` computes the network after `fit`
+        self.memory, self.buffer = frames, Buffer(maxlen=frames)
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """Train both stages, or load their results if they were trained before; build the network
@@ -139,18 +126,15 @@ class SteerNerf:
         renderer.engine = self.built = build(engine)
 
     def reset(self) -> None:
-        """Forget preceding frames."""
         self.buffer.clear()
 
     def render(self, camera: Camera, probe: Probe) -> Frame:
-        """Render the next frame of the sequence."""
         return self.pipeline.render(camera, self.buffer, self.rendering, probe)
 
     def sizes(self) -> dict[str, int]:
-        """Bytes of table, networks, occupancy bits and 2D renderer."""
         return self.trained.sizes() | {"renderer2d": self.built.size}
 
     def settings(self) -> dict[str, str]:
         """Those of the field, with the engine and precision of the 2D renderer."""
         engine, computed = self.chosen.name, self.chosen.computed(self.setup.device)
-        return self.setup.settings(type(self)) | {"engine": engine, "precision": computed}
+        return super().settings() | {"engine": engine, "precision": computed}

@@ -88,11 +88,7 @@ class Pipeline:
         buffer.appendleft(PointCloud.of(frame))
 
     def features(
-        self,
-        view: TwoScales,
-        preceding: Sequence[PointCloud],
-        rendering: Rendering,
-        probe: Probe,
+        self, view: TwoScales, preceding: Sequence[PointCloud], rendering: Rendering, probe: Probe
     ) -> FeatureFrame:
         """Render features F and depth D at low resolution (Eq. 2 to 5). With range reduction, rays
         are sampled only near the depth of the newest of the `preceding` frames (Eq. 7, 8)."""
@@ -102,7 +98,7 @@ class Pipeline:
                 expected = reduction.depth == "expected"
                 cloud = preceding[0].expected() if expected else preceding[0]
                 near_far = cloud.interval(view.low, reduction.epsilon, self.backend)
-                how = how.within(near_far.view(-1, 2))
+                how = replace(how, window=near_far.view(-1, 2))
         with probe.stage("field"):
             where = self.occupancy if rendering.skip.empty else self._cube
             render = everywhere(self.field, where, probe, how)

@@ -42,7 +42,7 @@ class Stage2:
     model: ModelOptions  # the settings it is trained for
     renderer: partial[UNet]  # makes the 2D renderer for K, L and s
     joint: JointOptions  # how it is trained
-    after: float = 1.0  # share of the steps whose weights are used, 1 or one of `MARKS`
+    after: float  # share of the steps whose weights are used, 1 or one of `MARKS`
 
     def __post_init__(self) -> None:
         marks = ", ".join(map(str, MARKS))
@@ -97,28 +97,28 @@ def train_stage2(
     return pipeline, key, training.seconds
 
 
-class JointTraining:
-    """Stage 2 as a `loop.Training`: trains `renderer` in place, on patches from `patches`, and the
-    field `trained`, unless that is None: then it is frozen."""
+class JointTraining(loop.Training):
+    """Stage 2: trains `renderer` in place, on patches from `patches`, and the field `trained`,
+    unless that is None: then it is frozen."""
 
     advice = "Try smaller learning rates (method.joint.rate, method.joint.field_rate)."
-    asked: loop.Asked | None = None
 
     def __init__(
         self, renderer: UNet, patches: Patches, steps: int, trained: TrainedField | None
     ) -> None:
-        self.renderer, self.patches = renderer, patches
+        self.renderer, self.patches, self.steps, self.trained = renderer, patches, steps, trained
         self.options, self.generator = patches.options, patches.generator
-        self.step, self.steps, self.seconds = 0, steps, 0.0
-        self.trained = trained
         if trained is not None:
             self.field_optimiser = FieldOptimiser(trained.field)
             seed = self.generator.initial_seed()
             self._visits = torch.Generator(trained.field.device).manual_seed(seed)
 
+    def optimisers(self) -> checkpoint.Optimisers:
+        return {**self._of_renderer, **(self.field_optimiser.parts if self.trained else {})}
+
     @cached_property
-    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """Of the renderer's parameters; created when first needed, like that of the field."""
+    def _of_renderer(self) -> dict[str, torch.optim.Optimizer]:
+        """Created when first needed, like that of the field."""
         parameters, rate = list(self.renderer.parameters()), self.options.rate
         if self.options.optimiser == "adam":
             return {"adam": torch.optim.Adam(parameters, lr=rate, fused=True)}
@@ -127,8 +127,7 @@ class JointTraining:
         return {"adam": torch.optim.Adam(others, lr=rate, fused=True), "muon": Muon(weights, rate)}
 
     def advance(self) -> dict[str, float]:
-        """Take one step; return the mean squared error of the pictures, as `loop.look` does, which
-        raises SteerbenchError if it is not finite. The density grid follows the field."""
+        """Take one step; return the error of the pictures. The density grid follows the field."""
         if self.trained and self.options.grid_samples and self.step % EVERY == 0:
             grid = self.trained.grid
             grid.update(self.trained.field, self._visits, self.options.grid_samples)
@@ -143,7 +142,7 @@ class JointTraining:
         loss.backward()
         errors = loop.look(self, {"": error}, {"loss": error, "picture": pictures})
         rate = self.rate_now(self.options.rate)
-        for name, optimiser in self.optimisers.items():
+        for name, optimiser in self._of_renderer.items():
             loop.step_at(optimiser, MUON * rate if name == "muon" else rate)
         if self.trained:
             self.field_optimiser.step(self.rate_now(self.options.field_rate))
@@ -156,12 +155,10 @@ class JointTraining:
         return first * loop.cosine(self.step / self.steps, final, waves)
 
     def watched(self) -> dict[str, Tensor]:
-        """The parameters of the renderer, and of a field that learns."""
         field = self.trained.field.named_parameters("field") if self.trained else ()
         return dict([*self.renderer.named_parameters("renderer"), *field])
 
     def result(self) -> dict[str, Tensor]:
-        """Renderer, and field and density grid if they learn."""
         result = self.renderer.state_dict(prefix="renderer.")
         if self.trained:
             result |= self.trained.field.state_dict(prefix="field.")
@@ -169,28 +166,20 @@ class JointTraining:
         return result
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore what `result` returned."""
         self.renderer.load_state_dict(checkpoint.part(tensors, "renderer."))
         if self.trained:
             restore_field(self.trained.field, self.trained.grid, tensors)
             self.patches.pipeline.occupancy = self.trained.grid.occupancy
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """Optimisers, random numbers, and the examples that patches are cut from."""
-        tensors = {f"patches.{name}": x for name, x in self.patches.state().items()}
-        tensors |= checkpoint.of_optimisers(self.optimisers)
-        tensors["generator"] = self.generator.get_state()
+        tensors, figures = super().state()
+        tensors |= {f"patches.{name}": x for name, x in self.patches.state().items()}
         if self.trained:
-            tensors |= checkpoint.of_optimisers(self.field_optimiser.parts)
             tensors["visits"] = self._visits.get_state()
-        return tensors, {}
+        return tensors, figures
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        """Restore what `result` and `state` returned."""
-        self.restore_result(tensors)
-        checkpoint.restore_optimisers(self.optimisers, tensors)
+        super().restore(tensors, figures)
         self.patches.restore(checkpoint.part(tensors, "patches."))
-        self.generator.set_state(tensors["generator"].cpu())
         if self.trained:
-            checkpoint.restore_optimisers(self.field_optimiser.parts, tensors)
             self._visits.set_state(tensors["visits"].cpu())

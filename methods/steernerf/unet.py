@@ -93,10 +93,8 @@ class UNet(nn.Module):
 
     def _picture(self, shown: Observation, correction: Tensor) -> Tensor:
         """The enlarged RGB [H, W, 3], with the `correction` [H', W', 3] of the part that is drawn.
-
         At the border of the part, the network reads zeros beyond. They change what it draws there
-        by less than a grey level, but such a line across a white background costs 0.01 of LPIPS.
-        """
+        by less than a grey level, but such a line across a white background costs 0.01 of LPIPS."""
         rgb = shown.frame.values[..., :3].permute(2, 0, 1)[None]
         size = [self.scale * side for side in rgb.shape[2:]]
         base = functional.interpolate(rgb, size, mode="bilinear", align_corners=True)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from statistics import mean, median
 
 import torch
 from torch import Tensor
@@ -63,12 +63,9 @@ class TrainingViews:
                     frame = self._render(camera, buffer, clock)
                 found.append(psnr(frame.rgb.cpu(), truth))
             self.pipeline.renderer.engine = None  # the network itself draws the frames before
-        return [
-            EngineFigures(
-                statistics.mean(found), statistics.median(map(_renderer_ms, clock.frames))
-            )
-            for found, clock in zip(quality, clocks, strict=True)
-        ]
+        of_renderer = [[_renderer_ms(frame) for frame in clock.frames] for clock in clocks]
+        of_each = zip(map(mean, quality), map(median, of_renderer), strict=True)
+        return [EngineFigures(*figures) for figures in of_each]
 
     def _spread(self, count: int, label: str) -> Iterator[tuple[int, Camera, Buffer]]:
         """Numbers and cameras of `count` views, evenly spread, and the frames before each: L + 1 of

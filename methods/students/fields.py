@@ -84,12 +84,10 @@ class FieldStudent(Student):
         return self.teacher.training.sampling(budget)
 
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> StudentTraining:
-        """Make the training of a new field."""
         self.occupancy = self.occupied(teacher)
         return StudentTraining(self, self.new_field(), teacher, scene, budget)
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Load a field, and where it is occupied."""
         self.occupancy = Occupancy(tensors["cells"].to(self.teacher.device))
         self.field = self.new_field()
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
@@ -100,20 +98,16 @@ class FieldStudent(Student):
         self.how = replace(self.sampling(budget), stop=self.stop)
 
     def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
-        """The occupied cells, and a march through them."""
         return self.occupancy, everywhere(self.field, self.occupancy, probe, self.how)
 
     def sizes(self) -> dict[str, int]:
-        """Bytes of the field and of the occupancy bits."""
         return self.field.sizes() | {"occupancy": self.occupancy.cells.numel() // 8}
 
 
 class StudentTraining(PixelTraining):
-    """Trains on points of the teacher, then on rays of the photos, within occupied cells.
-
-    On rays, samples that the teacher's density hides are left out: it costs less than the density
-    of a large network. The training follows the settings of `student`.
-    """
+    """Trains on points of the teacher, then on rays of the photos, within occupied cells. On rays,
+    samples that the teacher's density hides are left out: it costs less than the density of a large
+    network. The training follows the settings of `student`."""
 
     def __init__(
         self,
@@ -138,21 +132,22 @@ class StudentTraining(PixelTraining):
         """Take one step; return its mean squared error, of opacities and colours or of pixels."""
         if self.step >= self.points_until:
             return super().advance()
-        loss = self._difference(*self._places())
+        positions = self._places()
+        shape, device = positions.shape, positions.device
+        directions = torch.randn(shape, generator=self.generator, device=device)
+        loss = self._difference(positions, functional.normalize(directions, dim=1))
         loss.backward()
         errors = loop.look(self, {"": loss}, {"loss": loss})
         self._update()
         self.step += 1
         return errors
 
-    def _places(self) -> tuple[Tensor, Tensor]:
-        """Random points [S, 3] in occupied cells, and random view directions [S, 3]."""
+    def _places(self) -> Tensor:
+        """Random points [S, 3] in occupied cells."""
         count, device, generator = self.samples, self.cells.device, self.generator
         chosen = torch.randint(len(self.cells), (count,), generator=generator, device=device)
         jitter = torch.rand(count, 3, generator=generator, device=device)
-        directions = torch.randn(count, 3, generator=generator, device=device)
-        positions = (self.cells[chosen] + jitter) / self.occupancy.resolution
-        return positions, functional.normalize(directions, dim=1)
+        return (self.cells[chosen] + jitter) / self.occupancy.resolution
 
     def _difference(self, positions: Tensor, directions: Tensor) -> Tensor:
         """Mean squared difference in opacity over `REACH`, plus those in red, green and blue,
@@ -183,9 +178,7 @@ class StudentTraining(PixelTraining):
         return dict(self.field.named_parameters())
 
     def result(self) -> dict[str, Tensor]:
-        """The field, and the occupied cells."""
-        tensors = {f"field.{name}": value for name, value in self.field.state_dict().items()}
-        return tensors | {"cells": self.occupancy.cells}
+        return self.field.state_dict(prefix="field.") | {"cells": self.occupancy.cells}
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
         self.field.load_state_dict(checkpoint.part(tensors, "field."))

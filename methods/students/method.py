@@ -23,14 +23,14 @@ from methods.kernels.types import Occupancy, expect
 from methods.rendering.frame import Render, render_frame
 from methods.training import checkpoint, loop
 
+IN_FP32 = {"field_precision": "fp32"}
+"""`Student.computed` of a model whose products are of float32, whatever those of its teacher."""
+
 
 @dataclass(kw_only=True, eq=False)
 class Student(ABC):
-    """Base of the methods that start from the Instant-NGP field that all methods share.
-
-    `train_s` counts the training of the field, the initialisation of the model and its own
-    training.
-    """
+    """Base of the methods that start from the Instant-NGP field that all methods share. `train_s`
+    counts the training of the field, the initialisation of the model and its own training."""
 
     teacher: Setup  # the field that it starts from, and where it runs
     training: PixelOptions  # how the model is trained
@@ -40,6 +40,8 @@ class Student(ABC):
 
     memory = 0
     kind: ClassVar[str]  # name of its trained stage, for example "nerf"
+    model: ClassVar[tuple[str, ...]] = ()  # its settings that its training depends on
+    computed: ClassVar[Mapping[str, str]] = {}  # what rows say of it but not of its teacher
     study = Study(
         knobs={"stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3"))},
         exact=("method.stop=1e-4",),
@@ -51,10 +53,6 @@ class Student(ABC):
         check_stop(self.stop)
         expect(self.steps is None or self.steps >= 1, "steps", "1 or more, or none", self.steps)
         self.train_s = 0.0
-
-    def model_settings(self) -> Mapping[str, object]:
-        """The settings of the model that its training depends on."""
-        return {}
 
     @abstractmethod
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> loop.Training:
@@ -74,18 +72,23 @@ class Student(ABC):
 
     @torch.no_grad()
     def render(self, camera: Camera, probe: Probe) -> Frame:
-        """Render one frame at the camera's full resolution."""
         camera = place_camera(camera, self.teacher.device)
         occupancy, render = self.renderer(probe)
         return render_frame(camera, occupancy, self.background, probe, render).picture()
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
-        """Train the field and the model, or load their results if they were trained before."""
         budget = replace(budget, renderer_steps=self.steps or budget.renderer_steps)
         with torch_threads(budget.threads):
             teacher = train_field(self.teacher, scene, budget, log)
-            folder = log.stage_dir(self.kind, self._key(scene, budget))
-            finished = folder / f"{self.kind}.safetensors"
+            settings = asdict(self)
+            key = {
+                "field": self.teacher.key(scene, budget),
+                "steps": budget.renderer_steps,
+                "model": {name: settings[name] for name in self.model},
+                "training": settings["training"],
+                **computed_by(type(self)),
+            }
+            finished = log.stage_dir(self.kind, key) / f"{self.kind}.safetensors"
             begin = partial(self.begin, teacher, scene, budget)
             tensors, seconds = loop.trained(begin, finished, self.kind, log)
             with checkpoint.restoring(finished):
@@ -93,19 +96,8 @@ class Student(ABC):
         self.train_s = teacher.train_s + seconds
         self.background = scene.background.to(self.teacher.device)
 
-    def _key(self, scene: Scene, budget: Budget) -> dict[str, object]:
-        """Everything the trained model depends on."""
-        return {
-            "field": self.teacher.key(scene, budget),
-            "steps": budget.renderer_steps,
-            "model": self.model_settings(),
-            "training": asdict(self.training),
-            **computed_by(type(self)),
-        }
-
     def reset(self) -> None:  # noqa: B027 (no student has anything to forget)
         """Do nothing: every frame stands alone."""
 
     def settings(self) -> dict[str, str]:
-        """What a row says of how it ran."""
-        return self.teacher.settings(type(self))
+        return {**self.teacher.settings(type(self)), **self.computed}

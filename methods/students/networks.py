@@ -23,11 +23,8 @@ def positional(
     values: Tensor, frequencies: int, *, identity: bool = True, scale: float = math.pi
 ) -> Tensor:
     """Sines and cosines of `values` [S, C], at frequencies 2^0 to 2^(F - 1) times `scale`, the
-    lowest first: [S, C (2 F + identity)].
-
-    Mildenhall et al. (2020), Eq. 4; the release has no pi (`scale` 1) and puts the values
-    themselves in front (`identity`).
-    """
+    lowest first: [S, C (2 F + identity)]. Mildenhall et al. (2020), Eq. 4; the release has no pi
+    (`scale` 1) and puts the values themselves in front (`identity`)."""
     angles = scale * values
     sine, cosine = angles.sin(), angles.cos()
     parts = [values] if identity else []
@@ -67,7 +64,6 @@ class Dense(nn.Linear):
             self.bias.zero_()
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Map [S, I] to [S, O]."""
         return self.forward_with(inputs, self.weight, self.bias)
 
     def forward_with(self, inputs: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -104,11 +100,9 @@ class NetworkField(StudentField):
 
 
 def density_of(raw: Tensor) -> Tensor:
-    """ReLU of a density network's output; where the result is 0, a loss can still raise it.
-
-    With the gradient of plain ReLU, a network that once gives 0 everywhere, as it may after its
-    first steps among mostly empty samples, stays at 0 forever.
-    """
+    """ReLU of a density network's output; where the result is 0, a loss can still raise it. With
+    the gradient of plain ReLU, a network that once gives 0 everywhere, as it may after its first
+    steps among mostly empty samples, stays at 0 forever."""
     return _RisingRelu.apply(raw)
 
 

@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -28,15 +28,19 @@ Asked = Callable[[], dict[str, float]]
 class Training(Protocol):
     """What the loop drives."""
 
+    advice: ClassVar[str]  # what to try if the training breaks down
     steps: int  # how many there are in all
-    step: int  # how many are done
-    seconds: float  # the time they took, over all the processes the training was continued in
-    advice: str  # what to try if the training breaks down
-    asked: Asked | None  # the errors that `look` requested last; None at first
+    step: int = 0  # how many are done
+    seconds: float = 0.0  # the time they took, over all the processes the training was continued in
+    asked: Asked | None = None  # the errors that `look` requested last
+    generator: torch.Generator
 
     def advance(self) -> Mapping[str, float]:
         """Take one step; return what `look` returns, the mean squared errors to show by label (""
         for the main one)."""
+
+    def optimisers(self) -> checkpoint.Optimisers:
+        """The optimisers, which a checkpoint keeps."""
 
     def watched(self) -> Mapping[str, Tensor]:
         """The tensors that must be finite in a good state, by name."""
@@ -49,9 +53,14 @@ class Training(Protocol):
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
         """What a checkpoint must hold, besides the result, to go on as if never stopped."""
+        tensors = checkpoint.of_optimisers(self.optimisers())
+        return tensors | {"generator": self.generator.get_state()}, {}
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
         """Restore result and state."""
+        self.restore_result(tensors)
+        checkpoint.restore_optimisers(self.optimisers(), tensors)
+        self.generator.set_state(tensors["generator"].cpu())
 
 
 def trained(
@@ -121,10 +130,8 @@ def _drive(
 
 
 def save(training: Training, path: Path, done: bool = False) -> None:
-    """Write the result and, unless `done`, the state.
-
-    Something that is not finite raises `SteerbenchError` and leaves the last good file alone.
-    """
+    """Write the result and, unless `done`, the state. Something that is not finite raises
+    `SteerbenchError` and leaves the last good file alone."""
     check_finite(training)
     more, figures = training.state()
     figures |= {"step": training.step, "seconds": training.seconds}
@@ -152,11 +159,9 @@ def look(
     training: Training, errors: Mapping[str, Tensor], tensors: Mapping[str, Tensor]
 ) -> dict[str, float]:
     """Return the `errors` of a step as numbers; raise `SteerbenchError` if one is not finite, with
-    the names of the `tensors` that are not.
-
-    On a GPU this happens every `LOOK_EVERY` steps, with the errors that were requested the time
-    before, which have arrived meanwhile; in all other steps there are none.
-    """
+    the names of the `tensors` that are not. On a GPU this happens every `LOOK_EVERY` steps, with
+    the errors that were requested the time before, which have arrived meanwhile; in all other steps
+    there are none."""
     on_cpu = all(error.device.type == "cpu" for error in errors.values())
     if not on_cpu and training.step % LOOK_EVERY:
         return {}
@@ -195,10 +200,8 @@ def check_finite(training: Training, more: Mapping[str, Tensor] | None = None) -
 
 
 def cosine(done: float, final: float, half_waves: int = 1) -> float:
-    """Share of the learning rate left after a share `done` of the steps: from 1 to `final`.
-
-    One half wave falls all the way; three fall, rise to 1 again, and fall.
-    """
+    """Share of the learning rate left after a share `done` of the steps: from 1 to `final`. One
+    half wave falls all the way; three fall, rise to 1 again, and fall."""
     return final + (1 - final) * 0.5 * (1 + math.cos(half_waves * math.pi * done))
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.cameras import cast
+from bench.cameras import cast, look_at
 from bench.console import ConsoleLog
 from bench.types import Camera, Log, NullProbe, Scene, Split
 from methods.instant_ngp.field import HashField
@@ -40,15 +40,9 @@ def ball(camera: Camera) -> Tensor:
 
 def look_at_the_middle(turn: float, lift: float) -> Camera:
     """A camera at a distance of 1.6 from the middle of the unit cube."""
-    angle = 2 * math.pi * turn
-    away = torch.tensor(
-        [math.cos(angle) * math.cos(lift), math.sin(angle) * math.cos(lift), math.sin(lift)]
-    )
-    right = torch.nn.functional.normalize(
-        torch.linalg.cross(-away, torch.tensor([0.0, 0.0, 1.0])), dim=0
-    )
-    down = torch.linalg.cross(-away, right)
-    c2w = torch.stack((right, down, -away, 0.5 + 1.6 * away), dim=1)
+    angle, out = 2 * math.pi * turn, math.cos(lift)
+    away = torch.tensor([math.cos(angle) * out, math.sin(angle) * out, math.sin(lift)])
+    c2w = look_at(0.5 + 1.6 * away, torch.full((3,), 0.5), torch.tensor([0.0, 0.0, 1.0]))
     return Camera(c2w, 40.0, 40.0, SIZE / 2, SIZE / 2, SIZE, SIZE)
 
 

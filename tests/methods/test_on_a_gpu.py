@@ -42,12 +42,7 @@ from methods.students.fields import StudentField
 from methods.training import loop
 from tests.conftest import QUICK
 from tests.methods.conftest import Work
-from tests.methods.models import (
-    small_joint,
-    small_model,
-    small_motion,
-    small_rendering,
-)
+from tests.methods.models import small_joint, small_model, small_motion, small_rendering
 from tests.methods.small_students import extraction
 from tests.methods.trainings import killed
 from tests.methods.usual import field_options, lessons, new_gaussians, new_ngp, usual
@@ -75,6 +70,7 @@ def steernerf(field: str, **others: Any) -> Method:
         "renderer": partial(UNet, width=4),
         "joint": small_joint(field=field, jitter=True, grid_samples=512, **FEW),
         "engine": TorchEngine(),
+        **{"name": "steernerf", "precision": "bf16", "seed": 0, "steps": None, "after": 1.0},
     }
     return SteerNerf(**given | others)
 

@@ -25,13 +25,7 @@ from steerbench_worker import serve
 
 class NerfBaselines:
     def __init__(
-        self,
-        id,
-        backend="python",
-        presets=None,
-        overrides=None,
-        iterations=None,
-        weights=None,
+        self, id, backend="python", presets=None, overrides=None, iterations=None, weights=None
     ):
         self.name, self.backend, self.presets = id, backend, presets
         self.overrides, self.iterations, self.weights = overrides or {}, iterations, weights

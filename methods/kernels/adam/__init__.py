@@ -51,10 +51,8 @@ class AdamState:
 
 @cache
 def corrections() -> Tensor:
-    """The bias corrections 1 / (1 - beta^n) of both `BETAS` for n = 0 (unused), 1, ...: [2, N].
-
-    The table ends where float32 rounds both to 1.
-    """
+    """The bias corrections 1 / (1 - beta^n) of both `BETAS` for n = 0 (unused), 1, ...: [2, N]. The
+    table ends where float32 rounds both to 1."""
     last = math.ceil(math.log(2.0**-25) / math.log(max(BETAS)))
     powers = torch.tensor(BETAS, dtype=torch.float64)[:, None] ** torch.arange(last + 1)
     return (1 / (1 - powers)).float()
@@ -63,10 +61,8 @@ def corrections() -> Tensor:
 def sparse_adam_(
     table: Tensor, grad: Tensor, state: AdamState, rate: float, *, backend: str = "auto"
 ) -> None:
-    """Update in place the entries of `table` [entries, F] with a non-zero `grad`; clear `grad`.
-
-    The bias correction uses the entry's own step count.
-    """
+    """Update in place the entries of `table` [entries, F] with a non-zero `grad`; clear `grad`. The
+    bias correction uses the entry's own step count."""
     check_shape("grad", grad, *table.shape)
     _check(table, state)
     implementation(__name__, backend, table.device).sparse_adam_(table, grad, state, rate)
@@ -83,9 +79,7 @@ def hash_adam_(
     backend: str = "auto",
 ) -> None:
     """`sparse_adam_` for the hash table of `grid`, with the sum of its `gradients`; clear them.
-
-    `packed`, the bfloat16 copy of the table (`encode.pack`), is updated, too, if given.
-    """
+    `packed`, the bfloat16 copy of the table (`encode.pack`), is updated, too, if given."""
     check_shape("table", table, grid.entries, grid.features)
     _check(table, state)
     if packed is not None:

@@ -86,11 +86,9 @@ def _update_levels(positions, grad, shapes, tables, how, workers):
 
 @jit(error_model="numpy")
 def _entries(a, b, features, grad, own, how):
-    """Update the entries from `a` to `b`, at most `CHUNK`, and clear their gradient.
-
-    All arrays are flat: `grad`; `own`, which are table, moments, steps and packed copy, the latter
-    empty if there is none. `how` are the bias corrections and the rate.
-    """
+    """Update the entries from `a` to `b`, at most `CHUNK`, and clear their gradient. All arrays are
+    flat: `grad`; `own`, which are table, moments, steps and packed copy, the latter empty if there
+    is none. `how` are the bias corrections and the rate."""
     table, first, second, steps, packed = own
     to1, to2, rate = how
     touched = np.empty(CHUNK, np.uint32)

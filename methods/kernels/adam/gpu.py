@@ -71,9 +71,7 @@ def _update(
     table, grad, first, second, steps, packed, known, last, rate, entries, FEATURES: tl.constexpr
 ):
     """`last` is the largest number of steps in `known`, the corrections; `packed` is of bfloat16.
-
-    `FEATURES` is known at compile time, so that a lane can load two or four at once.
-    """
+    `FEATURES` is known at compile time, so that a lane can load two or four at once."""
     WIDTH: tl.constexpr = triton.next_power_of_2(FEATURES)
     ROWS: tl.constexpr = BLOCK // WIDTH
     entry = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)

@@ -61,9 +61,7 @@ def weights(
     backend: str = "auto",
 ) -> Tensor:
     """The weights [S] that `composite` gives to samples, computed without values. No gradient.
-
-    `front` [R] is the transmittance in front of each ray's first sample; None: 1.
-    """
+    `front` [R] is the transmittance in front of each ray's first sample; None: 1."""
     front = _light(sigma, intervals, front)
     kernel = implementation(__name__, backend, sigma.device)
     return kernel.weights(sigma.detach(), intervals, stop, front)
@@ -78,11 +76,8 @@ def visible(
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
     """How many samples of each ray get a weight from `composite`, [R] int64, and the transmittance
-    behind them, [R]. No gradient.
-
-    They are the first samples of the ray; those behind have neither weight nor gradient. `front`
-    is as for `weights`.
-    """
+    behind them, [R]. No gradient. They are the first samples of the ray; those behind have neither
+    weight nor gradient. `front` is as for `weights`."""
     front = _light(sigma, intervals, front)
     kernel = implementation(__name__, backend, sigma.device)
     return kernel.visible(sigma.detach(), intervals, stop, front)

@@ -83,8 +83,7 @@ def _intervals(given: Given) -> Intervals:
 
 def _composite(given: Given, backend: str) -> tuple[Tensor, ...]:
     how = {"stop": given["stop"], "carry": given["carry"], "backend": backend}
-    pixels = composite(given["sigma"], given["values"], _intervals(given), **how)
-    return pixels.values, pixels.depth_sum, pixels.alpha
+    return composite(given["sigma"], given["values"], _intervals(given), **how).columns
 
 
 def _light(given: Given, backend: str) -> tuple[Tensor, ...]:

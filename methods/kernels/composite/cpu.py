@@ -54,11 +54,10 @@ class _Composite(torch.autograd.Function):
         samples = [x.contiguous() for x in (sigma, values, t, delta, offsets)]
         learns = any(ctx.needs_input_grad)
         opacity = torch.empty(len(sigma) if learns else 0, dtype=torch.float64)
-        outputs = pixels.values, pixels.depth_sum, pixels.alpha
-        _forward(*arrays(*samples), f32(stop), *arrays(front, *outputs, opacity))
+        _forward(*arrays(*samples), f32(stop), *arrays(front, *pixels.columns, opacity))
         ctx.save_for_backward(*samples[1:], front, opacity)
         ctx.stop = stop
-        return pixels.values, pixels.depth_sum, pixels.alpha
+        return pixels.columns
 
     @staticmethod
     def backward(ctx, *grads):

@@ -57,11 +57,11 @@ class _TritonComposite(torch.autograd.Function):
         pixels = Pixels.blank(rays, channels, sigma.device) if carry is None else carry.copy()
         front = 1 - pixels.alpha
         samples = [x.contiguous() for x in (sigma, values, t, delta, offsets)]
-        outputs = pixels.values, pixels.depth_sum, pixels.alpha
-        launch(_forward, (rays,), *samples, front, stop, *outputs, CHANNELS=channels, num_warps=1)
+        given = *samples, front, stop, *pixels.columns
+        launch(_forward, (rays,), *given, CHANNELS=channels, num_warps=1)
         ctx.save_for_backward(*samples, front)
         ctx.stop = stop
-        return outputs
+        return pixels.columns
 
     @staticmethod
     def backward(ctx, *grads):
@@ -75,10 +75,8 @@ class _TritonComposite(torch.autograd.Function):
 
 @triton.jit
 def _thickness(sigma, delta, i, there):
-    """Optical thickness of samples, at most `OPAQUE`; NaN stays NaN.
-
-    A sample of length 0 has thickness 0 even at infinite density (avoids inf * 0).
-    """
+    """Optical thickness of samples, at most `OPAQUE`; NaN stays NaN. A sample of length 0 has
+    thickness 0 even at infinite density (avoids inf * 0)."""
     length = tl.load(delta + i, mask=there, other=0.0)
     tau = tl.load(sigma + i, mask=there, other=0.0) * length
     tau = tl.where(tau > OPAQUE, OPAQUE, tau)
@@ -87,11 +85,8 @@ def _thickness(sigma, delta, i, there):
 
 @triton.jit
 def _block(sigma, delta, first, i, inside, light, stop):
-    """Weights of the samples `i`, the first of which is `first`.
-
-    Also which of them still get light, the transmittance behind each, and that behind all. No
-    sample behind a NaN gets light.
-    """
+    """Weights of the samples `i`, the first of which is `first`. Also which of them still get
+    light, the transmittance behind each, and that behind all. No sample behind a NaN gets light."""
     in_front = _thickness(sigma, delta, i - 1, inside & (i > first))
     tau = _thickness(sigma, delta, i, inside)
     before = light * tl.exp(-tl.cumsum(in_front, 0))

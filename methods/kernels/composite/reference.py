@@ -14,16 +14,12 @@ def composite(
     slots = _padded_rays(intervals)
     front = sigma.new_ones(len(slots[0])) if carry is None else 1 - carry.alpha
     weight = _padded_weights(sigma, intervals.delta, slots, stop, front)
-    rays = Pixels(
+    sums = (
         (weight[..., None] * _padded(values, slots)).sum(dim=1),
         (weight * _padded(intervals.t, slots)).sum(dim=1),
         weight.sum(dim=1),
     )
-    if carry is None:
-        return rays
-    return Pixels(
-        carry.values + rays.values, carry.depth_sum + rays.depth_sum, carry.alpha + rays.alpha
-    )
+    return Pixels(*(sums if carry is None else map(torch.add, carry.columns, sums)))
 
 
 def weights(sigma: Tensor, intervals: Intervals, stop: float, front: Tensor) -> Tensor:

@@ -64,9 +64,7 @@ def _launch(
 @cache
 def _level_arrays(grid: HashGrid, device: torch.device) -> tuple[Tensor, Tensor]:
     """Scales [levels]; vertices along an axis (0: hashed), first entry, entries: [levels, 3].
-
-    Cached, because each copy to the device would synchronise.
-    """
+    Cached, because each copy to the device would synchronise."""
     shapes = list(zip(grid.strides, grid.offsets, grid.sizes, strict=False))
     scales = torch.tensor(grid.scales, dtype=torch.float32, device=device)
     return scales, torch.tensor(shapes, dtype=torch.int64, device=device)

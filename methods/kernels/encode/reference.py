@@ -31,13 +31,9 @@ def corners(positions: Tensor, grid: HashGrid, level: int) -> tuple[Tensor, Tens
     corner = torch.arange(8, device=positions.device)
     bits = corner[:, None] >> torch.arange(3, device=positions.device) & 1  # [8, 3]
     weights = torch.where(bits.bool(), fraction, 1 - fraction).prod(dim=-1)
-    return grid.offsets[level] + _entry(cell.long()[:, None] + bits, grid, level), weights
-
-
-def _entry(vertex: Tensor, grid: HashGrid, level: int) -> Tensor:
-    """Table entry, within its level, of integer grid vertices [..., 3]."""
-    x, y, z = vertex.unbind(dim=-1)
+    x, y, z = (cell.long()[:, None] + bits).unbind(dim=-1)  # vertices
     if res := grid.strides[level]:
-        return (x + y * res + z * res**2) % grid.sizes[level]
-    hashed = x * PRIMES[0] ^ (y * PRIMES[1] & 0xFFFFFFFF) ^ (z * PRIMES[2] & 0xFFFFFFFF)
-    return hashed % grid.sizes[level]
+        entry = x + y * res + z * res**2
+    else:
+        entry = x * PRIMES[0] ^ (y * PRIMES[1] & 0xFFFFFFFF) ^ (z * PRIMES[2] & 0xFFFFFFFF)
+    return grid.offsets[level] + entry % grid.sizes[level], weights

@@ -81,10 +81,7 @@ def extents(
     backend: str = "auto",
 ) -> list[Extent]:
     """How many samples `march` finds in each batch of `size` rays, in order, without `jitter`,
-    `start` and `limit`.
-
-    The host waits for a GPU, once.
-    """
+    `start` and `limit`. The host waits for a GPU, once."""
     kernel = implementation(__name__, backend, rays.origins.device)
     counts = kernel.count(_segments(rays, step, window, None, None, None), occupancy)
     return Extent.of_each(functional.pad(counts, (0, -len(counts) % size)).view(-1, size))

@@ -79,10 +79,8 @@ def _launch(arguments: list[Any], *outputs: Tensor | None) -> None:
 
 @triton.jit
 def _leave_slab(origin, slope, cell, free, width):
-    """t at which a ray leaves, along one axis, the cells known to be empty around `cell`.
-
-    These are the cell itself or, if `free` is not 0, the cells within that clearance in bricks.
-    """
+    """t at which a ray leaves, along one axis, the cells known to be empty around `cell`. These are
+    the cell itself or, if `free` is not 0, the cells within that clearance in bricks."""
     brick = cell >> 2
     first = tl.where(free == 0, cell, (brick - free + 1) << 2)
     end = tl.where(free == 0, cell + 1, (brick + free) << 2)

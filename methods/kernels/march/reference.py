@@ -62,23 +62,17 @@ class _Steps:
 
     def taken(self, occupancy: Occupancy) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """For each batch of rays: which steps are samples [R, most], counts [R], resume [R]."""
-        rays = torch.arange(len(self.near), device=self.near.device)
-        k = torch.arange(self.most, device=self.near.device)
+        rays = torch.arange(len(self.near), device=self.near.device)[:, None]
+        k, limit = torch.arange(self.most, device=self.near.device), self.segments.limit
         for ray in rays.split(BLOCK):
-            yield self._taken(ray[:, None], k, occupancy)
-
-    def _taken(self, ray: Tensor, k: Tensor, occupancy: Occupancy) -> tuple[Tensor, Tensor, Tensor]:
-        t, positions = self.at(ray, k)  # [R, K], [R, K, 3]
-        candidate = self.alive[ray] & (t >= self.segments.window[ray, 0]) & (t < self.far[ray])
-        candidate &= k >= self.segments.start[ray]
-        candidate &= occupancy.holds(torch.where(candidate[..., None], positions, 0))
-
-        limit = self.segments.limit
-        kept = candidate & (candidate.cumsum(dim=1) <= limit)
-        per_ray = kept.sum(dim=1)
-        full = per_ray == limit
-        last = (kept * (k + 1)).amax(dim=1) if len(k) else per_ray
-        return kept, per_ray, torch.where(full, last, -1).int()
+            t, positions = self.at(ray, k)  # [R, K], [R, K, 3]
+            candidate = self.alive[ray] & (t >= self.segments.window[ray, 0]) & (t < self.far[ray])
+            candidate &= k >= self.segments.start[ray]
+            candidate &= occupancy.holds(torch.where(candidate[..., None], positions, 0))
+            kept = candidate & (candidate.cumsum(dim=1) <= limit)
+            counts = kept.sum(dim=1)
+            last = (kept * (k + 1)).amax(dim=1) if len(k) else counts
+            yield kept, counts, torch.where(counts == limit, last, -1).int()
 
 
 def clip(segments: Segments) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -29,11 +29,9 @@ MAX_CLEARANCE = 32  # upper limit of a clearance in bricks; beyond it a ray take
 
 @dataclass(frozen=True, eq=False)
 class Voxels:
-    """The non-empty cells (voxels) of a grid of G^3 over the unit cube, with their numbers.
-
-    A two-level tree with branching 8^3: a map of bricks of 8^3 cells, and the cells of the bricks
-    that contain any voxel. Both hold int32 numbers, -1 for empty.
-    """
+    """The non-empty cells (voxels) of a grid of G^3 over the unit cube, with their numbers. A
+    two-level tree with branching 8^3: a map of bricks of 8^3 cells, and the cells of the bricks
+    that contain any voxel. Both hold int32 numbers, -1 for empty."""
 
     coordinates: Tensor  # [V, 3] integers from 0 to G - 1, distinct (x, y, z); row v is voxel v
     resolution: int  # G, a multiple of 8, at most `MAX_RESOLUTION`
@@ -73,10 +71,8 @@ class Voxels:
 
     @cached_property
     def clearance(self) -> Tensor:
-        """Chebyshev distance in bricks to the nearest non-empty brick: [G/8, G/8, G/8] uint8.
-
-        0 in a non-empty brick, at most `MAX_CLEARANCE`.
-        """
+        """Chebyshev distance in bricks to the nearest non-empty brick: [G/8, G/8, G/8] uint8. 0 in
+        a non-empty brick, at most `MAX_CLEARANCE`."""
         near = (self.bricks >= 0)[None, None].float()
         clearance = torch.zeros_like(near)
         for _ in range(min(self.resolution // BRICK, MAX_CLEARANCE)):
@@ -87,10 +83,8 @@ class Voxels:
 
     @cached_property
     def masks(self) -> Tensor:
-        """Which cells of a brick are voxels: [B, 8] int64, one word per x, bit y * 8 + z.
-
-        The masks of a brick are in one cache line, whereas its `leaves` are in 32.
-        """
+        """Which cells of a brick are voxels: [B, 8] int64, one word per x, bit y * 8 + z. The masks
+        of a brick are in one cache line, whereas its `leaves` are in 32."""
         bits = torch.arange(BRICK**2, device=self.leaves.device)
         used = (self.leaves.view(-1, BRICK, BRICK**2) >= 0).long()
         return used.bitwise_left_shift(bits).sum(dim=2)
@@ -98,10 +92,8 @@ class Voxels:
 
 @dataclass(frozen=True)
 class Crossings(Intervals):
-    """Parts of R rays inside voxels, ray by ray, front to back.
-
-    `t` is the middle of each, `delta` its world length; see `Intervals`.
-    """
+    """Parts of R rays inside voxels, ray by ray, front to back. `t` is the middle of each, `delta`
+    its world length; see `Intervals`."""
 
     near: Tensor  # [S] t where the ray enters the voxel
     far: Tensor  # [S] t where it leaves; for touching voxels it equals `near` of the next one

@@ -84,10 +84,8 @@ def _lengths() -> Iterator[Case]:
 
 
 def _length_error(grid: str, given: Rays, backend: str, device: str, precision: str) -> float:
-    """Largest error of a ray's length in a voxel.
-
-    Infinite if crossings are not in order, or have gaps in the full grid.
-    """
+    """Largest error of a ray's length in a voxel. Infinite if crossings are not in order, or have
+    gaps in the full grid."""
     (rays, voxels), dtype = placed((given, _grid(grid)), device), DTYPES[precision]
     rays = Rays(rays.origins.to(dtype), rays.directions.to(dtype))
     found = walk(rays, voxels, backend=backend)

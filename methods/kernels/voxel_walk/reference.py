@@ -54,20 +54,14 @@ def _walk_block(origins: Tensor, directions: Tensor, voxels: Voxels) -> tuple[Te
         cell = torch.where(slope[:, axis, None] > 0, passed - 1, size - passed)
         still = (torch.nan_to_num(origins[:, axis]).clamp(0, 1) * size).long()
         cells.append(torch.where(parallel[:, axis, None], still[:, None], cell))
-    voxel = _look_up(torch.stack(cells, dim=-1).clamp(0, size - 1), voxels)
+    cell = torch.stack(cells, dim=-1).clamp(0, size - 1)
+    voxel = voxels.bricks[tuple((cell // BRICK).unbind(dim=-1))]
+    if len(voxels):
+        x, y, z = (cell % BRICK).unbind(dim=-1)
+        of_brick = voxels.leaves[voxel.clamp(min=0), (x * BRICK + y) * BRICK + z]
+        voxel = torch.where(voxel >= 0, of_brick, -1)
 
     kept = (voxel >= 0) & (leave > enter)
     place = kept.flatten().nonzero().squeeze(1)  # waits for a GPU once, not three times
     enter, leave, voxel = (x.flatten()[place] for x in (enter, leave, voxel))
     return enter, leave, voxel, kept.sum(dim=1)
-
-
-def _look_up(cells: Tensor, voxels: Voxels) -> Tensor:
-    """The voxels at `cells` [..., 3], -1 where there is none."""
-    brick = voxels.bricks[tuple((cells // BRICK).unbind(dim=-1))]
-    x, y, z = (cells % BRICK).unbind(dim=-1)
-    if not len(voxels):
-        return brick
-    return torch.where(
-        brick >= 0, voxels.leaves[brick.clamp(min=0), (x * BRICK + y) * BRICK + z], -1
-    )

@@ -41,15 +41,8 @@ class Network:
 
     model: bytes
 
-    @property
-    def num_inputs(self) -> int:
-        return len(onnx.load_from_string(self.model).graph.input)
-
     def get_input(self, index: int) -> SimpleNamespace:
-        tensor = onnx.load_from_string(self.model).graph.input[index]
-        axes = tensor.type.tensor_type.shape.dim
-        shape = tuple(-1 if axis.dim_param else axis.dim_value for axis in axes)
-        return SimpleNamespace(name=tensor.name, shape=shape)
+        return SimpleNamespace(name=onnx.load_from_string(self.model).graph.input[index].name)
 
 
 class Builder:

@@ -14,10 +14,7 @@ from bench.scenes.assemble import hold_out
 from bench.study import Variant
 from bench.types import Budget, NullProbe, SteerbenchError
 from methods.gaussians import ply
-from tests.methods.external.conftest import ROOT
 from tests.methods.gaussians.test_ply import some
-from tests.methods.trainings import GRID, QUICK
-from tests.methods.usual import new_ngp
 
 BUDGET = Budget("test", steps=7, samples=9)
 
@@ -232,53 +229,6 @@ def test_a_training_that_failed_leaves_nothing_to_load(
     with pytest.raises(SteerbenchError, match="ValueError: too bad"):
         external(worker(STORES + fails, after="serve(Stores)\n")).fit(tiny_scene, BUDGET, quiet_log)
     assert [path.name for path in tmp_path.glob("outputs/stages/external-*/*")] == ["lock"]
-
-
-# Our own renderers in another process
-
-
-def test_instant_ngp_renders_the_same_in_another_process(
-    worker, external, ball_scene, quiet_log, tmp_path
-):
-    before = f"""
-    import sys
-    sys.path.insert(1, {str(ROOT)!r})
-
-    import numpy as np
-    import torch
-
-    from bench.console import ConsoleLog
-    from bench.scenes import blender
-    from bench.types import Budget, Camera, NullProbe
-    from steerbench_worker import serve
-    from tests.methods.trainings import GRID, QUICK
-    from tests.methods.usual import new_ngp
-
-    class Ngp:
-        device = "cpu"
-
-        def fit(self, job):
-            log = ConsoleLog(job.state, quiet=True)
-            scene = blender.load(job.scene, bounds=job.bounds, log=log)
-            self.method = new_ngp(grid=GRID, training=QUICK, device="cpu")
-            self.method.fit(scene, Budget("b", steps=job.steps, samples=job.samples), log)
-
-        def render(self, camera):
-            pose = torch.from_numpy(camera.c2w)
-            pose[:, 3] = (pose[:, 3] + 1.5) / 3
-            lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
-            return self.method.render(Camera(pose.float(), *lens), NullProbe()).rgb
-    """
-    cube = torch.tensor([[0.0] * 3, [1.0] * 3])
-    scene = replace(ball_scene, origin=torch.full((3,), -1.5), unit_length=3.0, bounds=cube)
-    budget = Budget("test", steps=8, samples=2048)
-    inside = new_ngp(grid=GRID, training=QUICK, device="cpu")
-    outside = external(worker(before=before, after="serve(Ngp)\n"))
-    for method in (inside, outside):
-        method.fit(scene, budget, quiet_log)
-    for camera in scene.splits["test"].cameras:
-        expected = inside.render(camera, NullProbe()).rgb
-        assert torch.equal(outside.render(camera, NullProbe()).rgb, expected)
 
 
 def test_a_ply_file_is_rendered_without_its_data_set(external, moved_scene, tmp_path, quiet_log):

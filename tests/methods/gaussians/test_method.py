@@ -46,10 +46,3 @@ def test_sizes_are_those_of_what_is_stored(ball_scene, shared_log):
     assert plain.sizes() == {"gaussians": 400 * 59 * 4}
     assert small.sizes()["gaussians"] < plain.sizes()["gaussians"] / 3.5
     assert abs(quality(small, ball_scene) - quality(plain, ball_scene)) < 0.5
-
-
-@pytest.mark.parametrize("wrong", [{"count": 0}, {"degree": 4}, {"stop": 1.0}, {"stored": "fp8"}])
-def test_wrong_settings_are_refused(wrong):
-    (name,) = wrong
-    with pytest.raises(ValueError, match=f"^{name}: expected"):
-        new_gaussians(grid=GRID, training=QUICK, **wrong)

@@ -193,19 +193,6 @@ def test_pictures_that_do_not_overlap_are_refused(ball_scene):
         new_training(replace(ball_scene, splits={"train": alone}))
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        *(("rate", 0.0), ("final_rate", 2.0), ("opacity_entropy", -1.0), ("max_rays", 1)),
-        *(("rays", 1), ("by_error", 1.0), ("march_step", 0.0), ("share", 0.0), ("share", 1.5)),
-        *(("grid_samples", 1), ("stop", 1.0), ("thin", -1.0)),
-    ],
-)
-def test_options_that_make_no_sense_are_refused(name, value):
-    with pytest.raises(ValueError, match=f"^{name}: expected"):
-        field_options(**{name: value})
-
-
 def test_a_checkpoint_that_cannot_be_written_says_so(tmp_path):
     with pytest.raises(SteerbenchError, match=r"gone.*cannot write the checkpoint"):
         checkpoint.write(tmp_path / "gone" / "field.safetensors", {}, {})

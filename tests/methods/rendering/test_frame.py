@@ -11,7 +11,6 @@ from methods.instant_ngp.field import HashField
 from methods.kernels.march import march
 from methods.kernels.types import Occupancy
 from methods.rendering import frame as rendering
-from methods.rendering.batch import render_batch
 from methods.rendering.frame import everywhere, rays_at_matter, render_frame, render_rays
 from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import FAINT, Sampling
@@ -78,20 +77,6 @@ def test_a_window_is_that_of_its_pixel(cloud):
     torch.testing.assert_close(half.alpha[:, 16:], whole.alpha[:, 16:], rtol=0, atol=1e-6)
 
 
-def test_rounds_render_what_one_go_renders(cloud, device):
-    field, occupancy = cloud
-    rays = cast(place_camera(look_at_the_middle(0.1, 0.4), device))
-    half = torch.full((len(rays.origins),), 0.5, device=device)
-    with torch.no_grad():
-        whole, _ = render_batch(field, rays, occupancy, Sampling(), jitter=half)
-    rounds = render_rays(field, rays, occupancy, NullProbe(), Sampling())
-    assert whole.alpha.max() > 0.5
-    # Both end a ray at the same transmittance; sums are added up in another grouping.
-    torch.testing.assert_close(rounds.values, whole.values, rtol=0, atol=1e-4)
-    torch.testing.assert_close(rounds.depth_sum, whole.depth_sum, rtol=0, atol=3e-4)
-    torch.testing.assert_close(rounds.alpha, whole.alpha, rtol=0, atol=1e-4)
-
-
 def test_at_once_rays_look_as_in_rounds(cloud, device, monkeypatch):
     field, occupancy = cloud
     rays = cast(place_camera(look_at_the_middle(0.1, 0.4), device))
@@ -104,7 +89,8 @@ def test_at_once_rays_look_as_in_rounds(cloud, device, monkeypatch):
     rounds, rounds_of_chunks, once, chunks = found
     assert 0.2 < rounds.alpha.max() < 1
     for name in ("values", "depth_sum", "alpha"):
-        # As in `test_rounds_render_what_one_go_renders`: a chunk has rounds of its own.
+        # All end a ray at the same transmittance; sums are added up in another grouping, as a chunk
+        # has rounds of its own.
         a, b, c, d = (getattr(x, name) for x in (rounds, rounds_of_chunks, once, chunks))
         torch.testing.assert_close(a, b, rtol=0, atol=3e-4)
         torch.testing.assert_close(a, c, rtol=0, atol=3e-4)

@@ -17,7 +17,6 @@ from methods.rendering.frame import FeatureFrame, everywhere, render_frame
 from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import Sampling
 from methods.steernerf.buffer import RELIABLE_ALPHA, PointCloud
-from methods.steernerf.options import RangeReduction
 from tests.methods.conftest import Work, look_at_the_middle
 from tests.methods.solids import Solid, ball, wall
 
@@ -126,7 +125,7 @@ def render(field: Solid, interval: Tensor | None = None) -> tuple[FeatureFrame, 
     """The frame, in the interval [h, w, 2] or everywhere, and how many samples it took."""
     probe, how = Work(), Sampling(step=4 * STEP)
     if interval is not None:
-        how = how.within(interval.view(-1, 2))
+        how = replace(how, window=interval.view(-1, 2))
     by = everywhere(field, EVERYWHERE, probe, how)
     return render_frame(along_x(), EVERYWHERE, torch.ones(4), probe, by), probe.done["samples"]
 
@@ -161,9 +160,3 @@ def test_the_interval_is_that_of_the_pixel_alone_and_everything_where_nothing_is
     torch.testing.assert_close(middle, frame.depth[seen], rtol=0, atol=1e-5)
     width = interval[seen].diff(dim=-1).squeeze(-1)
     torch.testing.assert_close(width, torch.full_like(width, 2 * EPSILON), rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("epsilon", [0.0, -1.0, math.nan])
-def test_an_interval_has_a_width(epsilon):
-    with pytest.raises(ValueError, match=r"range\.epsilon: expected more than 0, got"):
-        RangeReduction("paper", epsilon, "sum")

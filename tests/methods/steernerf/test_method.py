@@ -45,6 +45,7 @@ def new_method(
         after=after,
         steps=steps,
         device=device,
+        **{"name": "steernerf", "precision": "bf16", "backend": "auto", "seed": 0},
     )
 
 

@@ -92,23 +92,6 @@ def test_range_reduction_reprojects_the_depth_that_it_is_told_to():
     assert not torch.equal(expected, values(buffer[0], "sum"))
 
 
-@pytest.mark.parametrize(
-    ("name", "least", "most"), [("channels", 3, 256), ("frames", 0, 64), ("scale", 1, 64)]
-)
-def test_sizes_that_make_no_frame_are_refused(name, least, most):
-    for wrong in (least - 1, most + 1):
-        with pytest.raises(ValueError, match=f"{name}: expected {least} to {most}, got {wrong}"):
-            small_model(**{name: wrong})
-
-
-@pytest.mark.parametrize("make", [small_model, small_rendering])
-def test_a_step_has_a_length_and_a_stop_lets_something_through(make):
-    with pytest.raises(ValueError, match=r"^step: expected a length of more than 0, got 0\.0"):
-        make(step=0.0)
-    with pytest.raises(ValueError, match=r"stop: expected a transmittance .* got 1\.0"):
-        make(stop=1.0)
-
-
 def samples(**others) -> int:
     """How many samples a frame takes."""
     probe = Work()

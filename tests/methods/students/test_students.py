@@ -3,11 +3,8 @@ is found again; they learn a ball; wrong settings are refused."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -15,14 +12,8 @@ import torch
 from bench.types import Log, NullProbe, Scene
 from methods.instant_ngp.stage1 import train_field
 from methods.training import loop
-from tests.methods.small_students import SMALL, budget, extraction, fitted
-from tests.methods.trainings import (
-    EXACT_TEACHER,
-    PIXEL,
-    goes_on_after_a_kill,
-    shows_the_ball,
-)
-from tests.methods.usual import lessons
+from tests.methods.small_students import SMALL, budget, fitted
+from tests.methods.trainings import EXACT_TEACHER, PIXEL, goes_on_after_a_kill, shows_the_ball
 
 names = pytest.mark.parametrize("name", SMALL)
 
@@ -86,36 +77,3 @@ def test_a_row_names_what_its_own_products_are_computed_in(name: str) -> None:
     computed = teacher.settings(object)["field_precision"] if as_teacher else "fp32"
     assert (shown["engine"], shown["precision"]) == ("none", "none")
     assert shown["field_precision"] == computed
-
-
-REFUSED: list[tuple[Callable[..., Any], str, Any]] = [
-    *((make, "stop", 1.0) for make in SMALL.values()),
-    (SMALL["nerf"], "steps", 0),
-    *((SMALL["diver"], "resolution", x) for x in (100, 1024)),
-    (SMALL["diver"], "stored", "int8"),
-    (SMALL["diver"], "faint", 1.0),
-    *((SMALL["kilonerf"], "networks", x) for x in (0, 33)),
-    (SMALL["nsvf"], "resolution", 40),
-    (SMALL["nsvf"], "step", 0.0),
-    (SMALL["plenoctree"], "stored", "fp8"),
-    (partial(lessons, "diver"), "corner_rate", 0.0),
-    (partial(lessons, "diver"), "prune_at", 2.0),
-    (partial(lessons, "diver"), "prune_below", 1.0),
-    *((partial(lessons, "nerf"), "share", x) for x in (0.0, 1.5)),
-    (partial(lessons, "nerf"), "points", 2.0),
-    (partial(lessons, "kilonerf"), "points_each", 0),
-    (partial(lessons, "kilonerf"), "view_cost", -1.0),
-    (partial(lessons, "plenoctree"), "density_rate", -1.0),
-    (partial(lessons, "plenoctree"), "samples", 0),
-    *((extraction, "resolution", x) for x in (100, 192, 4096)),
-    (extraction, "degree", 4),
-    (extraction, "directions", 3),
-    (extraction, "rays", 0),
-    (extraction, "least_weight", float("nan")),
-]
-
-
-@pytest.mark.parametrize(("make", "setting", "value"), REFUSED)
-def test_wrong_settings_are_refused(make: Callable[..., Any], setting: str, value: Any) -> None:
-    with pytest.raises(ValueError, match=f"^{setting}: expected"):
-        make(**{setting: value})

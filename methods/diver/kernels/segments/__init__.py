@@ -74,11 +74,9 @@ def render_segments(
     backend: str = "auto",
 ) -> tuple[Pixels, Tensor, Tensor]:
     """The pixels of R `rays`, which end at the transmittance `stop`, without a background; segments
-    with at most the weight `faint` have an opacity but no colour. Not differentiable.
-
-    `towards` [R, H] is what the direction of a ray adds to the output of `layers.geometry`. Also
-    returns how many segments of each ray lie in front of its end, and have a colour: [R] int32.
-    """
+    with at most the weight `faint` have an opacity but no colour. Not differentiable. `towards` [R,
+    H] is what the direction of a ray adds to the output of `layers.geometry`. Also returns how many
+    segments of each ray lie in front of its end, and have a colour: [R] int32."""
     check_stop(stop)
     hidden, features = layers.hidden.shape
     check_shape("rows", corners.rows, len(corners.voxels), CORNERS)

@@ -56,11 +56,6 @@ WEIGH = Operation(
 )
 
 
-def _pixels(given: Given, backend: str) -> tuple[Tensor, ...]:
-    pixels, _, _ = render_segments(**given, backend=backend)
-    return pixels.values, pixels.depth_sum, pixels.alpha
-
-
 def _light(given: Given) -> float:
     """How far the opacity of a ray may be off: its n segments' densities, rounding; a weight beside
     `stop` or `faint` may count on one side only, and few lie beside a `faint` of 1e-2."""
@@ -72,7 +67,7 @@ def _light(given: Given) -> float:
 RENDER = Operation(
     "render_segments",
     served(__package__),
-    _pixels,
+    lambda given, backend: render_segments(**given, backend=backend)[0].columns,
     {
         "values": Bound(
             "as opacities, and colours by 540 / 4 u", lambda given: _light(given) + 540 / 4 * U32

@@ -34,8 +34,7 @@ CROWD = 600  # Gaussians at a pixel of the cases, at most
 def _pixels(given: Given, backend: str) -> tuple[Tensor, ...]:
     rest = dict(given)
     ellipses = Ellipses(*(rest.pop(name) for name in ("centres", "conics", "depth", "extents")))
-    pixels = blend(ellipses, **rest, backend=backend)
-    return pixels.values, pixels.depth_sum, pixels.alpha
+    return blend(ellipses, **rest, backend=backend).columns
 
 
 WHY = (

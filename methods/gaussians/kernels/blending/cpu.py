@@ -57,14 +57,13 @@ class _Blend(torch.autograd.Function):
         _pack(order, *given, width, height, packed, boxes)
         lists = _lists(boxes, width, height)
         pixels = Pixels.blank(width * height, 3)
-        parts = pixels.values, pixels.depth_sum, pixels.alpha
-        out = arrays(*(x.view(height, width, *x.shape[1:]) for x in parts))
+        out = arrays(*(x.view(height, width, *x.shape[1:]) for x in pixels.columns))
         _forward(packed, boxes, *lists[:2], f32(stop), numba.get_num_threads(), *out)
         ctx.save_for_backward(pixels.values, pixels.alpha)
         ctx.gaussians, ctx.lists = (order, packed, boxes), lists
         ctx.size, ctx.stop, ctx.count = (height, width), stop, len(depth)
         ctx.mark_non_differentiable(pixels.depth_sum)
-        return parts
+        return pixels.columns
 
     @staticmethod
     def backward(ctx, grad_values, _grad_depth, grad_alpha):
@@ -92,11 +91,9 @@ def _by_depth(depth: np.ndarray, extents: np.ndarray) -> np.ndarray:
 
 
 def _lists(boxes: np.ndarray, width: int, height: int) -> tuple[np.ndarray, ...]:
-    """Which Gaussians each tile shows: offsets, ranks, first and slots.
-
-    Tile t owns entries offsets[t] to offsets[t + 1] of ranks: Gaussians by depth, ascending. That
-    of rank r owns first[r] to first[r + 1] of slots: the indices of its entries, tile by tile.
-    """
+    """Which Gaussians each tile shows: offsets, ranks, first and slots. Tile t owns entries
+    offsets[t] to offsets[t + 1] of ranks: Gaussians by depth, ascending. That of rank r owns
+    first[r] to first[r + 1] of slots: the indices of its entries, tile by tile."""
     across, down = -(-width // TILE), -(-height // TILE)
     threads = numba.get_num_threads()
     counts, first = np.zeros(across * down, np.int64), np.zeros(len(boxes) + 1, np.int64)

@@ -43,11 +43,9 @@ def locate(
     positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor, *, backend: str = "auto"
 ) -> tuple[Tensor, Tensor]:
     """The networks [S] int16 of `positions` [S, 3], -1 for none, and where these are in the cubes
-    of their networks [S, 3], -1 to 1 along each axis. No gradient.
-
-    `cubes` [X, Y, Z] int16 are the networks of a grid of cubes of a `side` [], -1 for none; the
-    first one has the lower `corner` [3].
-    """
+    of their networks [S, 3], -1 to 1 along each axis. No gradient. `cubes` [X, Y, Z] int16 are the
+    networks of a grid of cubes of a `side` [], -1 for none; the first one has the lower `corner`
+    [3]."""
     check_shape("positions", positions, None, 3)
     check_shape("cubes", cubes, None, None, None)
     check_shape("corner", corner, 3)
@@ -58,11 +56,8 @@ def locate(
 
 def order(networks: Tensor, count: int, *, backend: str = "auto") -> tuple[Tensor, Tensor]:
     """Sort samples by their `networks` [S], integers below `count`, which is not checked, negative
-    for none; within a network they keep their order.
-
-    Returns the samples [M] int64 that have a network, and offsets [N + 1] int64: network n owns
-    offsets[n] to offsets[n + 1] of them.
-    """
+    for none; within a network they keep their order. Returns the samples [M] int64 that have a
+    network, and offsets [N + 1] int64: network n owns offsets[n] to offsets[n + 1] of them."""
     check_shape("networks", networks, None)
     return implementation(__name__, backend, networks.device).order(networks, count)
 
@@ -88,10 +83,8 @@ def grouped_linear(
     backend: str = "auto",
 ) -> Tensor:
     """A linear layer [S, O], with a `relu` or without, on `inputs` [S, I] sorted by network.
-
     Differentiable in inputs, `weights` [N, I, O] and `biases` [N, O]; `offsets` [N + 1] are those
-    of `order`. Not checked.
-    """
+    of `order`. Not checked."""
     check_shape("weights", weights, None, None, None)
     networks, channels, outputs = weights.shape
     check_shape("inputs", inputs, None, channels)
@@ -107,10 +100,8 @@ def densities(
 ) -> tuple[Tensor, Tensor]:
     """Densities [S] before their activation, and the input [S, 33] of `colours`, of samples at
     `positions` [S, 3] in the cubes of their networks, by their `numbers` [S] as for `order`.
-
     `colours` takes the hidden channels, then the number, which is exact in float32. Densities and
-    hidden channels are 0 where a sample has no network. Differentiable in the networks.
-    """
+    hidden channels are 0 where a sample has no network. Differentiable in the networks."""
     check_shape("positions", positions, None, 3)
     check_shape("numbers", numbers, len(positions))
     kernel = implementation(__name__, backend, positions.device)
@@ -130,10 +121,8 @@ def colours(
     geometry: Tensor, encoded: Tensor, networks: Networks, *, backend: str = "auto"
 ) -> Tensor:
     """Colours [S, 3] in (0, 1) of samples with the `geometry` [S, 33] of `densities` in `encoded`
-    directions [S, 27]; 0 where a sample has no network.
-
-    Differentiable in the hidden channels and the networks.
-    """
+    directions [S, 27]; 0 where a sample has no network. Differentiable in the hidden channels and
+    the networks."""
     check_shape("geometry", geometry, None, HIDDEN + 1)
     check_shape("encoded", encoded, len(geometry), SHAPES["direction"][0] - HIDDEN)
     kernel = implementation(__name__, backend, geometry.device)

@@ -37,10 +37,8 @@ def render_voxels(
     backend: str = "auto",
 ) -> tuple[Pixels, Tensor, Tensor]:
     """Render R `rays`, which end at the transmittance `stop`, without a background; voxels with at
-    most the weight `faint` count for opacity but are not shaded. Not differentiable.
-
-    Returns the pixels and, for each ray, the numbers of crossed and of shaded voxels: [R] int32.
-    """
+    most the weight `faint` count for opacity but are not shaded. Not differentiable. Returns the
+    pixels and, for each ray, the numbers of crossed and of shaded voxels: [R] int32."""
     check_stop(stop)
     check_rays(rays)
     check_shape("density", light.density, len(voxels))
@@ -60,10 +58,8 @@ def shade_voxels(
 ) -> Tensor:
     """Colours [S, 3] of some voxels, rows `voxel` [S] int32 of the `harmonics` [V, C, 3], in the
     direction of their `ray` [S] int32, a row of the unit vectors `directions` [R, 3].
-
     Differentiable in `harmonics`; if a `grad_buffer` of their shape is given, the gradient is added
-    to it in place and hidden from autograd.
-    """
+    to it in place and hidden from autograd."""
     check_harmonics("harmonics", harmonics, None)
     check_shape("voxel", voxel, None)
     check_shape("ray", ray, len(voxel))

@@ -22,11 +22,6 @@ products of harmonics (below 2, error 48 u) and numbers below 6, plus the sigmoi
 FARTHEST = 3  # largest depth of a voxel
 
 
-def _pixels(given: Given, backend: str) -> tuple[Tensor, ...]:
-    pixels, _, _ = render_voxels(**given, backend=backend)
-    return pixels.values, pixels.depth_sum, pixels.alpha
-
-
 def _light(given: Given) -> float:
     """How far the opacity in front of a voxel may be off: rounded once or twice at each of at most
     3 G voxels on both sides; a weight beside `stop` or `faint` may count on one side only."""
@@ -37,7 +32,7 @@ def _light(given: Given) -> float:
 RENDER = Operation(
     "render_voxels",
     served(__package__),
-    _pixels,
+    lambda given, backend: render_voxels(**given, backend=backend)[0].columns,
     {
         "values": Bound(
             "as opacities, and colours as `COLOUR` says", lambda given: _light(given) + COLOUR * U32

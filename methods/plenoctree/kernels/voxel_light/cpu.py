@@ -59,7 +59,7 @@ def render_voxels(
         light.harmonics.shape[1],
         maps_of(voxels),
         (f64(f32(stop)), f64(f32(faint))),
-        tuple(arrays(pixels.values, pixels.depth_sum, pixels.alpha, crossed, shaded)),
+        tuple(arrays(*pixels.columns, crossed, shaded)),
     )
     return pixels, crossed, shaded
 

@@ -14,7 +14,6 @@ BLOCK = 256
 
 
 def splat(pixels: Tensor, depth: Tensor, width: int, height: int, last: Tensor) -> Tensor:
-    """As the reference, of float32."""
     check_types(torch.float32, pixels=pixels, depth=depth)
     landed = torch.empty(len(depth), dtype=torch.int64, device=depth.device)
     size = width, height, width * height

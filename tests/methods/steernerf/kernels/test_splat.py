@@ -6,7 +6,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.threads import torch_threads
 from methods.steernerf.kernels.splat import splat
 
 
@@ -64,15 +63,6 @@ def test_the_border_of_a_pixel_belongs_to_the_next_and_wrong_points_to_none():
     for depth in depths.split(1):
         given = torch.tensor([[0.5, 0.5]]), depth, 1, 1
         assert splat(*given).tolist() == plain_splat(*given), depth
-
-
-def test_the_number_of_threads_does_not_change_the_pixels():
-    pixels, depth = scatter_points(5000, 50, 3)  # a hundred points a pixel, from all threads
-    found = []
-    for threads in (1, 2, 4):
-        with torch_threads(threads):
-            found.append(splat(pixels, depth, 50, 3))
-    assert all(torch.equal(each, found[0]) for each in found)
 
 
 def test_wrong_arguments_are_named():
