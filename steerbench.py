@@ -24,8 +24,6 @@ with a message for the user.
 | `SteerbenchError` | base class of all errors that a user can fix |
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple

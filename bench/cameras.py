@@ -3,8 +3,6 @@
 Pixel (i, j) (column i, row j) covers [i, i+1) x [j, j+1) and is sampled at its centre, +0.5.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

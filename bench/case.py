@@ -4,8 +4,6 @@ Each folder keeps its cases in `cases.py`. A tolerance is derived from the arith
 the unit roundoff u of the type that the result is computed in, never from an observed error.
 """
 
-from __future__ import annotations
-
 import math
 import statistics
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence

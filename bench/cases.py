@@ -1,7 +1,5 @@
 """Cases of projection and unprojection: near, far, tiny scenes, odd sizes, rigid motions."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The clock and the counters of a measurement."""
 
-from __future__ import annotations
-
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence

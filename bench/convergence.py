@@ -1,7 +1,5 @@
 """Run time against error of computations whose exact answer is known; the order of convergence."""
 
-from __future__ import annotations
-
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

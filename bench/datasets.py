@@ -3,8 +3,6 @@
 `scenes/published.toml` describes them, `scenes/*.registry.txt` have the SHA-256 of each file.
 """
 
-from __future__ import annotations
-
 import tempfile
 import tomllib
 import zipfile

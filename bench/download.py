@@ -1,7 +1,5 @@
 """Downloads a file, and checks it."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 

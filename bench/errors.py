@@ -1,7 +1,5 @@
 """Errors for users. Not in `bench.types`, so that the command line need not load torch."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches

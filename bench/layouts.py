@@ -9,8 +9,6 @@ The pictures to learn from are those of the training split, the frames of the pa
 - `nerfbaselines`: as `blender`, with `nb-info.json`, and the path as `path.json`.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import replace

@@ -4,8 +4,6 @@ figures is here: `_render`.
 Quality, time and memory of a run come from the same rendering of the same frames.
 """
 
-from __future__ import annotations
-
 import math
 import statistics
 from collections import Counter

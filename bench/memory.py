@@ -5,8 +5,6 @@ A training step allocates and frees 50 MB of activations. If this memory is retu
 `keep_freed` and `give_back` do nothing.
 """
 
-from __future__ import annotations
-
 import ctypes
 import re
 import resource

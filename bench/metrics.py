@@ -4,8 +4,6 @@ Every metric takes float pictures [H, W, 3] in [0, 1] and returns a Python float
 clips or rounds: that is the protocol's choice, made with `quantise`.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import warnings

@@ -4,8 +4,6 @@ Poses are computed in float64 and returned in the type of the input. Directions 
 about a `target` [3], the point in scene units that the cameras look at or move around.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

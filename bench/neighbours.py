@@ -1,7 +1,5 @@
 """Measures how busy other processes keep the machine, from the kernel's accounting (psutil)."""
 
-from __future__ import annotations
-
 import math
 import os
 import time

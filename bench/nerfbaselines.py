@@ -5,8 +5,6 @@ The folder is laid out as the artifacts that NerfBaselines publishes, without th
 those that its version 1.2 writes and reads.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -4,8 +4,6 @@ Poses in such files (of nerfstudio's viewer, `transforms.json`) are camera-to-wo
 set's coordinates, with OpenGL axes; NerfBaselines' have OpenCV's.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections import ChainMap

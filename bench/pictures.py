@@ -1,7 +1,5 @@
 """Scores existing pictures, from any program, in the same way as rendered frames."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import re

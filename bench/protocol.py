@@ -1,7 +1,5 @@
 """The protocol: the rules of a fair measurement. Its name is in every row."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from contextlib import suppress

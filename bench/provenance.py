@@ -5,8 +5,6 @@ is kept by hand. A cache key holds their digest, so that results become invalid 
 these files changes.
 """
 
-from __future__ import annotations
-
 import ast
 import hashlib
 import importlib.util

@@ -5,8 +5,6 @@ A run folder holds `rows.csv` (one metric per row, `COLUMNS`), `frames.csv` (one
 It gets its final name only when it is complete.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -1,7 +1,5 @@
 """The rows of a run: means over frames with their 95 % intervals, quantiles, single figures."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

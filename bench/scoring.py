@@ -1,7 +1,5 @@
 """Scores of rendered frames by a protocol, one after the other, with pictures of some of them."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable, Collection, Mapping

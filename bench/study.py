@@ -1,7 +1,5 @@
 """What a method declares for the studies that vary it: its knobs, switches, axes and parts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """Threads: how many torch uses per operation, and work on many items with all cores."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -6,8 +6,6 @@ split is missing or empty; those along a smooth path, if pictures differ in size
 all cameras. `bench.motion` computes the motion between two poses, `bench.paths` reads files.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ of consecutive frames, or where each pixel was some frames earlier. No method im
 so that a package installed for a metric leaves the keys of trainings alone.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Iterator, Sequence

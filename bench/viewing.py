@@ -1,7 +1,5 @@
 """The rendering side of a viewer: one frame at a time, each browser's newest camera only."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass

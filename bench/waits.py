@@ -1,7 +1,5 @@
 """Where the host waits for a GPU: counts the waits by the line that causes them."""
 
-from __future__ import annotations
-
 import linecache
 import traceback
 import warnings

@@ -3,8 +3,6 @@
 They are searched in `weights_dir`, `$STEERBENCH_WEIGHTS` and torch's hub cache, in this order.
 """
 
-from __future__ import annotations
-
 import os
 import pickle
 import re

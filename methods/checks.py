@@ -1,7 +1,5 @@
 """All kernels, and all checks: the `cases.py` and `experiments.py` of the folders."""
 
-from __future__ import annotations
-
 import importlib
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What the paper concludes, claim by claim: how large a difference is there, and how large here."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Tables of several runs, a line for each of their settings, with the best figures in bold."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Exports tables: LaTeX for an article, Markdown, CSV and JSON."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """Plots of measured rows, as PNG. They need no display and no global state."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@
 of truth, renderings, details and error maps.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Runs as lines of a table: seeds are repetitions, and settings that differ are columns."""
 
-from __future__ import annotations
-
 import shlex
 import warnings
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Finds runs that look broken. Each rule is a function that yields outliers with the reason."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

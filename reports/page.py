@@ -1,7 +1,5 @@
 """Writes a page about measured runs: one table of all, pictures, provenance of every figure."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime

@@ -3,8 +3,6 @@
 Its texts, and which lines its plots and images show, are in `paper/page.yaml`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial

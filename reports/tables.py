@@ -4,8 +4,6 @@ Units are dB, milliseconds and MB = 10^6 bytes. Every LPIPS column names its net
 which have fewer preceding frames than the method can use, are listed separately.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

@@ -4,8 +4,6 @@ Each tracker gets the figures of every frame as a series, the headline figures a
 pictures and the provenance. A run already sent under the same key is replaced or kept.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec

@@ -7,8 +7,6 @@ failed, or a bug (with its traceback); 2 an error the user can act on; 130 inter
 reader of a pipe closed it; 143 terminated.
 """
 
-from __future__ import annotations
-
 import argparse
 import errno
 import importlib

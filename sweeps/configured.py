@@ -3,8 +3,6 @@
 All raise SteerbenchError, which names the setting, if one is wrong or cannot be had here.
 """
 
-from __future__ import annotations
-
 import inspect
 import os
 import re

@@ -1,7 +1,5 @@
 """The paper's data sets, and the scenes of one in a folder."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

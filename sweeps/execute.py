@@ -4,8 +4,6 @@ Jobs in other processes share with this one only the store, and the folder in wh
 they ended.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -1,7 +1,5 @@
 """Reads the files of experiments: what they vary, and which axes of a method that makes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

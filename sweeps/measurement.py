@@ -1,7 +1,5 @@
 """Jobs: what identifies them, and their runs, which are found in the store or measured now."""
 
-from __future__ import annotations
-
 import hashlib
 import shlex
 from collections.abc import Iterator, Mapping, Sequence

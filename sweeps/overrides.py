@@ -4,8 +4,6 @@ Words are overrides as for `steerbench run` (scene=wires), and `--config-dir=DIR
 further choices. Installed packages bring folders of choices, too, named by entry points.
 """
 
-from __future__ import annotations
-
 import pkgutil
 import re
 import traceback

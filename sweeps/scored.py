@@ -1,7 +1,5 @@
 """Scores pictures of any program against true ones, under a named protocol."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace

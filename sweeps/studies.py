@@ -1,7 +1,5 @@
 """The lines of a study: variants of the methods that it is about, as these declare them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property

@@ -3,8 +3,6 @@
 A table is an experiment with a section `table`, in our folder or in one that `--config-dir` names.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product

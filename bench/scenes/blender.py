@@ -1,7 +1,5 @@
 """Loads NeRF-Synthetic: `transforms_{train,val,test}.json` beside RGBA pictures."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from bench.errors import unexpected

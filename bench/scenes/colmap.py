@@ -1,7 +1,5 @@
 """Loads a capture reconstructed by COLMAP: a sparse model beside the pictures."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 from functools import cached_property

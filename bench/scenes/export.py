@@ -1,7 +1,5 @@
 """Writes a scene as files for other programs, in the units of its data set."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping, Sequence

@@ -3,8 +3,6 @@
 The argument `where` is the start of an error message: the file, and the field inside it.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import sys

@@ -5,8 +5,6 @@ the lens shows them in that plane. It is hashable. A picture is undistorted to t
 with the same intrinsics.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 from collections.abc import Callable, Iterator, Sequence

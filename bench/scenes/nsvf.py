@@ -1,7 +1,5 @@
 """Loads NSVF's layout, also of Tanks & Temples: `bbox.txt intrinsics.txt pose/*.txt rgb/*`."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

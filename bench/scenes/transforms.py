@@ -1,7 +1,5 @@
 """Loads a hand-held capture: the `transforms.json` of instant-ngp and nerfstudio."""
 
-from __future__ import annotations
-
 from collections import ChainMap
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """DIVeR (Wu et al. 2022), as a `bench.types.Method`: what is baked for a frame (Section 3.4)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal

@@ -1,7 +1,5 @@
 """Training of corners and decoder on random pixels of the training pictures."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ An engine turns a network, and sample inputs from real frames, into a function o
 Kernels, reprojection and the field do not use an engine.
 """
 
-from __future__ import annotations
-
 import importlib
 import tempfile
 from abc import ABC, abstractmethod

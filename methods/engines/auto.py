@@ -1,7 +1,5 @@
 """Chooses the engine and precision that compute a 2D renderer fastest on this machine."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Iterator, Sequence

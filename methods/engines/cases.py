@@ -1,7 +1,5 @@
 """Test cases of the engines: constant inputs, values far out of the calibration range, NaN."""
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections.abc import Callable, Sequence

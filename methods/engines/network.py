@@ -3,8 +3,6 @@
 A module of its own, so that trainings do not depend on any engine.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass

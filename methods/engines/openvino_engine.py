@@ -1,7 +1,5 @@
 """OpenVINO as an engine: fp32, bfloat16, and int8 by NNCF."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import sys

@@ -6,8 +6,6 @@ and DequantizeLinear, which ONNX Runtime inserts. TensorRT requires that these a
 leave the bias in float32 (https://docs.nvidia.com/deeplearning/tensorrt, "Explicit Quantization").
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from copy import deepcopy

@@ -4,8 +4,6 @@ In plain torch a network is dozens of operations, which the CPU launches one by 
 recorded once for each input size and then replayed, needs a single launch.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any

@@ -1,7 +1,5 @@
 """A renderer in another process, as a `bench.types.Method`."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

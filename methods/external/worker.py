@@ -1,7 +1,5 @@
 """A renderer's process, and the conversation with it, whatever the process does."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

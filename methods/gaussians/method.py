@@ -1,7 +1,5 @@
 """3D Gaussian Splatting, as a `bench.types.Method`."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal

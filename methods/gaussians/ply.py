@@ -6,8 +6,6 @@ scale_0..2 (logarithms), rot_0..3 (w x y z). The file's harmonics have the Condo
 ours do not: those of odd order m change sign.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

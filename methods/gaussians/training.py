@@ -3,8 +3,6 @@ ones are relocated and explore (Kheradmand et al. 2024, "3D Gaussian Splatting a
 Carlo"). Their number is fixed.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Test cases of fields and their training: bad data, extreme rates, weights and gradients."""
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A hash-grid field: position and view direction to density and K features (SteerNeRF Eq. 4)."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

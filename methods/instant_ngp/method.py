@@ -1,7 +1,5 @@
 """Plain Instant-NGP (Müller et al. 2022): a hash-grid field rendered at full resolution."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

@@ -1,7 +1,5 @@
 """The pixels of all training pictures, the rays through them, and which ones are drawn."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn import functional

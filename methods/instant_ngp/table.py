@@ -4,8 +4,6 @@ A table that is too short blurs a scene, one that is too long takes time in ever
 memory.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict
 
 import torch

@@ -1,7 +1,5 @@
 """Stage 1: a hash-grid field learns from random pixels of the training pictures."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping

@@ -7,8 +7,6 @@ there is one way to contract, as in a sum of products, and "reassoc" only where 
 seen to give the same bits in all cases of the kernel.
 """
 
-from __future__ import annotations
-
 import math
 import shutil
 from collections.abc import Callable

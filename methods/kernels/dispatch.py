@@ -1,7 +1,5 @@
 """Selects the backend of a kernel, by name or by the device of the tensors."""
 
-from __future__ import annotations
-
 import difflib
 import importlib
 import importlib.util

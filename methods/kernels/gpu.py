@@ -4,8 +4,6 @@ On a machine without a GPU, the kernels run (slowly) in Triton's interpreter if 
 is set in the environment, as the tests do.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

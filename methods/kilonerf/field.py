@@ -1,7 +1,5 @@
 """The field: small networks, one for each cube of a grid that holds matter."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,8 +1,6 @@
 """KiloNeRF (Reiser et al. 2021): thousands of small networks, distilled from one field, then
 trained on photos (Section 3.2)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

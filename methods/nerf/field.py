@@ -1,7 +1,5 @@
 """The network of NeRF, as a field."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

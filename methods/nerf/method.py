@@ -1,7 +1,5 @@
 """NeRF, as a `bench.types.Method`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

@@ -1,7 +1,5 @@
 """Embeddings at the corners of sparse voxels and the network that reads them, as a field."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import torch

@@ -1,7 +1,5 @@
 """NSVF, as a `bench.types.Method`."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

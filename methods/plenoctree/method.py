@@ -1,8 +1,6 @@
 """PlenOctree, as a `bench.types.Method`: its leaves learn from random rays of the photos, with Adam
 (Yu et al. 2021, Section 4.2)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal

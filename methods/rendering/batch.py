@@ -1,7 +1,5 @@
 """Volume rendering in training: all samples of a batch of rays at once, with a gradient."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

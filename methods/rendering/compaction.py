@@ -4,8 +4,6 @@ On a GPU the host would wait for the length of such a list until all earlier wor
 everything is computed, in a way that leaves the result unchanged.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

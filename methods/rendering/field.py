@@ -1,7 +1,5 @@
 """The interface of a radiance field to its renderers, and how batches of samples are evaluated."""
 
-from __future__ import annotations
-
 from typing import Protocol, runtime_checkable
 
 import torch

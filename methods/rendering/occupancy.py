@@ -9,8 +9,6 @@ whole grid need not be sampled at first. Only cells within the bounds of the sce
 see can be occupied, and none close to a camera (`learnable_cells`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

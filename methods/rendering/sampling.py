@@ -1,7 +1,5 @@
 """How rays are marched: their steps, and where they end."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from torch import Tensor

@@ -1,7 +1,5 @@
 """More views to learn from, rendered by the field of stage 1 (Section 3.5)."""
 
-from __future__ import annotations
-
 import time
 
 import torch

@@ -1,7 +1,5 @@
 """SteerNeRF (Li et al. 2022), as a `bench.types.Method`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial

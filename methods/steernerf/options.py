@@ -1,7 +1,5 @@
 """The settings of SteerNeRF: what is trained, how, and what is chosen afterwards."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Literal

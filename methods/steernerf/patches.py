@@ -5,8 +5,6 @@ ends at the view. The pipeline renders these frames with its present weights, as
 used. After a number of patches they are replaced, by those before another view.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Stage 2: the 2D renderer and the field, trained together on patches (Section 3.4)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """The 2D renderer: what it is shown, and the U-Net of the released code (Section 3.3)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

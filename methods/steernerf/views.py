@@ -1,7 +1,5 @@
 """Training views with the frames before them, on which engines are built and compared."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from statistics import mean, median

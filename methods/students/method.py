@@ -1,7 +1,5 @@
 """A method whose model starts from a trained field, then learns from the photos."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace

@@ -1,7 +1,5 @@
 """Dense layers for students that are networks, and the encoding of their inputs."""
 
-from __future__ import annotations
-
 import math
 from abc import abstractmethod
 

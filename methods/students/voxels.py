@@ -1,7 +1,5 @@
 """Sparse voxels of the unit cube: which ones exist, and the corners that they share."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

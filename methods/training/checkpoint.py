@@ -1,7 +1,5 @@
 """Files of trained and half-trained stages: tensors and numbers, written whole or not at all."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterator, Mapping

@@ -1,8 +1,6 @@
 """The loop of every training: progress, checkpoints, resuming after a kill, finiteness checks,
 learning rates."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Muon (Jordan et al. 2024, kellerjordan.github.io/posts/muon) for the weights of convolutions."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

@@ -5,8 +5,6 @@ page are rendered from Markdown, plots are drawn by the same code, as SVG. The f
 module are the page's templates, its style and its script.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import io

@@ -1,7 +1,5 @@
 """`steerbench check`: are the figures as good as they were, when a baseline was recorded."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import shlex

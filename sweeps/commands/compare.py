@@ -1,7 +1,5 @@
 """`steerbench compare`: what changed from one run of the store to another."""
 
-from __future__ import annotations
-
 import argparse
 
 from bench.results import Store

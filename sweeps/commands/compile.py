@@ -3,8 +3,6 @@
 A kernel is compiled by computing its cases, which covers all types of inputs.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import os

@@ -1,7 +1,5 @@
 """`steerbench experiments`: run time against error of kernels whose exact answer is known."""
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Sequence

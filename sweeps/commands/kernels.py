@@ -1,7 +1,5 @@
 """`steerbench kernels`: error and throughput of every kernel; a wrong kernel is not timed."""
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Mapping, Sequence

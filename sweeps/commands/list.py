@@ -1,7 +1,5 @@
 """`steerbench list`: what can be chosen, and why some of it cannot be used here."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from contextlib import suppress

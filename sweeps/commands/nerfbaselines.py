@@ -1,7 +1,5 @@
 """`steerbench export nerfbaselines` and `import nerfbaselines`: results to and from others."""
 
-from __future__ import annotations
-
 import argparse
 import shlex
 from collections import Counter

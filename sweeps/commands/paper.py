@@ -1,8 +1,6 @@
 """`steerbench paper` measures the tables of the SteerNeRF paper, or another, and writes a page of
 them; `steerbench report` writes the same page from the store alone."""
 
-from __future__ import annotations
-
 import argparse
 import re
 import sys

@@ -1,7 +1,5 @@
 """`steerbench render`: renders every frame of a trajectory, as pictures and as a video."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import re

@@ -1,7 +1,5 @@
 """`steerbench results`: prints every row of the store, for people or for programs."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import sys

@@ -1,7 +1,5 @@
 """`steerbench scenes`: downloads published data sets, checks copies, exports scenes."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`steerbench score`: scores pictures of any program against true ones, under a named protocol."""
 
-from __future__ import annotations
-
 import argparse
 
 from sweeps.scored import score

@@ -1,7 +1,5 @@
 """`steerbench stress`: runs all cases with every backend, engine and precision."""
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Iterable, Iterator

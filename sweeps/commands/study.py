@@ -3,8 +3,6 @@
 The lines of a study are runs in the store, as those of a sweep; a study shows them in its own way.
 """
 
-from __future__ import annotations
-
 import argparse
 import re
 import shlex

@@ -4,8 +4,6 @@ A method is trained for a moment. Then it renders the same frames, and trains as
 turns: with all kernels as they are, and with one of them computed by its reference.
 """
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 import time

@@ -3,8 +3,6 @@
 A scene is written once in NeRF-Synthetic's layout, then read by the loader of that layout.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -4,8 +4,6 @@ Lengths are written as if the ground were at z = 0; the front faces -y. No bar, 
 thinner than 0.007, a 300th of the whole; joints between bricks are 0.003 wide.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The embedded scenes: z is up, everything lies in [-1.2, 1.2]^3, the totem faces -y."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from itertools import pairwise

@@ -5,8 +5,6 @@ picture is rendered in bands of rows. In each band, a part of a model is traced 
 that its bounding box can cover.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

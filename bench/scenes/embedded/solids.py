@@ -6,8 +6,6 @@ directions; a light at infinity has one direction and many origins. Positions al
 parameter t, +inf where the ray misses. Points are [N, 3].
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ worn. They repeat along x + y and z, so that a wall that faces x or y shows the 
 around a corner. A wall made of several parts takes `placed`, and its pattern goes on in each.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import cache, partial

@@ -4,8 +4,6 @@ The gradients of samples are short numbers, and so are their positions in cells,
 a hash table's gradient are exact in any order.
 """
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

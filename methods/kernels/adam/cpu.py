@@ -4,8 +4,6 @@ For a hash table, a thread takes a level, adds up its gradient, which stays in t
 T = 2^17), and updates it, before it takes the next one. So at most as many threads as levels work.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -5,8 +5,6 @@ and writes the table, both moments and the step count, 12 F + 4 bytes each way, 
 gradient of 0 and the packed copy, 4 F + 4 bytes.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import torch

@@ -4,8 +4,6 @@ alpha_i = 1 - exp(-sigma_i delta_i),  T_i = prod_{j<i} (1 - alpha_j),  w_i = T_i
 values = sum w_i f_i,  depth_sum = sum w_i t_i,  alpha = sum w_i
 """
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from bench.types import check_shape

@@ -1,7 +1,5 @@
 """Cases of the compositing: agreement of the backends, extremes, long rays."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from typing import Any

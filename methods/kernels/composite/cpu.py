@@ -4,8 +4,6 @@ The transmittance is updated by T_{i+1} = T_i - w_i. Transmittance and sums are 
 float32 a product of many equal factors near 1 drifts: all are rounded the same way.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -6,8 +6,6 @@ whose slope s depends on y. With the optical thickness tau = s x^2 / 2, opacity 
 alpha = 1 - exp(-s / 2),  depth_sum = int_0^1 x sigma exp(-tau) = int_0^1 exp(-tau) - exp(-s / 2).
 """
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

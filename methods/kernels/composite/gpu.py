@@ -4,8 +4,6 @@ Within a block, transmittance is the exponential of a cumulative sum. A ray ends
 block behind which it is opaque.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

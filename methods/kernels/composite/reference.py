@@ -1,7 +1,5 @@
 """Compositing in plain torch: rays padded to the longest, transmittance by a cumulative sum."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -5,8 +5,6 @@ coordinates go from 0 to 1 along each axis of a voxel. With the weights of `tril
 is the trilinear interpolant at a point.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

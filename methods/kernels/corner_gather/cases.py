@@ -1,7 +1,5 @@
 """Cases of the corner features: agreement of backends, NaN."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

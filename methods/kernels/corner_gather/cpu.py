@@ -5,8 +5,6 @@ through all samples, so that no two threads add to the same number. This needs n
 sums do not depend on the number of threads.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from numba import get_num_threads, prange, types

@@ -1,7 +1,5 @@
 """Corner features in plain torch, differentiable in table and weights."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 

@@ -8,8 +8,6 @@ into 2^log2_table entries is dense, x + y res + z res^2; the others are hashed,
 offset, a cell at the far side of a dense level has vertices beyond the res^3; indices wrap around.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property

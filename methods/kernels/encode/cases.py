@@ -1,7 +1,5 @@
 """Cases of the hash-grid encoding: agreement of the backends, ends of the cube."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from functools import partial

@@ -10,8 +10,6 @@ goes through the chunks, so that no two threads add to the same entry: this need
 the sums are the same in every run.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from numba import get_num_threads, prange

@@ -5,8 +5,6 @@ one level, which stays in the L2 cache. The backward pass scatters with atomics,
 repeatable.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import torch

@@ -1,7 +1,5 @@
 """Hash-grid encoding in plain torch, differentiable in the table and in the positions."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -7,8 +7,6 @@ samples does not depend on how empty space is skipped, so that all backends retu
 a window removes samples but moves none.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

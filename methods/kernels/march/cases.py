@@ -1,8 +1,6 @@
 """Cases of the ray march: bit-identical samples by all backends; rays that hit faces, edges and
 corners, or come from very far."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from functools import cache, partial

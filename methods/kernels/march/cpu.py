@@ -6,8 +6,6 @@ part of a scratch array, whose pages cost nothing until written. Once all counts
 samples are moved to their final place, ray by ray.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -3,8 +3,6 @@
 Rays are marched twice: first to count samples, then to write them, once their places are known.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -4,8 +4,6 @@ Such networks follow the encoding in Instant-NGP (Müller et al. 2022, Section 5
 "fully fused" (Müller et al. 2021, Section 4.1).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from torch import Tensor

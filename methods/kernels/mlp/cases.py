@@ -4,8 +4,6 @@ Inputs, weights and gradients are small multiples of 1/8. Every sum then has at 
 that it is exact in any order, and no activation lies within rounding of the corner of a ReLU.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import partial

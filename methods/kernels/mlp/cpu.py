@@ -4,8 +4,6 @@ bfloat16 goes layer by layer instead: a CPU that has products of bfloat16 comput
 any product of float32.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """A small network in plain torch, layer by layer."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import torch

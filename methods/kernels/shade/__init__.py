@@ -1,7 +1,5 @@
 """Colours that change with the view direction: sums of spherical harmonics."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from bench.types import check_shape

@@ -1,7 +1,5 @@
 """Sums of harmonics with numba, which are computed a block of directions at a time."""
 
-from __future__ import annotations
-
 import torch
 from numba import prange
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Sums of harmonics in plain torch."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from methods.kernels.spherical.reference import spherical_harmonics

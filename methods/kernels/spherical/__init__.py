@@ -1,7 +1,5 @@
 """Real spherical harmonics of view directions, degrees 0 to 3."""
 
-from __future__ import annotations
-
 import math
 
 from torch import Tensor

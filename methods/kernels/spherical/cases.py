@@ -1,7 +1,5 @@
 """Cases of the spherical harmonics."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import torch

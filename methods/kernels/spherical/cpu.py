@@ -1,7 +1,5 @@
 """Spherical harmonics with numba: one pass, 64 bytes written for 12 read."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from numba import prange

@@ -5,8 +5,6 @@ each lane computes all harmonics of its direction and keeps those of its columns
 than scattered writes.
 """
 
-from __future__ import annotations
-
 import torch
 import triton
 import triton.language as tl

@@ -1,7 +1,5 @@
 """Spherical harmonics in plain torch."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -6,8 +6,6 @@ the exit from a voxel and the entry into its neighbour have exactly the same t. 
 determined by the planes that it has crossed, so that every backend finds the same segments.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar

@@ -1,8 +1,6 @@
 """Cases of the voxel walk: bit-identical crossings by all backends; lengths against a slab test per
 voxel; rays that hit faces, edges and corners, or come from far."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from functools import partial

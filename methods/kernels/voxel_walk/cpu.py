@@ -5,8 +5,6 @@ As in the ray march, a chunk of rays writes its crossings into its own part of a
 all counts are known, they are moved to their final place.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

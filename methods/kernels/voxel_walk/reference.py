@@ -3,8 +3,6 @@
 For small grids, since a ray takes memory for 3 G planes.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -8,8 +8,6 @@ ValueError, as do with backend="cpu" other numbers than float32, and layers whos
 multiple of 16.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

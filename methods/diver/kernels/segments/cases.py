@@ -1,7 +1,5 @@
 """Cases of segments: the weights of corners, also against quadrature; pixels; NaN."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

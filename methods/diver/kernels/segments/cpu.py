@@ -6,8 +6,6 @@ some lie behind the end of the ray, in vain. Segments that show wait until `BATC
 there, of any rays of a chunk, before their colours are computed together.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Segments in plain torch, made of kernels with references of their own."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import linear

@@ -7,8 +7,6 @@ at the centre of every pixel, with (x, y) relative to the centre of the ellipse,
 Wrong shapes raise ValueError, as do other numbers than float32 with backend="cpu".
 """
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from bench.types import check_shape

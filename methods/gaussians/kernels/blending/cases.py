@@ -1,7 +1,5 @@
 """Cases of the blending of Gaussians: agreement of the backends, and results known in advance."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -5,8 +5,6 @@ this order, and processes the list until it is opaque. The 16 pixels of a row ar
 vector: the code has no branches, and exp is a polynomial.
 """
 
-from __future__ import annotations
-
 import math
 
 import numba

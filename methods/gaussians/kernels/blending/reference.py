@@ -1,7 +1,5 @@
 """Blending in plain torch: band by band, all Gaussians that reach it at all of its pixels."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

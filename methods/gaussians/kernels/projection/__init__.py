@@ -6,8 +6,6 @@ derivative of the projection at its centre. Wrong shapes raise ValueError, as do
 float32 with backend="cpu".
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """Cases of the projection of Gaussians: agreement of the backends, ellipses known in advance."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from typing import Any

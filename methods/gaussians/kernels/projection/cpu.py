@@ -1,7 +1,5 @@
 """Projection of Gaussians with numba: one pass, in vectors of Gaussians."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

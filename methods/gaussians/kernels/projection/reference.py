@@ -1,7 +1,5 @@
 """Projection of Gaussians in plain torch, differentiated by autograd."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """SSIM as a loss (Wang et al. 2004): 11 x 11 Gaussian window, sigma 1.5, K1 = 0.01, K2 = 0.03."""
 
-from __future__ import annotations
-
 import math
 
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Cases of SSIM: agreement of the backends."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import torch

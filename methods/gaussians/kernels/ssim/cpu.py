@@ -4,8 +4,6 @@ A row of pixels is a row of 3 W numbers: neighbours in a channel are three numbe
 loop runs over consecutive numbers. Windows in which the pictures are equal are skipped.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from numba import prange

@@ -1,7 +1,5 @@
 """SSIM in plain torch: windows as convolutions."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn import functional

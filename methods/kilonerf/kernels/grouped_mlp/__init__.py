@@ -10,8 +10,6 @@ colour = sigmoid(colour(relu(direction(feature(hidden), encoding of the directio
 ValueError, as do other numbers than float32 with backend="cpu".
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from types import ModuleType
 

@@ -1,7 +1,5 @@
 """Cases of the small networks: sorting, encoding, single layers and whole networks."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import torch

@@ -4,8 +4,6 @@ All of it is made of `methods.kernels.cpu.tall`. Work is divided among threads b
 borders of networks. Samples sorted by network lie anywhere in memory, so their rows are prefetched.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

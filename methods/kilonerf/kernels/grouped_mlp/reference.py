@@ -1,7 +1,5 @@
 """Small networks in plain torch, one network after the other, for any dtype and device."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -5,8 +5,6 @@ Y_k(d)) in direction d (Yu et al. 2021, Eq. 1 to 3). Wrong shapes raise ValueErr
 numbers than float32 with backend="cpu".
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from torch import Tensor

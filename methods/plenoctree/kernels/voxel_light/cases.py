@@ -1,7 +1,5 @@
 """Cases of voxels with densities and harmonics: pixels, and shaded samples."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

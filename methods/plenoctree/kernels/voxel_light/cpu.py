@@ -4,8 +4,6 @@ place; in the backward pass each thread sums the gradients of its own voxels onl
 no atomics and results are repeatable.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

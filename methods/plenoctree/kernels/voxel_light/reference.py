@@ -1,7 +1,5 @@
 """Voxels in plain torch."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize

@@ -3,8 +3,6 @@
 Pixel (i, j) covers [i, i+1) x [j, j+1), so a point at (u, v) lands only in (floor u, floor v).
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

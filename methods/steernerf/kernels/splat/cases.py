@@ -1,7 +1,5 @@
 """Cases of the splatting: agreement of the backends, also at borders and far outside."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

@@ -1,8 +1,6 @@
 """Splatting with Triton: one lane per point; points compete for their pixel with atomics. A maximum
 does not depend on their order, so that the result is repeatable."""
 
-from __future__ import annotations
-
 import torch
 import triton
 import triton.language as tl
