@@ -15,6 +15,7 @@ with a message for the user.
 | `load_scene` | cameras, pictures and bounds of a scene |
 | `score` | score pictures of any program against true ones |
 | `results` | the rows of all runs in the store |
+| `check` | whether the runs are as good as a recorded baseline, metric by metric |
 | `methods`, `scenes` | what can be chosen, with a description of each |
 | `Run` | what `run` and `score` return |
 | `Method`, `Probe`, `NullProbe` | the interface of a method; the probe it reports to |
@@ -32,10 +33,12 @@ import pandas as pd
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
-from bench.results import Store
+from bench.results import existing_store
 from bench.types import Budget, Camera, Frame, Method, NullProbe, Probe, Scene, Split
+from reports.regression import Assertion
 from reports.runs import Run, load_runs
 from sweeps import configured
+from sweeps.baseline import checked
 from sweeps.measurement import Job, obtain
 from sweeps.overrides import composed, described
 from sweeps.scored import score
@@ -52,6 +55,7 @@ __all__ = [
     "Scene",
     "Split",
     "SteerbenchError",
+    "check",
     "fit",
     "load_scene",
     "methods",
@@ -94,7 +98,15 @@ def load_scene(*settings: str) -> Scene:
 
 def results(outputs: str | Path = "outputs") -> pd.DataFrame:
     """All rows of all runs below `outputs`, one metric each; docs/protocol.md explains columns."""
-    return Store(Path(outputs)).rows()
+    return existing_store(Path(outputs)).rows()
+
+
+def check(baseline: str | Path, outputs: str | Path = "outputs") -> list[Assertion]:
+    """Compare the runs below `outputs` with a file that `steerbench check --record` wrote.
+
+    There is one for each run and metric of the baseline; its `verdict` is "worse", "missing" or "".
+    """
+    return [each for of_run in checked(Path(baseline), Path(outputs)) for each in of_run]
 
 
 def methods(*settings: str) -> Mapping[str, str]:

@@ -6,8 +6,8 @@ import argparse
 import math
 import sys
 
-from bench.errors import SteerbenchError, unknown
-from bench.results import Store
+from bench.errors import unknown
+from bench.results import existing_store
 from reports.tables import NOT_AVAILABLE, Table
 from sweeps.terminal import show
 
@@ -20,9 +20,8 @@ SHOWN = (
 
 def main(options: argparse.Namespace) -> int:
     """Print the rows below `options.outputs`, filtered if asked, as a table, csv or json."""
-    rows = Store(options.outputs).rows(report=lambda message: print(message, file=sys.stderr))
-    if rows.empty:
-        raise SteerbenchError(f"{options.outputs}: no runs yet; `steerbench run` makes one")
+    store = existing_store(options.outputs)
+    rows = store.rows(report=lambda message: print(message, file=sys.stderr))
     for column in ("method", "scene", "metric"):
         wanted = getattr(options, column)
         if wanted is not None:
