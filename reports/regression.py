@@ -60,8 +60,8 @@ def limited(words: Sequence[str], limits: Mapping[str, Limit] = LIMITS) -> dict[
         if not (read := re.fullmatch(r"(\d+\.?\d*)(%?)", text)):
             raise unexpected(f"--limit {metric}", "as 0.2 in its unit, or 10%", text or "nothing")
         amount, share = float(read[1]), read[2] == "%"
-        ways = {"absolute": amount * (not share), "relative": amount / 100 * share}
-        found[metric] = replace(known[metric], **ways)
+        absolute, relative = amount * (not share), amount / 100 * share
+        found[metric] = replace(known[metric], absolute=absolute, relative=relative)
     return found
 
 
