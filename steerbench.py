@@ -17,6 +17,7 @@ with a message for the user.
 | `load_scene` | cameras, pictures and bounds of a scene |
 | `score` | score pictures of any program against true ones |
 | `results` | the rows of all runs in the store |
+| `check` | whether the runs are as good as a recorded baseline, metric by metric |
 | `methods`, `scenes` | what can be chosen, with a description of each |
 | `Run`, `Sweep` | what `run`, `load` and `score` return; what `sweep` returns |
 | `Method`, `Probe`, `NullProbe` | the interface of a method; the probe it reports to |
@@ -32,13 +33,15 @@ import pandas as pd
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
-from bench.results import Store
+from bench.results import existing_store
 from bench.types import Budget, Camera, Frame, Method, NullProbe, Probe, Scene, Split
 from reports.comparison import columns_of
 from reports.lines import as_lines
 from reports.lines import results as rows_of
+from reports.regression import Assertion
 from reports.runs import Run, load_runs
 from sweeps import configured
+from sweeps.baseline import checked
 from sweeps.hydra_runs import run_hydra
 from sweeps.measurement import Job, obtain
 from sweeps.overrides import composed, described
@@ -57,6 +60,7 @@ __all__ = [
     "Split",
     "SteerbenchError",
     "Sweep",
+    "check",
     "fit",
     "load",
     "load_scene",
@@ -104,13 +108,13 @@ def sweep(*settings: str) -> Sweep:
     if errors:
         raise errors[0]
     keys = dict.fromkeys(job.run for job in ended if job.run)
-    lines = as_lines(load_runs(Store(Path(ended[0].outputs)), keys))
+    lines = as_lines(load_runs(existing_store(Path(ended[0].outputs)), keys))
     return Sweep(lines.runs, lines.frame(columns_of(lines)))
 
 
 def load(key: str, outputs: str | Path = "outputs") -> Run:
     """The run of the store below `outputs` whose key begins with `key`."""
-    store = Store(Path(outputs))
+    store = existing_store(Path(outputs))
     return load_runs(store, [store.whole_key(key)])[0]
 
 
@@ -133,7 +137,15 @@ def results(outputs: str | Path = "outputs") -> pd.DataFrame:
 
     docs/protocol.md explains the columns.
     """
-    return rows_of(Store(Path(outputs)))
+    return rows_of(existing_store(Path(outputs)))
+
+
+def check(baseline: str | Path, outputs: str | Path = "outputs") -> list[Assertion]:
+    """Compare the runs below `outputs` with a file that `steerbench check --record` wrote.
+
+    There is one for each run and metric of the baseline; its `verdict` is "worse", "missing" or "".
+    """
+    return [each for of_run in checked(Path(baseline), Path(outputs)) for each in of_run]
 
 
 def methods(*settings: str) -> Mapping[str, str]:

@@ -194,6 +194,15 @@ class Store:
         raise SteerbenchError(f"no run {run!r} in {self.folder}: see `steerbench results`")
 
 
+def existing_store(root: Path) -> Store:
+    """The store below `root`, for whoever only reads it; SteerbenchError if that has no runs."""
+    store, unread = Store(root), [f"`steerbench run outputs={root}` makes one"]
+    if store.rows(report=unread.append).empty:
+        there = "no runs to read" if store.folder.is_dir() else "there is no store of runs"
+        raise SteerbenchError(f"{root}: {there}; {unread[-1]}")
+    return store
+
+
 def unreadable(schema: object) -> str:
     return (
         f"stored by another version of steerbench, or damaged (schema {schema}, this one reads "

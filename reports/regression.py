@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bench.errors import SteerbenchError
+from bench.errors import SteerbenchError, unexpected, unknown
 from bench.rows import half_interval, path_interval
 from reports.runs import Run
 from reports.tables import QUALITY, Table
@@ -16,7 +17,7 @@ from reports.tables import QUALITY, Table
 
 @dataclass(frozen=True)
 class Limit:
-    """How much worse a metric may become: `absolute` in its unit, `relative` to the old figure.
+    """How much worse a metric may become: `absolute` in its `unit`, `relative` to the old figure.
 
     `better` is 1 where more is better, else -1. With `here`, it is compared on one machine only.
     """
@@ -25,22 +26,43 @@ class Limit:
     absolute: float = 0.0
     relative: float = 0.0
     here: bool = False
+    unit: str = ""
+
+    def __str__(self) -> str:
+        return f"{100 * self.relative:.4g} %" if self.relative else f"{self.absolute:.4g}"
 
 
 LIMITS: Mapping[str, Limit] = {
-    "psnr": Limit(1, absolute=0.1),
+    "psnr": Limit(1, absolute=0.1, unit="dB"),
     "ssim": Limit(1, absolute=0.002),
     "lpips_alex": Limit(-1, absolute=0.003),
     "lpips_vgg": Limit(-1, absolute=0.003),
     "lpips_squeeze": Limit(-1, absolute=0.003),
     "flicker": Limit(-1, relative=0.05),
-    "size_bytes.total": Limit(-1, relative=0.001),
+    "size_bytes.total": Limit(-1, relative=0.001, unit="bytes"),
     "work.samples": Limit(-1, relative=0.05),
     "work.products": Limit(-1, relative=0.05),
-    "frame_ms": Limit(-1, relative=0.25, here=True),
-    "peak_bytes": Limit(-1, relative=0.2, here=True),
+    "frame_ms": Limit(-1, relative=0.25, here=True, unit="ms"),
+    "peak_bytes": Limit(-1, relative=0.2, here=True, unit="bytes"),
 }
 """The metrics that are compared, unless a baseline has limits of its own."""
+
+
+def limited(words: Sequence[str], limits: Mapping[str, Limit] = LIMITS) -> dict[str, Limit]:
+    """`limits` with those of `words` (psnr=0.2, frame_ms=10%); SteerbenchError if one is wrong."""
+    directions = {metric: {"↑": 1, "↓": -1}.get(of.better) for metric, of in QUALITY.items()}
+    known = {**{name: Limit(better) for name, better in directions.items() if better}, **LIMITS}
+    found = dict(limits)
+    for word in words:
+        metric, _, text = word.partition("=")
+        if metric not in known:
+            raise unknown("metric", metric, known)
+        if not (read := re.fullmatch(r"(\d+\.?\d*)(%?)", text)):
+            raise unexpected(f"--limit {metric}", "as 0.2 in its unit, or 10%", text or "nothing")
+        amount, share = float(read[1]), read[2] == "%"
+        absolute, relative = amount * (not share), amount / 100 * share
+        found[metric] = replace(known[metric], absolute=absolute, relative=relative)
+    return found
 
 
 @dataclass(frozen=True)
@@ -50,7 +72,8 @@ class Figures:
     `frames` has the figures that the headline averages, by metric and by number and name of the
     frame, in the order of the path: of qualities the steady frames that have them, of other
     metrics all steady frames. `machine` names its device and processors. `views` is equal for the
-    same frames of the same scene under one protocol.
+    same frames of the same scene under one protocol: a scene that steerbench draws is known by its
+    name, because its pictures differ by a level of 255 on another processor.
     """
 
     values: Mapping[str, float]
@@ -70,31 +93,43 @@ class Figures:
             names = averaged["frame"].astype(str) + ": " + averaged["name"].fillna("")
             if averaged[metric].notna().all():
                 frames[metric] = dict(zip(names, averaged[metric].astype(float), strict=True))
-        views = ", ".join(map(str, (*run.views, run.facts["protocol"])))
-        return cls(values, frames, ", ".join(run.computer), views)
+        views = [*map(str, run.views), str(run.facts["protocol"])]
+        scene = run.record["made_of"].get("config", {}).get("scene", {})
+        if scene.get("_target_") == "bench.scenes.embedded.load":
+            views[0] = str(run.facts["scene"])
+        return cls(values, frames, ", ".join(run.computer), ", ".join(views))
 
 
 @dataclass(frozen=True)
-class Change:
-    """The change of one metric from `old` to `new`, which is nan if the new run lacks it.
+class Assertion:
+    """That a metric of a run is as good `now` as it `was`; `now` is nan if the new run lacks it.
 
-    `by` is new less old: the mean over the frames that both runs have, where frames are known, and
-    over the seeds. `interval` is the 95 % interval of that mean, over the seeds, with one seed over
-    its frames; None where only two figures are known. The `verdict` is "worse" (by more than its
-    limit and not by chance), "missing" (it or a frame is gone) or "".
+    `change` is new less old: the mean over the frames that both runs have, where frames are known,
+    and over the seeds. `interval` is the 95 % interval of that mean, over the seeds, with one seed
+    over its frames; None where only two figures are known. The `verdict` is "worse" (by more than
+    its limit and not by chance), "missing" (it, a frame or the `run` is gone) or "".
     """
 
     metric: str
-    old: float
-    new: float
-    by: float
+    was: float
+    now: float
+    change: float
     interval: tuple[float, float] | None
+    limit: Limit
     verdict: str
+    run: str = ""
+    note: str = ""  # what else to know of the run
+
+    def __str__(self) -> str:
+        share = self.limit.relative and self.was
+        by, unit = (100 / abs(self.was), "%") if share else (1.0, self.limit.unit)
+        change = f" {by * self.change:+.3g} {unit}".rstrip() + f" (limit {self.limit})"
+        return self.metric + change * (self.verdict != "missing")
 
 
 def changes(
     old: Sequence[Figures], new: Sequence[Figures], limits: Mapping[str, Limit] = LIMITS
-) -> Iterator[Change]:
+) -> Iterator[Assertion]:
     """The change of every metric of `old` that has a limit, over runs with the same seeds.
 
     A change beyond its limit is chance where its interval contains 0, unless one frame alone moves
@@ -116,7 +151,7 @@ def changes(
             yield _change(metric, limit, pairs)
 
 
-def _change(metric: str, limit: Limit, pairs: Sequence[tuple[Figures, Figures]]) -> Change:
+def _change(metric: str, limit: Limit, pairs: Sequence[tuple[Figures, Figures]]) -> Assertion:
     values = np.array([[run.values.get(metric, math.nan) for run in pair] for pair in pairs])
     frames = [_hiding_nothing(_frames_apart(metric, *pair), limit) for pair in pairs]
     pairwise = zip(frames, values, strict=True)
@@ -135,7 +170,7 @@ def _change(metric: str, limit: Limit, pairs: Sequence[tuple[Figures, Figures]])
     gone = (one.frames.get(metric, {}).keys() - of.frames.get(metric, {}) for one, of in pairs)
     if math.isnan(after) or any(gone):
         verdict = "missing"
-    return Change(metric, before, after, by, interval, verdict)
+    return Assertion(metric, before, after, by, interval, limit, verdict)
 
 
 def _frames_apart(metric: str, old: Figures, new: Figures) -> np.ndarray:
@@ -155,12 +190,12 @@ def _apart(old: float, new: float) -> float:
     return 0.0 if old == new else new - old
 
 
-def change_table(title: str, found: Sequence[Change]) -> Table:
+def change_table(title: str, found: Sequence[Assertion]) -> Table:
     """The changes `found`, a line each."""
     lines = []
     for change in found:
         interval = " – ".join(f"{end:+.4g}" for end in change.interval or ())
-        figures = (f"{change.old:.6g}", f"{change.new:.6g}", f"{change.by:+.4g}", interval)
-        lines.append((change.metric, *figures, change.verdict))
-    columns = ("metric", "was", "is", "change", "95 % interval", "")
+        figures = (f"{change.was:.6g}", f"{change.now:.6g}", f"{change.change:+.4g}", interval)
+        lines.append((change.metric, *figures, str(change.limit), change.verdict))
+    columns = ("metric", "was", "is", "change", "95 % interval", "limit", "")
     return Table(title, columns, tuple(lines))

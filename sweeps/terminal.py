@@ -80,15 +80,16 @@ def write_page(
 
 
 def print_rows(rows: Any) -> None:
-    """Print `rows` as one line of JSON, with null for figures that are not finite."""
-    print(json.dumps(_finite(rows)))
+    """Print `rows` as one line of JSON."""
+    print(json.dumps(finite(rows)))
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
+    """`value` for JSON, which has no NaN and no infinity: null in their place."""
     if isinstance(value, Mapping):
-        return {key: _finite(each) for key, each in value.items()}
+        return {key: finite(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(each) for each in value]
+        return [finite(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

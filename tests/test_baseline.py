@@ -5,9 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from bench.results import Store
-from reports.regression import Figures
-from reports.runs import readable
 from tests.test_end_to_end import called
 
 BASELINE = Path(__file__).with_name("baseline.json")
@@ -24,9 +21,9 @@ METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "work.samples", "work.prod
 def test_the_baseline_is_of_methods_that_have_learnt():
     baseline = json.loads(BASELINE.read_text())
     assert baseline["limits"].keys() >= set(METRICS)
-    for seeds in baseline["runs"].values():
-        assert len(seeds) == 3
-        for run in seeds.values():
+    for of in baseline["runs"]:
+        assert len(of["seeds"]) == 3
+        for run in of["seeds"].values():
             assert run["values"]["psnr"] >= 25
             assert run["values"].keys() >= set(METRICS)
 
@@ -43,12 +40,6 @@ def test_methods_are_as_good_as_the_recorded_baseline(tmp_path, lpips_weights, r
         done = called(tmp_path, "run", *RUN, *method, f"weights_dir={lpips_weights}")
         assert done.returncode == 0, done.stderr
     held = json.loads(BASELINE.read_text())
-    # The scene was drawn here: on other processors some pixels differ by a level of 255.
-    (views,) = {Figures.of(run).views for run in readable(Store(tmp_path / "outputs"))}
-    held["runs"] = {
-        name: {seed: {**run, "views": views} for seed, run in seeds.items()}
-        for name, seeds in held["runs"].items()
-    }
     if not real_lpips_weights:
         limits = held["limits"].items()
         held["limits"] = {name: one for name, one in limits if not name.startswith("lpips")}

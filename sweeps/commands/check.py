@@ -1,99 +1,98 @@
-"""`steerbench check`: are the figures as good as they were, when a baseline was recorded."""
+"""`steerbench check`: are the figures as good as they were, when a baseline was recorded; and
+`steerbench compare`: what changed from one run of the store to another."""
 
 import argparse
 import json
-import shlex
-from collections.abc import Mapping
+import os
+import xml.etree.ElementTree as ET
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
-from typing import Any
 
 from bench.errors import SteerbenchError, explained
-from bench.results import Store
-from bench.sharing import whole
-from reports.regression import LIMITS, Figures, Limit, change_table, changes
-from reports.runs import Run, readable
-from sweeps.measurement import PLACES
-from sweeps.terminal import console, show
-
-SCHEMA = 2  # of baseline files
+from bench.results import existing_store
+from reports.regression import Assertion, Figures, change_table, changes
+from reports.runs import load_runs
+from reports.tables import decimal
+from sweeps.baseline import checked, record
+from sweeps.terminal import console, finite, show
 
 
 def main(options: argparse.Namespace) -> int:
     """Compare the store with a baseline, or write one; 1 if anything is worse or missing."""
-    stored = _by_command(Store(options.outputs))
+    if options.command == "compare":
+        return _compare(options)
+    forms = {"markdown": _markdown, "junit": _junit, "json": _json}
+    if unused := [x for x in (forms if options.record else ["limit"]) if getattr(options, x)]:
+        used = "without" if options.record else "with"
+        raise SteerbenchError(f"--{unused[0]}: expected {used} --record")
     if options.record:
-        _record(options.baseline, stored)
+        record(options.baseline, options.outputs, options.limit, _say)
         return 0
-    runs, limits = _read(options.baseline)
-    failed = 0
-    for command, old in runs.items():
-        there = stored.get(command, {})
-        if missing := old.keys() - there:
-            seeds = f" with seed={','.join(sorted(missing))}" if there else ""
-            why = f"no such run{seeds} below {options.outputs}"
-        else:
-            try:
-                new = [Figures.of(there[seed], limits) for seed in old]
-                rows = list(changes(list(old.values()), new, limits))
-            except SteerbenchError as error:
-                why = f"{error}; `steerbench check --record` takes the new ones"
-            else:
-                failed += sum(row.verdict != "" for row in rows)
-                show(change_table(command, rows))
-                if [each.machine for each in new] != [each.machine for each in old.values()]:
-                    console().print("times and memory are not compared: of other machines")
-                continue
-        console().print(f"{command}: {why}", markup=False)
-        failed += 1
-    console().print("as good as the baseline" if not failed else f"worse or missing: {failed}")
-    return int(failed > 0)
+    found = checked(options.baseline, options.outputs)
+    for name, form in forms.items():
+        if path := getattr(options, name):
+            _write(path, form(found))
+    if options.json != Path("-"):
+        for run in found:
+            show(change_table(run[0].run, run))
+            _say(run[0].note)
+        _say(_verdict(found))
+    return int(any(each.verdict for each in chain(*found)))
 
 
-def _by_command(store: Store) -> dict[str, dict[str, Run]]:
-    """Every run, by what was typed for it and by its seed; of several, the last that was stored."""
-    stored: dict[str, dict[str, Run]] = {}
-    others = (*PLACES, "hydra.mode", "seed")  # what does not change a row is left out, too
-    for run in readable(store):
-        words = shlex.split(str(run.record["command"]))[2:]
-        kept = sorted(word for word in words if word.partition("=")[0] not in others)
-        stored.setdefault(shlex.join(kept), {})[str(run.facts["seed"])] = run
-    return stored
+def _compare(options: argparse.Namespace) -> int:
+    store = existing_store(options.outputs)
+    keys = [store.whole_key(key) for key in (options.old, options.new)]
+    old, new = load_runs(store, keys)
+    rows = list(changes([Figures.of(old)], [Figures.of(new)]))
+    show(change_table(" to ".join(keys), rows))
+    _say(f"PSNR between the pictures that both kept: {decimal(old.psnr_to(new), 2)} dB")
+    return int(any(row.verdict for row in rows))
 
 
-def _record(path: Path, stored: Mapping[str, Mapping[str, Run]]) -> None:
-    """Write figures to `path`; a baseline that is there keeps its limits and its choice of runs."""
-    limits: Mapping[str, Limit] = LIMITS
-    if path.exists():
-        known, limits = _read(path)
-        if missing := known.keys() - stored.keys():
-            raise SteerbenchError(f"{path}: no such run in the store: {sorted(missing)[0]}")
-        stored = {command: stored[command] for command in known}
-    if not stored:
-        raise SteerbenchError("there are no runs to record: `steerbench run` makes one")
-    runs = {
-        command: {seed: asdict(Figures.of(run, limits)) for seed, run in seeds.items()}
-        for command, seeds in stored.items()
-    }
-    plain = {metric: asdict(limit) for metric, limit in limits.items()}
-    text = json.dumps({"schema": SCHEMA, "limits": plain, "runs": runs}, indent=1)
-    with explained(path.parent), whole(path) as new:
-        new.write_text(text + "\n", encoding="utf-8")
-    console().print(f"{path}: {len(runs)} runs", markup=False)
+def _verdict(found: list[list[Assertion]]) -> str:
+    """One line: what is worse, by how much, against which limit, and what is missing."""
+    parts = [
+        f"{verdict}: {', '.join(said)}: {run[0].run}"
+        for run in found
+        for verdict in ("worse", "missing")
+        if (said := [str(each) for each in run if each.verdict == verdict])
+    ]
+    return "; ".join(parts) or "as good as the baseline"
 
 
-def _read(path: Path) -> tuple[dict[str, dict[str, Figures]], dict[str, Limit]]:
-    """The figures of a baseline, by what was typed and by seed, and its limits."""
-    try:
-        held: Any = json.loads(path.read_text(encoding="utf-8"))
-        if held["schema"] != SCHEMA:
-            raise ValueError(f"schema {held['schema']}, expected {SCHEMA}")
-        runs = {
-            command: {seed: Figures(**figures) for seed, figures in seeds.items()}
-            for command, seeds in held["runs"].items()
-        }
-        return runs, {metric: Limit(**limit) for metric, limit in held["limits"].items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise SteerbenchError(
-            f"{path}: no baseline ({error}); `steerbench check --record {path}` writes one"
-        ) from error
+def _markdown(found: list[list[Assertion]]) -> str:
+    parts = ["## steerbench check", _verdict(found)]
+    for run in found:
+        parts += [f"### {run[0].run}", change_table("", run).markdown(), run[0].note]
+    return "\n\n".join(filter(None, parts)) + "\n"
+
+
+def _junit(found: list[list[Assertion]]) -> str:
+    """A test case for each run and metric."""
+    suite = ET.Element("testsuite", name="steerbench check")
+    for each in chain(*found):
+        case = ET.SubElement(suite, "testcase", classname=each.run, name=each.metric)
+        if each.verdict:
+            ET.SubElement(case, "failure", message=f"{each.verdict}: {each}").text = each.note
+    failures = str(len(suite.findall("*/failure")))
+    suite.attrib |= {"tests": str(len(suite)), "failures": failures}
+    return ET.tostring(suite, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _json(found: list[list[Assertion]]) -> str:
+    return json.dumps(finite([asdict(each) for each in chain(*found)]), indent=1) + "\n"
+
+
+def _write(path: Path, text: str) -> None:
+    if path == Path("-"):
+        print(text, end="")
+        return
+    adds = str(path) == os.environ.get("GITHUB_STEP_SUMMARY")  # other steps write there, too
+    with explained(path.parent), path.open("a" if adds else "w", encoding="utf-8") as file:
+        file.write(text)
+
+
+def _say(line: str) -> None:
+    console().print(line, markup=False, soft_wrap=True)

@@ -10,7 +10,7 @@ from typing import Any
 from bench.errors import unexpected
 from bench.nerfbaselines import METRICS, Prediction, read_results, write_results
 from bench.provenance import digest, sha256
-from bench.results import RECORD, Store
+from bench.results import RECORD, Store, existing_store
 from bench.scenes.export import check_empty, data_camera
 from reports.comparison import comparison
 from reports.lines import as_lines
@@ -27,7 +27,7 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _export(options: argparse.Namespace) -> int:
-    store = Store(options.outputs)
+    store = existing_store(options.outputs)
     key = store.whole_key(options.run)
     (run,), place = load_runs(store, [key]), setting("outputs", str(options.outputs))
     config = composed([*words_of_run(key, [place]), place])

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bench.errors import SteerbenchError
-from bench.results import Store
+from bench.results import Store, existing_store
 from reports import export
 from reports.outliers import outlier_table, outliers
 from reports.paper_page import write_paper_page
@@ -37,7 +37,7 @@ def main(options: argparse.Namespace) -> int:
     settings, of_hydra = divided(options.overrides)
     words, data = data_set(settings)
     if options.command == "report" and options.check:
-        return _check(Store(Path(composed(words).outputs)))
+        return _check(existing_store(Path(composed(words).outputs)))
     missing = data.missing if data else {}
     for name, why in missing.items():
         print(f"missing: {name}: {why}", file=sys.stderr)
@@ -48,7 +48,7 @@ def main(options: argparse.Namespace) -> int:
     failed = 0
     if options.command != "report":
         failed = run_jobs(jobs, Launcher([*options.config_dir, *of_hydra], outputs))
-    runs = newest(Store(outputs))
+    runs = newest(Store(outputs) if options.command == "paper" else existing_store(outputs))
     broken = outliers(list(chain(*runs.values())))
     folder = options.report or outputs / "paper"
     measured = gather(jobs, runs)
@@ -75,6 +75,8 @@ def data_set(words: Sequence[str]) -> tuple[list[str], DataSet | None]:
 
 def _check(store: Store) -> int:
     runs = list(chain(*newest(store).values()))
+    if not runs:
+        raise SteerbenchError(f"{store.folder}: no runs, only pictures that were scored")
     broken = outliers(runs)
     if broken:
         show(outlier_table(broken, runs))

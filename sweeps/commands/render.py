@@ -18,7 +18,7 @@ from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable, explained, install_command
 from bench.metrics import as_bytes, quantise
 from bench.paths import write_path
-from bench.results import Store
+from bench.results import existing_store
 from bench.scoring import check_frame
 from bench.trajectories import MIXED
 from bench.types import Camera, Method, NullProbe
@@ -119,7 +119,7 @@ def words_of_run(key: str | None, words: Sequence[str]) -> list[str]:
     """The words of the command that measured the run `key` of the store."""
     if key is None:
         return []
-    store = Store(Path(composed(words).outputs))
+    store = existing_store(Path(composed(words).outputs))
     _, command, *rest = shlex.split(str(store.record(store.whole_key(key))["command"]))
     if command != "run":
         raise SteerbenchError(f"run {key}: expected one of `steerbench run`, got {command}")

@@ -4,8 +4,8 @@ import argparse
 import math
 import sys
 
-from bench.errors import SteerbenchError, unknown
-from bench.results import COLUMNS, Store
+from bench.errors import unknown
+from bench.results import COLUMNS, existing_store
 from reports.lines import results
 from reports.tables import NOT_AVAILABLE, Table
 from sweeps.terminal import show
@@ -19,10 +19,8 @@ SHOWN = (
 
 def main(options: argparse.Namespace) -> int:
     """Print the rows below `options.outputs`, filtered if asked, in the form that is asked for."""
-    store = Store(options.outputs)
+    store = existing_store(options.outputs)
     rows = results(store, report=lambda message: print(message, file=sys.stderr))
-    if rows.empty:
-        raise SteerbenchError(f"{options.outputs}: no runs yet; `steerbench run` makes one")
     for column in ("method", "scene", "metric"):
         wanted = getattr(options, column)
         if wanted is not None:

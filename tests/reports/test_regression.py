@@ -6,15 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bench.errors import SteerbenchError
 from bench.rows import half_interval, path_interval
-from reports.regression import LIMITS, Change, Figures, Limit, changes
+from reports.regression import LIMITS, Assertion, Figures, Limit, changes, limited
 
 OLD = Figures(
     {"psnr": 30.0, "frame_ms": 100.0, "size_bytes.total": 1000.0}, {}, "one machine", "views"
 )
 
 
-def change(metric: str, old: list[Figures], new: list[Figures]) -> Change:
+def change(metric: str, old: list[Figures], new: list[Figures]) -> Assertion:
     (found,) = (found for found in changes(old, new) if found.metric == metric)
     return found
 
@@ -66,8 +67,8 @@ def test_frames_that_both_have_are_compared_in_pairs(by, verdict):
     after = [*(value + each for value, each in zip(before, by, strict=True)), 99.0]
     found = change("psnr", [with_frames("psnr", *before)], [with_frames("psnr", *after)])
     half = path_interval(np.array(by))
-    assert found.by == pytest.approx(np.mean(by))
-    assert found.interval == pytest.approx((found.by - half, found.by + half))
+    assert found.change == pytest.approx(np.mean(by))
+    assert found.interval == pytest.approx((found.change - half, found.change + half))
     assert found.verdict == verdict
 
 
@@ -79,18 +80,18 @@ def test_frames_without_an_error_hide_no_others(before):
         for psnr, last in ((30.0, before), (20.0, math.inf))
     )
     found = change("psnr", [old], [new])
-    assert (found.by, found.verdict) == (pytest.approx(-9), "worse")
+    assert (found.change, found.verdict) == (pytest.approx(-9), "worse")
     assert change("psnr", [old], [old]).verdict == ""
 
 
 def test_one_slow_frame_among_many_is_chance():
     new = with_frames("frame_ms", *[100.0] * 11, 2000.0, *[100.0] * 12)
     found = change("frame_ms", [with_frames("frame_ms", *[100.0] * 24)], [new])
-    assert found.by > 25
+    assert found.change > 25
     assert found.verdict == ""
 
 
-def seeds(*by: float) -> Change:
+def seeds(*by: float) -> Assertion:
     """PSNR of a run with so many seeds, each of which changed by so much in all of its frames."""
     before = [np.arange(25.0 + seed, 31.0 + seed) for seed in range(len(by))]
     old = [with_frames("psnr", *frames) for frames in before]
@@ -101,9 +102,9 @@ def seeds(*by: float) -> Change:
 def test_seeds_of_which_some_became_better_have_changed_by_chance():
     """All frames of a training change alike, so that those of one seed would call it worse."""
     found = seeds(-0.6, 0.2, -0.4)
-    assert found.by == pytest.approx(-0.8 / 3)
+    assert found.change == pytest.approx(-0.8 / 3)
     half = half_interval(np.array([-0.6, 0.2, -0.4]))
-    assert found.interval == pytest.approx((found.by - half, found.by + half))
+    assert found.interval == pytest.approx((found.change - half, found.change + half))
     assert found.verdict == ""
     assert seeds(-0.6).verdict == seeds(-0.6, -0.5, -0.7).verdict == "worse"
 
@@ -126,6 +127,29 @@ def test_a_baseline_can_have_limits_of_its_own():
     (wide,) = changes([OLD], [new], {"psnr": Limit(1, absolute=2.0)})
     assert wide.verdict == ""
     assert LIMITS["psnr"].absolute < 1
+
+
+def test_an_assertion_says_by_how_much_and_against_which_limit():
+    new = replace(OLD, values={**OLD.values, "psnr": 28.766, "frame_ms": 131.0})
+    assert str(change("psnr", [OLD], [new])) == "psnr -1.23 dB (limit 0.1)"
+    assert str(change("frame_ms", [OLD], [new])) == "frame_ms +31 % (limit 25 %)"
+
+
+def test_limits_are_typed_in_the_unit_of_the_metric_or_as_a_share():
+    found = limited(["psnr=0.2", "frame_ms=10%", "flip=0.01"], {"psnr": LIMITS["psnr"]})
+    times = Limit(-1, relative=0.1, here=True, unit="ms")
+    psnr, flip = Limit(1, absolute=0.2, unit="dB"), Limit(-1, absolute=0.01)
+    assert found == {"psnr": psnr, "frame_ms": times, "flip": flip}
+    for word, said in (("pnsr=1", "Did you mean psnr"), ("psnr=-1", "got -1"), ("psnr", "nothing")):
+        with pytest.raises(SteerbenchError, match=said):
+            limited([word])
+
+
+def test_noise_of_the_frames_passes_ten_of_ten():
+    generator, old = np.random.default_rng(0), np.linspace(25, 35, 24)
+    for _ in range(10):
+        new = with_frames("psnr", *old + generator.normal(0, 0.15, 24))
+        assert change("psnr", [with_frames("psnr", *old)], [new]).verdict == ""
 
 
 def test_frames_are_those_that_the_headline_is_the_mean_of(run):

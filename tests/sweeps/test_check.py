@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pandas as pd
@@ -9,8 +10,10 @@ import pytest
 
 from bench.errors import SteerbenchError
 from bench.results import Store
+from sweeps.baseline import portable
 from sweeps.cli import dispatch
 from tests.reports.conftest import rewrite
+from tests.sweeps.conftest import HERE, QUICK
 
 
 @pytest.fixture
@@ -34,14 +37,15 @@ def baseline(outputs: Path, tmp_path: Path) -> Path:
 
 def test_a_figure_that_became_worse_is_shown_and_fails(baseline, outputs, capsys):
     held = json.loads(baseline.read_text())
-    ((figures,),) = (seeds.values() for seeds in held["runs"].values())
+    (figures,) = held["runs"][0]["seeds"].values()
     figures["values"]["psnr"] += 1
     figures["frames"]["psnr"] = {name: x + 1 for name, x in figures["frames"]["psnr"].items()}
     baseline.write_text(json.dumps(held))
     assert check(baseline, outputs) == 1
-    (line,) = [line for line in capsys.readouterr().out.splitlines() if "psnr" in line]
+    line, last = [line for line in capsys.readouterr().out.splitlines() if "psnr" in line]
     assert "-1" in line
-    assert "worse" in line
+    assert "| 0.1 | worse |" in line
+    assert last == "worse: psnr -1 dB (limit 0.1): offset, scene tiny"
 
 
 def test_a_baseline_that_is_recorded_anew_keeps_its_limits_and_its_runs(baseline, outputs):
@@ -51,20 +55,25 @@ def test_a_baseline_that_is_recorded_anew_keeps_its_limits_and_its_runs(baseline
     assert check(baseline, outputs, "--record") == 0
     again = json.loads(baseline.read_text())
     assert again["limits"]["psnr"]["absolute"] == 0.5
-    assert again["runs"].keys() == held["runs"].keys()
-    assert list(again["runs"]["method=offset scene=tiny"]["5"]["values"]) == ["psnr"]
+    (run,) = again["runs"]
+    assert run["command"] == "run scene=tiny method=offset"
+    assert list(run["seeds"]["5"]["values"]) == ["psnr"]
+    assert check(baseline, outputs, "--record", "--limit", "ssim=1%") == 0
+    assert json.loads(baseline.read_text())["limits"].keys() == {"psnr", "ssim"}
 
 
 def test_a_run_of_other_frames_fails_and_the_others_are_still_compared(baseline, outputs, capsys):
     held = json.loads(baseline.read_text())
-    ((command, seeds),) = held["runs"].items()
-    others = {"5": {**seeds["5"], "views": "others"}}
-    held["runs"] = {command: others, "method=other": seeds}
+    (run,) = held["runs"]
+    others = {"5": {**run["seeds"]["5"], "views": "others"}}
+    other = {**run, "subject": ["other", *run["subject"][1:]], "command": "run method=other"}
+    held["runs"] = [{**run, "seeds": others}, other]
     baseline.write_text(json.dumps(held))
     assert check(baseline, outputs) == 1
     out = capsys.readouterr().out
-    assert f"{command}: these are figures of other frames" in out
-    assert "method=other: no such run" in out
+    assert "these are figures of other frames" in out
+    assert f"no such run below {outputs}: run method=other" in out
+    assert out.endswith("peak_bytes: other, scene tiny\n")
 
 
 @pytest.mark.parametrize("text", [None, "", "{}", '{"schema": 99}'])
@@ -89,14 +98,15 @@ def test_all_seeds_of_a_run_are_one_entry_and_none_may_be_missing(outputs, copy,
     rows.to_csv(copy / "rows.csv", index=False)
     path = tmp_path / "baseline.json"
     assert check(path, outputs, "--record") == 0
-    (seeds,) = json.loads(path.read_text())["runs"].values()
+    (run,) = json.loads(path.read_text())["runs"]
+    seeds = run["seeds"]
     assert seeds.keys() == {"5", "6"}
     assert seeds["6"]["values"]["psnr"] == pytest.approx(seeds["5"]["values"]["psnr"] + 1)
     assert check(path, outputs) == 0
     assert "as good as the baseline" in capsys.readouterr().out
     shutil.rmtree(copy)
     assert check(path, outputs) == 1
-    assert "scene=tiny: no such run with seed=6 below" in capsys.readouterr().out
+    assert "no such run with seed=6 below" in capsys.readouterr().out
 
 
 def test_a_run_of_another_schema_is_left_out_and_not_compared(baseline, outputs, stored_run, copy):
@@ -104,3 +114,73 @@ def test_a_run_of_another_schema_is_left_out_and_not_compared(baseline, outputs,
     assert check(baseline, outputs) == 0
     with pytest.raises(SteerbenchError, match=rf"{copy.name}: stored by another .* \(schema 1,"):
         dispatch(["compare", copy.name, stored_run, "--outputs", str(outputs)])
+
+
+def test_what_a_record_leaves_out_is_said(outputs, copy, tmp_path, capsys):
+    rewrite(Store(outputs), copy.name, schema_version=1)
+    (outputs / "failures").mkdir()
+    (outputs / "failures" / "0.txt").write_text("no room\n")
+    assert check(tmp_path / "baseline.json", outputs, "--record") == 0
+    out = capsys.readouterr().out
+    assert "without a limit: fps, frame_ms.*, " in out
+    assert "left out: a run that failed: no room" in out
+    assert f"left out: {copy.name}: stored by another version" in out
+
+
+def test_a_folder_that_is_no_store_is_an_error_of_every_command(steerbench, baseline):
+    own = ("results", "compare 0 1", "check baseline.json", "check --record new.json")
+    commands = [f"{x} --outputs nowhere" for x in (*own, "export nerfbaselines 0 --to there")]
+    of_settings = ("report --table table3", "report --check", "render --run 0")
+    commands += [f"{x} outputs=nowhere" for x in of_settings]
+    for said in ("there is no store of runs", "no runs to read"):
+        for command in commands:
+            refused = steerbench(*command.split()).refused()
+            assert f"steerbench: nowhere: {said}; `steerbench run outputs=nowhere`" in refused
+        Path("nowhere/runs").mkdir(parents=True, exist_ok=True)
+
+
+# A gate for other checkouts
+
+
+@pytest.fixture
+def gate(steerbench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Measure a method of a checkout, whose YAML says `level`, and check it there with words."""
+
+    def called(checkout: str, *words: str, level: float = 0.5):
+        shutil.copytree(HERE / "configs", tmp_path / checkout / "configs", dirs_exist_ok=True)
+        monkeypatch.chdir(tmp_path / checkout)
+        method = Path("configs/method/grey.yaml")
+        method.write_text(method.read_text().replace("level: 0.5", f"level: {level}"))
+        steerbench("run", "--config-dir", "configs", *QUICK, "-m", "seed=0,1").ok()
+        return steerbench("check", "../baseline.json", *words)
+
+    called("one", "--record", "--limit", "frame_ms=99999%", "--limit", "peak_bytes=999%").ok()
+    return called
+
+
+def test_a_gate_passes_in_a_checkout_elsewhere_with_a_method_of_its_own(gate, tmp_path):
+    assert str(tmp_path) not in Path("../baseline.json").read_text()
+    assert gate("two").ok().out.endswith("as good as the baseline\n")
+
+
+def test_a_setting_that_makes_it_worse_fails_and_every_form_names_the_metrics(gate, monkeypatch):
+    summary = Path("summary.md").absolute()
+    summary.write_text("before\n")
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(summary))
+    failed = gate("two", "--markdown", str(summary), "--junit", "junit.xml", level=0.25)
+    last = failed.out.splitlines()[-1]
+    assert failed.status == 1
+    assert "other settings: method.level=0.25 (was 0.5)" in failed.out
+    assert last.startswith("worse: psnr -3.54 dB (limit 0.1), ssim -0.")
+    assert last.endswith(" (limit 0.002): grey, scene white")
+    assert summary.read_text().startswith(f"before\n## steerbench check\n\n{last}\n\n### grey")
+    cases = ET.parse("junit.xml").getroot()
+    worse = [case.attrib["name"] for case in cases if case.find("failure") is not None]
+    shown = json.loads(gate("two", "--json", "-", level=0.25).out)
+    assert worse == [x["metric"] for x in shown if x["verdict"] == "worse"] == ["psnr", "ssim"]
+    assert len(cases) == len(shown)
+
+
+def test_an_absolute_path_is_known_by_its_last_part():
+    typed = "/a/worker.py --model=~/b/c.ply x/y http://host/d ['/e/f', 1]"
+    assert portable(typed) == "worker.py --model=c.ply x/y http://host/d ['f', 1]"

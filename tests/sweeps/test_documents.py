@@ -1,6 +1,7 @@
 """What the documents tell a reader to write, to type and to open exists and does what they say."""
 
 import ast
+import os
 import re
 import shlex
 import sys
@@ -13,8 +14,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from omegaconf import OmegaConf
 
+from reports.regression import LIMITS
 from sweeps import cli, overrides
 from sweeps.overrides import choices, composed, swept
 from sweeps.plan import plan
@@ -118,6 +121,41 @@ def test_the_table_of_the_document_is_measured_reported_and_the_same_sweep(steer
     assert page.read_text() == written
     swept = steerbench(*typed("run -m"), *WITHOUT_LPIPS).ok()
     assert swept.err.count("already measured") == 4
+
+
+# The gate of commands.md
+
+
+def test_the_workflow_and_the_test_of_the_document_pass(steerbench, tmp_path, monkeypatch):
+    text = (DOCS / "commands.md").read_text()
+    (workflow,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+    steps = [step.get("run", "") for step in yaml.safe_load(workflow)["jobs"]["check"]["steps"]]
+    measure, check = (shlex.split(step)[1:] for step in steps if step.startswith("steerbench"))
+    (tmp_path / "configs" / "method").mkdir(parents=True)
+    grey = ROOT / "tests/sweeps/configs/method/grey.yaml"
+    (tmp_path / "configs" / "method" / "mine.yaml").write_text(grey.read_text())
+    steerbench(*measure, "scene.train=2", "scene.test=2").ok()
+    steerbench("check", "--record", "baseline.json").ok()
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", "summary.md")
+    steerbench(*map(os.path.expandvars, check)).ok()
+    assert "as good as the baseline" in Path("summary.md").read_text()
+    assert Path("check.xml").is_file()
+
+    (test,) = re.findall(r"```python\n(import pytest.*?)```", text, re.DOTALL)
+    names: dict[str, Any] = {}
+    exec(test, names)
+    ((_, cases),) = [mark.args for mark in names["test_nothing_became_worse"].pytestmark]
+    assert "psnr" in [one.metric for one in cases]
+    for one in cases:
+        names["test_nothing_became_worse"](one)
+
+
+def test_the_limits_of_the_document_are_those_there_are():
+    text = (DOCS / "protocol.md").read_text().partition("### Limits of")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| `(.*)` \| (.*) \| (everywhere)?.* \|$", text, re.MULTILINE)
+    assert [(name, limit, not where) for name, limit, where in rows] == [
+        (name, f"{x} {x.unit * (not x.relative)}".strip(), x.here) for name, x in LIMITS.items()
+    ]
 
 
 # All documents
