@@ -25,6 +25,7 @@ class ConsoleLog:
     def __init__(
         self, root: Path, quiet: bool = False, clock: Callable[[], float] = time.monotonic
     ) -> None:
+        self.followers: list[Callable[[str], object]] = []  # are told the progress, too
         self._root = root
         self._console = Console(stderr=True, quiet=quiet)
         self._clock = clock
@@ -48,7 +49,7 @@ class ConsoleLog:
     @contextmanager
     def progress(self, label: str, total: int) -> Iterator[_Bar]:
         """Show a bar, or a line now and then without a terminal; bars may nest."""
-        bar = _Bar(self.info, self._bars, label, total)
+        bar = _Bar(self, self._bars, label, total)
         self._bars.start()
         try:
             yield bar
@@ -69,10 +70,8 @@ class ConsoleLog:
 
 
 class _Bar:
-    def __init__(
-        self, say: Callable[[str], None], bars: progress.Progress, label: str, total: int
-    ) -> None:
-        self._say, self._bars, self._label = say, bars, label
+    def __init__(self, log: ConsoleLog, bars: progress.Progress, label: str, total: int) -> None:
+        self._log, self._bars, self._label = log, bars, label
         self.id = bars.add_task(label, total=total, note="")
         self._task = bars.tasks[-1]
         self._begun, self._shown = bars.get_time(), 0.0
@@ -82,11 +81,13 @@ class _Bar:
         plain, elapsed = self._bars.disable, self.elapsed()
         if elapsed - self._shown < (PLAIN_INTERVAL_S if plain else DRAW_INTERVAL_S):
             return
-        self._shown = elapsed
+        self._shown, task = elapsed, self._task
+        left = "?" if task.time_remaining is None else _duration(task.time_remaining)
+        line = self._line(f"{task.percentage:.0f} %, {_duration(elapsed)} elapsed, {left} left")
+        for tell in self._log.followers:
+            tell(line)
         if plain:
-            left = self._task.time_remaining
-            more = "?" if left is None else _duration(left)
-            self.say(f"{self._task.percentage:.0f} %, {_duration(elapsed)} elapsed, {more} left")
+            self._log.info(line)
         else:
             self._bars.refresh()
 
@@ -94,8 +95,11 @@ class _Bar:
         return self._bars.get_time() - self._begun
 
     def say(self, text: str) -> None:
+        self._log.info(self._line(text))
+
+    def _line(self, text: str) -> str:
         note = self._task.fields["note"]
-        self._say(f"{self._label}: {text}" + (f", {note}" if note else ""))
+        return f"{self._label}: {text}" + (f", {note}" if note else "")
 
 
 def _duration(seconds: float) -> str:

@@ -66,17 +66,12 @@ def _named(method: Method, several: bool) -> Iterator[None]:
         raise
 
 
-def measure(methods: Sequence[Method], task: Task, log: Log) -> list[Measurement]:
-    """Fit `methods` to the scene of `task`; render its trajectory under the clock and score it.
+def train(methods: Sequence[Method], task: Task, log: Log) -> None:
+    """Fit `methods` to the scene of `task`.
 
-    Several methods render each frame one after the other, so that their times come from the same
-    minutes. The first round through the trajectory is scored; with `protocol.rounds`, times and
-    work come from that further round whose mean time of the steady frames is the lower median.
-    Peak memory of the process is that of all methods together. Raises SteerbenchError if the scene
-    does not fit the protocol, or a method rendered values that are not finite; of several methods,
-    MethodFailed for whatever one of them raises.
+    Raises SteerbenchError if the scene does not fit the protocol; of several methods, MethodFailed
+    for whatever one of them raises.
     """
-    lpips, missing = task.protocol.load_lpips(task.weights_dir, log)
     task.protocol.check(task.scene, task.trajectory)
     if task.protocol.compared:
         _check_steady(methods, task.trajectory)
@@ -85,6 +80,19 @@ def measure(methods: Sequence[Method], task: Task, log: Log) -> list[Measurement
     for method in methods:
         with _named(method, len(methods) > 1):
             method.fit(task.scene, task.budget, log)
+
+
+def measure(methods: Sequence[Method], task: Task, log: Log) -> list[Measurement]:
+    """Render the trajectory of `task` with trained `methods` under the clock, and score it.
+
+    Several methods render each frame one after the other, so that their times come from the same
+    minutes. The first round through the trajectory is scored; with `protocol.rounds`, times and
+    work come from that further round whose mean time of the steady frames is the lower median.
+    Peak memory of the process is that of all methods together. Raises SteerbenchError if a method
+    rendered values that are not finite; of several methods, MethodFailed for whatever one of them
+    raises.
+    """
+    lpips, missing = task.protocol.load_lpips(task.weights_dir, log)
     takes = [_Take(method, task, lpips) for method in methods]
     neighbours = _render(takes, task, log)
     if neighbours.notable:

@@ -20,13 +20,15 @@ class Neighbours(NamedTuple):
     busy: float  # cores on average; in a virtual machine, with what the host took (steal time)
     cores: int
     seconds: float = math.inf
+    exclusive: bool = True  # whether no run that waits for its turn could train or measure then
 
     @property
     def notable(self) -> bool:
         return self.seconds >= SHORTEST and self.busy > NOTABLE_SHARE * self.cores
 
     def __str__(self) -> str:
-        return f"other programs kept {self.busy:.1f} of {self.cores} cores busy"
+        text = f"other programs kept {self.busy:.1f} of {self.cores} cores busy"
+        return text if self.exclusive else f"{text}; not timed alone (exclusive=false)"
 
 
 class Watch:

@@ -45,6 +45,7 @@ class Settings:
     device: str
     backend: str
     threads: int | None
+    exclusive: bool
     pictures: int
     frame_size: Sequence[int] | None
     outputs: str
@@ -92,6 +93,13 @@ def use_threads(settings: Settings) -> None:
     if settings.threads and threads > cores:
         print(f"threads={threads}: more than the {cores} cores here are slower", file=sys.stderr)
     torch.set_num_threads(threads)
+
+
+def training_threads(config: DictConfig) -> int:
+    """How many cores a training keeps busy."""
+    cores = len(os.sched_getaffinity(0))
+    threads = build(config, "budget").threads or config.threads
+    return min(threads, cores) if isinstance(threads, int) else cores
 
 
 def trained(config: DictConfig, log: Log) -> Method:

@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import as_completed
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import groupby
@@ -33,13 +33,13 @@ from bench.sharing import whole
 from bench.study import study_of
 from reports.runs import load_runs
 from reports.tables import decimal
-from sweeps.configured import build, trained
+from sweeps.configured import trained, training_threads
 from sweeps.measurement import Job, JobFailed, obtain, reason, stored
 from sweeps.overrides import CONFIGS, composed, explain, setting, target_of
 from sweeps.processes import device_lock, on_gpu, processes, set_up
 from sweeps.terminal import time_left
 
-OF_MEASUREMENT = ("engine", "precision", "protocol", "pictures")
+OF_MEASUREMENT = ("engine", "precision", "protocol", "pictures", "exclusive")
 """Settings of run.yaml that no training depends on."""
 
 Group = list[tuple[int, Job]]
@@ -304,7 +304,7 @@ def train_ahead(jobs: Sequence[Job], measured: Collection[str]) -> None:
     workers, log = room(jobs[0].config), ConsoleLog(jobs[0].outputs)
     log.info(f"training {len(todo)} models, {workers} at a time")
     begun = time.monotonic()
-    with device_lock("cpu", log), processes(workers) as pool:
+    with processes(workers) as pool:
         names = {pool.submit(_train, job.config): job.name for job in todo.values()}
         for number, ended in enumerate(as_completed(names), 1):
             left = time_left(time.monotonic() - begun, number, len(todo) - number)
@@ -314,11 +314,9 @@ def train_ahead(jobs: Sequence[Job], measured: Collection[str]) -> None:
 
 
 def room(config: DictConfig) -> int:
-    """How many trainings can run at a time; 1 on a GPU, or if the budget sets no `threads`."""
-    threads = build(config, "budget").threads
-    if threads is None or on_gpu(config.device):
-        return 1
-    return len(os.sched_getaffinity(0)) // threads
+    """How many trainings can run at a time; 1 on a GPU, or if nothing sets their threads."""
+    cores = len(os.sched_getaffinity(0))
+    return 1 if on_gpu(config.device) else cores // training_threads(config)
 
 
 def _training(job: Job) -> str:
@@ -333,4 +331,8 @@ def _training(job: Job) -> str:
 
 def _train(config: DictConfig) -> float:
     """Train, or load the training, in a worker process; return the seconds it took."""
-    return trained(config, ConsoleLog(Path(config.outputs), quiet=True)).train_s
+    log, quiet = (ConsoleLog(Path(config.outputs), quiet=each) for each in (False, True))
+    quiet.followers = log.followers
+    turn = device_lock(config.device, log, training_threads(config))
+    with turn if config.exclusive else nullcontext():
+        return trained(config, quiet).train_s

@@ -3,7 +3,7 @@
 import hashlib
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, explained, unexpected
-from bench.measure import MethodFailed, Task, measure
+from bench.measure import MethodFailed, Task, measure, train
 from bench.provenance import computed_by
 from bench.results import Store, content_key
 from bench.sharing import whole
@@ -30,6 +30,7 @@ from sweeps.configured import (
     scene_digest,
     scene_folder,
     scene_of,
+    training_threads,
     use_threads,
 )
 from sweeps.experiments import axes
@@ -46,14 +47,15 @@ def described(config: DictConfig) -> dict[str, Any]:
     """The settings that determine a run; equal for equal jobs.
 
     Left out are: locations, except the last part of a scene's folder, which rows show; `split`,
-    which is in the trajectory; the engine, if the method uses none; what only the tables read; and
-    whether a sweep is measured in turns, which is in `Job.turns`.
+    which is in the trajectory; the engine, if the method uses none; what only the tables read;
+    whether a sweep is measured in turns, which is in `Job.turns`; and `exclusive`, unless false.
     """
     try:
         plain: Any = OmegaConf.to_container(config, resolve=True)
     except OmegaConfBaseException as error:  # a setting that others use was removed
         raise SteerbenchError(" ".join(str(error).split())) from error
-    unused = () if "engine" in plain["method"] else ("engine", "precision")
+    unused = ["exclusive"] if plain.get("exclusive") is True else []
+    unused += [] if "engine" in plain["method"] else ["engine", "precision"]
     left_out = ("split", "tables", "in_turns", *PLACES, *unused)
     kept = {key: value for key, value in plain.items() if key not in left_out}
     for group, place in (("scene", "root"), ("method", "folders")):
@@ -149,11 +151,12 @@ def obtain(jobs: Sequence[Job]) -> tuple[list[str], bool]:
     one of several jobs fails, for whatever reason: the others can then be obtained without it.
     """
     log = ConsoleLog(jobs[0].outputs)
-    ready, measured = _ready(jobs, log), False
-    if not _stored(ready):
-        with ExitStack() as locks:
-            for device in sorted({each.method.settings()["device"] for each in ready}):
-                locks.enter_context(device_lock(device, log))
+    ready = _ready(jobs, log)
+    measured = not _stored(ready)
+    if measured:
+        with _turn(ready, log, training_threads(jobs[0].config)):
+            train([each.method for each in ready], ready[0].task, log)
+        with _turn(ready, log):
             measured = not _stored(ready)  # by another process meanwhile
             if measured:
                 _measure(ready, log)
@@ -268,21 +271,34 @@ def _told(ready: Sequence[_Ready], measured: bool, log: Log) -> list[str]:
     return [each.run for each in ready]
 
 
-def _measure(ready: Sequence[_Ready], log: Log) -> None:
-    """Measure all, and put them in the place of what an interruption has left of them."""
+@contextmanager
+def _turn(ready: Sequence[_Ready], log: ConsoleLog, threads: int | None = None) -> Iterator[None]:
+    """Hold the devices of all that are exclusive, see `device_lock`. A method that fails in the
+    body fails its job."""
+    devices = {each.method.settings()["device"] for each in ready if each.job.config.exclusive}
     try:
-        measurements = measure([each.method for each in ready], ready[0].task, log)
+        with ExitStack() as turns:
+            for device in sorted(devices):
+                turns.enter_context(device_lock(device, log, threads))
+            yield
     except MethodFailed as failed:
         (job,) = (each.job for each in ready if each.method is failed.method)
         if _needed(job, [each.job for each in ready]) and failed.__cause__:
             raise failed.__cause__ from None
         raise JobFailed(job) from failed.__cause__
+
+
+def _measure(ready: Sequence[_Ready], log: Log) -> None:
+    """Measure all, and put them in the place of what an interruption has left of them."""
+    measurements = measure([each.method for each in ready], ready[0].task, log)
     for each in ready if len(ready) > 1 else ():
         each.job.store.remove(each.run)
     for each, measurement in zip(ready, measurements, strict=True):
         command, place = shlex.join(each.job.command), scene_folder(each.job.config)
         named = {axis.setting: name for name, axis in axes(each.method.name).items()}
-        record = {**measurement.record, "command": command, "scene_path": place, "axes": named}
+        record: dict[str, Any] = {**measurement.record, "command": command}
+        record |= {"scene_path": place, "axes": named}
+        record["neighbours"] |= {"exclusive": each.job.config.exclusive}
         if each.task.protocol.compared:
             record["compared_with"] = ready[0].run
         each.job.store.save(each.parts, replace(measurement, record=record))

@@ -10,15 +10,15 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench.memory import keep_freed
-from bench.sharing import locked
+from bench.waiting import queued
 
 if TYPE_CHECKING:  # help and completion do not load torch
-    from bench.types import Log
+    from bench.console import ConsoleLog
 
 LOCKS = "STEERBENCH_LOCKS"  # the environment variable that names another folder for the locks
 
@@ -67,13 +67,16 @@ def _begin() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def device_lock(device: str, log: Log) -> AbstractContextManager[None]:
-    """Wait until no other process of this machine measures on `device`, then hold the lock.
+@contextmanager
+def device_lock(device: str, log: ConsoleLog, threads: int | None = None) -> Iterator[None]:
+    """Wait for a turn on `device`, named as in `steerbench run`, and hold it.
 
-    Parallel work would distort the times. `device` is named as in `steerbench run`. If a process is
-    killed, the system releases its lock.
+    Without `threads` alone: parallel work would distort the times. A training of so many threads
+    has a turn beside others, as far as there are cores, but a GPU alone.
     """
-    return locked(lock_file(device), f"waiting: another process measures on {device}", log)
+    what = f"{device} (exclusive=false waits for nobody; ${LOCKS} may name another folder)"
+    with queued(lock_file(device), None if on_gpu(device) else threads, what, log):
+        yield
 
 
 def on_gpu(device: str) -> bool:

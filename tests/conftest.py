@@ -24,7 +24,7 @@ from torch import Tensor
 
 from bench import neighbours
 from bench.console import ConsoleLog
-from bench.measure import Task, measure
+from bench.measure import Task, measure, train
 from bench.metrics import declare_torchvision
 from bench.nerfbaselines import VERSION
 from bench.results import Store
@@ -254,6 +254,7 @@ def store(tmp_path: Path, offset_method, tiny_scene, quiet_log) -> Store:
     """A store with one run, key `stored_run`, six frames, three of them pictured."""
     budget = Budget("none", steps=1, samples=1)
     task = Task(tiny_scene, from_split(tiny_scene), QUICK, budget, seed=5)
+    train([offset_method], task, quiet_log)
     (measurement,) = measure([offset_method], task, quiet_log)
     record = {
         **measurement.record,

@@ -54,6 +54,7 @@ class Browser:
     exact: Any
     record: Any
     figures: Any
+    stages: Any
     path: list[Camera] = field(default_factory=list)
     camera: Camera | None = None
     drawn: list[Drawn] | None = None
@@ -137,7 +138,9 @@ class Viewer:
         if who in self.browsers:  # still connected
             scene = browser.client.scene
             scene.set_background_image(as_bytes(picture), "jpeg", jpeg_quality=90)
-            browser.figures.content = _figures(self.painter, browser.drawn, truth)
+            sides = ("left: ", "right: ") if browser.shown.value == SIDE else ("", "")
+            browser.figures.content = _figures(self.painter, browser.drawn, truth, sides)
+            browser.stages.content = _stages(self.painter, browser.drawn)
         if not whole:
             self.turns.offer(who, Ask(ask.camera, still=True))
         elif browser.record.value:
@@ -199,19 +202,25 @@ class Viewer:
         two = len(names) == 2
         choices = [*dict.fromkeys(names), *((SIDE, DIFFERENCE) if two else ())]
         choices += [TRUTH, ERROR] if self.scene.exact else []
-        browser = Browser(
-            client,
-            shown=gui.add_dropdown("picture", choices, initial_value=SIDE if two else choices[0]),
-            split=gui.add_slider("divided at", 0.0, 1.0, 0.01, 0.5, visible=two),
-            height=gui.add_slider("rows", 16, 2160, 8, self.first.height),
-            exact=gui.add_checkbox("PSNR", False, visible=self.scene.exact is not None),
-            record=gui.add_checkbox("record a path", False),
-            figures=gui.add_markdown("drawing the first picture ..."),
-        )
+        shown = gui.add_dropdown("picture", choices, initial_value=SIDE if two else choices[0])
+        split = gui.add_slider("divided at", 0.0, 1.0, 0.01, 0.5, visible=two)
+        figures = gui.add_markdown("drawing the first picture ...")
+        with gui.add_folder("more", expand_by_default=False):  # a phone has no room for it
+            browser = Browser(
+                client,
+                shown=shown,
+                split=split,
+                height=gui.add_slider("rows", 16, 2160, 8, self.first.height),
+                exact=gui.add_checkbox("PSNR", False, visible=self.scene.exact is not None),
+                record=gui.add_checkbox("record a path", False),
+                figures=figures,
+                stages=gui.add_markdown(""),
+            )
+            first = gui.add_button("first view")
         controls = browser.shown, browser.split, browser.height, browser.exact, browser.record
         for control in controls:
             control.on_update(lambda _: self._want(client.client_id))
-        gui.add_button("first view").on_click(lambda _: self._look(client.camera, self.first))
+        first.on_click(lambda _: self._look(client.camera, self.first))
         self.browsers[client.client_id] = browser
         client.camera.on_update(lambda _: self._want(client.client_id))
         self._want(client.client_id)
@@ -284,13 +293,21 @@ def _three(vector: Tensor) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _figures(painter: Painter, drawn: Sequence[Drawn], truth: Tensor | None) -> str:
+def _figures(
+    painter: Painter, drawn: Sequence[Drawn], truth: Tensor | None, sides: Sequence[str]
+) -> str:
+    lines = []
+    for side, method, picture in zip(sides, painter.methods, drawn, strict=False):
+        quality = "" if truth is None else f", {psnr(picture.rgb, truth):.2f} dB"
+        lines.append(f"{side}**{method.name}** {picture.ms:.0f} ms{quality}")
+    return "\n\n".join(lines)
+
+
+def _stages(painter: Painter, drawn: Sequence[Drawn]) -> str:
     height, width = drawn[0].rgb.shape[:2]
     lines = [f"{width} x {height} pixels", ""]
     for method, picture in zip(painter.methods, drawn, strict=True):
-        quality = "" if truth is None else f", {psnr(picture.rgb, truth):.2f} dB"
-        lines += [f"**{method.name}** {picture.ms:.0f} ms{quality}", ""]
-        lines += ["| stage | ms |", "|---|---|"]
+        lines += [f"| {method.name} | ms |", "|---|---|"]
         lines += [f"| {stage} | {ms:.1f} |" for stage, ms in picture.stages_ms.items()]
         lines.append("")
     return "\n".join(lines)

@@ -55,13 +55,15 @@ def test_work_that_fails_or_is_short_is_not_called_done_and_the_next_is(plain, c
     assert capsys.readouterr().err == "again: done in 0:00:05\n"
 
 
-def test_a_quiet_log_says_nothing(tmp_path, clock, capsys):
-    log = ConsoleLog(tmp_path, quiet=True, clock=lambda: clock.now)
+def test_a_quiet_log_says_nothing_but_to_who_follows_it(tmp_path, clock, capsys):
+    log, told = ConsoleLog(tmp_path, quiet=True, clock=lambda: clock.now), []
+    log.followers.append(told.append)
     log.info("hello")
     with log.progress("training", 10) as bar:
         clock.now += 60.0
         bar.advance(5)
     assert capsys.readouterr() == ("", "")
+    assert told[0].startswith("training: 50 %, 0:01:00 elapsed")
 
 
 def test_on_a_terminal_nested_bars_show_how_far_it_is_without_a_thread(

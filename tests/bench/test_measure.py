@@ -13,7 +13,7 @@ import torch
 import bench.measure
 from bench.clock import FrameRecord
 from bench.console import ConsoleLog
-from bench.measure import MethodFailed, Task, _Take, measure
+from bench.measure import MethodFailed, Task, _Take, measure, train
 from bench.metrics import psnr, quantise
 from bench.protocol import EvaluationProtocol
 from bench.results import COLUMNS
@@ -28,12 +28,14 @@ BUDGET = Budget("tiny", steps=1, samples=1)
 
 @pytest.fixture
 def run(tiny_scene, quiet_log):
-    """`measure` on the tiny scene's test split, with anything replaced that a test is about: what
-    was measured of one method, or a list of several."""
+    """`train` and `measure` on the tiny scene's test split, with anything replaced that a test is
+    about: what was measured of one method, or a list of several."""
 
     def measured(*methods, **changes):
         task = Task(tiny_scene, from_split(tiny_scene), PROTOCOL, BUDGET, seed=5)
-        found = measure(methods, replace(task, **changes), quiet_log)
+        task = replace(task, **changes)
+        train(methods, task, quiet_log)
+        found = measure(methods, task, quiet_log)
         return found if len(methods) > 1 else found[0]
 
     return measured
@@ -407,5 +409,5 @@ def test_what_cannot_be_compared_is_refused_before_anything_is_trained(in_turns,
     method = Brighter(tiny_scene, 0, turns, memory=99)
     task = Task(tiny_scene, from_split(tiny_scene), IN_ROUNDS, BUDGET, seed=0)
     with pytest.raises(SteerbenchError, match="99 frames before it"):
-        measure([method], task, ConsoleLog(Path(), quiet=True))
+        train([method], task, ConsoleLog(Path(), quiet=True))
     assert turns == []

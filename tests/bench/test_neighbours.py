@@ -32,6 +32,7 @@ def test_work_of_others_is_all_work_less_our_own(accounts):
     accounts |= {"passed": 10.0, "own": 18.0, "times": Times(25, 5, 6, 1, 2, 9)}
     assert watch.seen() == Neighbours(pytest.approx(1.4), 4, 10.0)
     assert str(watch.seen()) == "other programs kept 1.4 of 4 cores busy"
+    assert "exclusive=false" in str(watch.seen()._replace(exclusive=False))
 
 
 def test_alone_there_is_nothing_to_warn_of(accounts):

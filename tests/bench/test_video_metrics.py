@@ -14,7 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from bench.cameras import cast, pixel_grid
-from bench.measure import Task, measure
+from bench.measure import Task, measure, train
 from bench.metrics import as_bytes, psnr
 from bench.scenes import embedded
 from bench.scoring import Scoring
@@ -222,6 +222,7 @@ def test_what_is_missing_says_what_it_needs(tiny_scene, offset_method, quiet_log
     steps = (whole.steps[0], replace(whole.steps[1], truth=None), whole.steps[2])
     trajectory = replace(whole, steps=steps)
     task = Task(tiny_scene, trajectory, PATH, Budget("tiny", steps=1, samples=1), seed=0)
+    train([offset_method], task, quiet_log)
     (measured,) = measure([offset_method], task, quiet_log)
     missing = measured.record["missing"]
     assert set(missing) == {"tpsnr", "warp_1_own", "warp_7_own"}  # the depths are infinite

@@ -1,12 +1,14 @@
 """How jobs end and what they leave behind; methods in turns; trainings side by side."""
 
 import os
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from unittest.mock import Mock
 
 import pytest
 
+from bench import waiting
 from bench.errors import SteerbenchError
 from sweeps import execute
 from sweeps.execute import Ended, read
@@ -14,6 +16,7 @@ from sweeps.hydra_runs import label
 from sweeps.measurement import Job, obtain, stored
 from sweeps.overrides import composed
 from sweeps.plan import plan
+from sweeps.processes import LOCKS, device_lock
 from tests.sweeps.conftest import HERE, STAND_INS
 from tests.sweeps.test_plan import TABLES
 
@@ -112,6 +115,53 @@ def test_a_failure_is_kept_for_its_job_until_that_succeeds(elsewhere):
     assert timed.failure is None  # in turns it is another job
     obtain([job])
     assert job.failure is None
+
+
+# Turns on a device
+
+
+@pytest.fixture
+def seen(tmp_path, elsewhere, monkeypatch) -> list[tuple[str, list[int | None]]]:
+    """What the stand-in did, and the threads of all that were in the queue."""
+    monkeypatch.setenv(LOCKS, str(tmp_path))
+    notes = []
+
+    def note(name: str, call, *given):
+        files = sorted(tmp_path.glob("steerbench-*.json"))
+        notes.append((name, [waiting._read(file).threads for file in files]))
+        return call(*given)
+
+    from stand_ins import Grey
+
+    for name in ("fit", "render"):
+        call = getattr(Grey, name)
+        monkeypatch.setattr(Grey, name, lambda *given, of=(name, call): note(*of, *given))
+    return notes
+
+
+def recorded(*words: str) -> dict:
+    job = Job(composed([*STAND_INS, "scene.frames=1", "protocol.warmup=0", *words]), [])
+    return job.store.record(obtain([job])[0][0])
+
+
+def test_a_run_trains_on_its_threads_also_ahead_of_a_table_and_is_timed_alone(seen, quiet_log):
+    with suppress(KeyError), device_lock("cpu", quiet_log):
+        raise KeyError  # it leaves the queue all the same
+    assert recorded("threads=1")["neighbours"]["exclusive"]
+    execute._train(composed([*STAND_INS, "budget.threads=1"]))
+    assert seen == [("fit", [1]), ("render", [None]), ("fit", [1])]
+
+
+def test_what_is_not_exclusive_waits_for_nobody_and_is_another_run(seen, quiet_log):
+    alone = recorded()
+    with device_lock("cpu", quiet_log):
+        beside = recorded("exclusive=false")
+    assert seen[2:] == [("fit", [None]), ("render", [None])]  # of whom it does not wait for
+    assert not beside["neighbours"]["exclusive"]
+    assert beside["made_of"]["config"] == {**alone["made_of"]["config"], "exclusive": False}
+    jobs = [Job(composed([*STAND_INS, f"exclusive={x}"]), []) for x in ("true", "false")]
+    assert len({job.key for job in jobs}) == 2
+    assert len({execute._training(job) for job in jobs}) == 1
 
 
 # Trainings side by side

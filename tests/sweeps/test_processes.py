@@ -1,20 +1,17 @@
-"""One process at a time measures on a device; sweeps run through Hydra's launchers alike."""
+"""Pools of processes, the files of locks; sweeps run through Hydra's launchers alike."""
 
 import os
-import queue
 import select
 import tempfile
-import threading
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 
-from bench.console import ConsoleLog
-from sweeps.processes import LOCKS, device_lock, lock_file, processes
+from sweeps.processes import LOCKS, lock_file, processes
 from tests.sweeps.conftest import PATH
 
 PATIENCE_S = 60.0
@@ -24,27 +21,6 @@ PATIENCE_S = 60.0
 @pytest.fixture(autouse=True)
 def locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(LOCKS, str(tmp_path))
-
-
-@pytest.mark.parametrize("ending", [None, KeyError])
-def test_a_device_that_is_locked_is_waited_for_until_its_work_ends_or_fails(tmp_path, ending):
-    messages: queue.Queue[str] = queue.Queue()
-    log, had = ConsoleLog(tmp_path), threading.Event()
-    log.info = messages.put
-
-    def other() -> None:
-        with device_lock("cpu", log):
-            had.set()
-
-    thread = threading.Thread(target=other, daemon=True)
-    with pytest.raises(ending) if ending else nullcontext(), device_lock("cpu", log):
-        thread.start()
-        assert "waiting: another process measures on cpu" in messages.get(timeout=PATIENCE_S)
-        assert not had.is_set()
-        if ending:
-            raise ending
-    thread.join(PATIENCE_S)
-    assert had.is_set()
 
 
 def test_who_is_told_to_end_does_not_wait_for_its_processes():

@@ -130,6 +130,9 @@ def test_two_methods_stand_side_by_side(opened):
         page.until(lambda: page.picture.size > 0)
         left, right = page.picture[:, 1].mean(), page.picture[:, -2].mean()
         assert abs(left - 102) < 3
+        (seen,) = viewer.browsers.values()
+        page.until(lambda: "left: **grey**" in seen.figures.content)
+        assert "right: **shades**" in seen.figures.content
         page.choose("picture", "difference x 4")
         page.until(lambda: abs(page.picture.mean() - min(4 * abs(right - left), 255)) < 8)
 
