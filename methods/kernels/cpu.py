@@ -152,12 +152,6 @@ def slope(direction):
 
 
 @jit()
-def three(rows, i):
-    """The three numbers of a row."""
-    return rows[i, 0], rows[i, 1], rows[i, 2]
-
-
-@jit()
 def pack_bf16(low, high):
     """Two float32 rounded to nearest even bfloat16, in the low and high half of a word."""
     return u32(u32(_round_bits(low) >> u32(16)) | u32(_round_bits(high) & u32(0xFFFF0000)))

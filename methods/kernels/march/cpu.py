@@ -13,7 +13,7 @@ import torch
 from numba import prange
 from torch import Tensor
 
-from methods.kernels.cpu import arrays, check_float32, f32, i32, jit, slope, three, u64
+from methods.kernels.cpu import arrays, check_float32, f32, i32, jit, slope, u64
 from methods.kernels.march import LEAST_STEP, Segments, longest_ray
 from methods.kernels.types import Extent, Occupancy, Samples, offsets_of
 
@@ -256,7 +256,8 @@ def _find(given, grid, resolution, step, most, found):
     for chunk in prange((rays + CHUNK - 1) // CHUNK):
         floats = np.zeros(FLOATS * CHUNK, np.float32)
         integers = np.zeros(INTEGERS * CHUNK, np.int32)
-        low, high = three(bounds, 0), three(bounds, 1)
+        low = bounds[0, 0], bounds[0, 1], bounds[0, 2]
+        high = bounds[1, 0], bounds[1, 1], bounds[1, 2]
         first = chunk * CHUNK
         active = min(CHUNK, rays - first)
         counts[first : first + active], resume[first : first + active] = 0, -1

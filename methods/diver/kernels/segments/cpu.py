@@ -27,7 +27,6 @@ from methods.kernels.cpu import (
     multiply,
     prefetch,
     sigmoid,
-    three,
 )
 from methods.kernels.types import Pixels
 from methods.kernels.voxel_walk import Crossings, Voxels
@@ -100,6 +99,13 @@ def _corner_weights(x, y, z):
     return gx * w00, x * w00, gx * w10, x * w10, gx * w01, x * w01, gx * w11, x * w11
 
 
+@jit()
+def _put(weights, i, found):
+    """Store the eight weights of a sample."""
+    weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3] = found[0:4]
+    weights[i, 4], weights[i, 5], weights[i, 6], weights[i, 7] = found[4:8]
+
+
 @jit(fastmath=FAST)
 def _mean_weights(ax, ay, az, bx, by, bz):
     """A weight is a cubic along the segment, for which two Gauss-Legendre nodes are exact."""
@@ -128,6 +134,11 @@ def _local(origin, direction, t, resolution, corner):
 
 
 @jit()
+def _three(values, row):
+    return values[row, 0], values[row, 1], values[row, 2]
+
+
+@jit()
 def _weights_between(origin, direction, near, far, resolution, corner):
     """Mean weights in the voxel that begins at `corner`, on a ray from t = `near` to `far`."""
     (ox, oy, oz), (dx, dy, dz), (x, y, z) = origin, direction, corner
@@ -146,11 +157,10 @@ def _segment_weights(origins, directions, ray, near, far, coordinates, voxel, re
     total = len(near)
     for chunk in prange((total + SEGMENTS - 1) // SEGMENTS):
         for i in range(chunk * SEGMENTS, min(total, (chunk + 1) * SEGMENTS)):
-            origin, direction = three(origins, ray[i]), three(directions, ray[i])
-            corner = three(coordinates, voxel[i])
+            origin, direction = _three(origins, ray[i]), _three(directions, ray[i])
+            corner = _three(coordinates, voxel[i])
             found = _weights_between(origin, direction, near[i], far[i], resolution, corner)
-            weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3] = found[0:4]
-            weights[i, 4], weights[i, 5], weights[i, 6], weights[i, 7] = found[4:8]
+            _put(weights, i, found)
 
 
 @jit()
@@ -205,7 +215,7 @@ def _render(given, maps, voxels, resolution, parts, bounds, out):
         buffers = np.empty(BATCH * size, np.float32), np.empty(BATCH * LANES, np.float32)
         sums = np.zeros((CHUNK, 3))
         for ray in range(first, end):
-            origin, direction = three(origins, ray), three(directions, ray)
+            origin, direction = _three(origins, ray), _three(directions, ray)
             depth, transmittance = 0.0, 1.0
             start, steps, colours = f32(0), 0, 0
             while start < np.inf and not transmittance <= stop:
@@ -220,7 +230,7 @@ def _render(given, maps, voxels, resolution, parts, bounds, out):
                     for row in eight_of(corners, voxel[i]):
                         prefetch(table, row * inputs)
                 for i in range(count):
-                    corner = three(coordinates, voxel[i])
+                    corner = _three(coordinates, voxel[i])
                     weights = _weights_between(
                         origin, direction, near[i], far[i], resolution, corner
                     )
