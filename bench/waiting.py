@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # loads rich
     from bench.console import ConsoleLog
 
 LOOK_S = 0.2  # how often who waits looks whether it is its turn
+REST_S = 1.0  # a timing begins so long after those it waited for: they print, or end, meanwhile
 WRITE_S = 2.0  # how often at most a process writes how far it is
 
 
@@ -75,6 +76,8 @@ def queued(path: Path, threads: int | None, what: str, log: ConsoleLog) -> Itera
                 log.info(f"waiting for {what}: {who}, {first.progress or 'just begun'}")
                 told = first.pid
             time.sleep(LOOK_S)
+        if told and threads is None:
+            time.sleep(REST_S)
 
         def tell(progress: str) -> None:
             with suppress(OSError):
