@@ -106,4 +106,4 @@ def test_backends_have_the_same_signatures(kernel):
     public = [name for name in shared if name[0] != "_" and inspect.isfunction(versions[0][name])]
     assert public
     for name in public:
-        assert len({inspect.signature(version[name]) for version in versions}) == 1, name
+        assert len({inspect.signature(of[name], eval_str=True) for of in versions}) == 1, name

@@ -11,7 +11,7 @@ import torch
 from bench.errors import SteerbenchError, Unavailable
 from bench.results import Store
 from bench.study import Axis, Study, turned
-from sweeps import tables
+from sweeps import experiments
 from sweeps.commands.study import decibels
 from sweeps.overrides import engine_kinds
 from sweeps.studies import subjects
@@ -240,11 +240,11 @@ def test_scaling_has_pixels_and_threads_for_every_method_and_scores_nothing_at_o
 
 
 def test_axes_of_tables_belong_to_their_method():
-    axes = tables.axes("steernerf")
+    axes = experiments.axes("steernerf")
     assert axes["L"] == Axis("L = {}", "method.model.frames", (0, 1, 2, 3))
     assert axes["T"].size(14) == 2**14
     assert axes["K"].size(9) == 9
-    assert tables.axes("ngp") == {}
+    assert experiments.axes("ngp") == {}
 
 
 def test_several_methods_get_what_they_have_of_the_settings(elsewhere):
