@@ -128,9 +128,9 @@ def ranks(lines: Sequence[Repeated], metric: str, write: Write | None = None) ->
     """The rank, from 1, of each of `lines` among those under the same conditions, by its index.
 
     Figures share the rank of a better one from which they differ by no more than the interval over
-    seeds, or not when written (by `write`, or in the usual format). Lines have none if they are all
-    alike, or alone under their conditions; nor has the last of several, so that the second of two
-    has none, and no line in a metric without a better side.
+    seeds, or not when written (by `write`, or in the usual format). The last ones have none: so
+    neither lines that are all alike or alone under their conditions have one, nor the second of
+    two. No line has one in a metric without a better side.
     """
     shown = shown_as(metric)
     if not shown.better:
@@ -148,9 +148,7 @@ def ranks(lines: Sequence[Repeated], metric: str, write: Write | None = None) ->
             if not of_rank or _apart(lines[of_rank[-1][0]], lines[row], metric, write):
                 of_rank.append([])
             of_rank[-1].append(row)
-        ranked = {row: rank for rank, rows in enumerate(of_rank, 1) for row in rows}
-        if len(of_rank) > 1:
-            places |= {row: rank for row, rank in ranked.items() if rank < len(figures)}
+        places |= {row: rank for rank, rows in enumerate(of_rank[:-1], 1) for row in rows}
     return places
 
 

@@ -54,11 +54,19 @@ def _heading(lines: Lines, failures: Mapping[str, str]) -> Iterator[Part]:
     )
     reading = f"Arrows point to better. Quality is a mean over {scored} frames, time over {timed}."
     if any(len(line.runs) > 1 for line in lines.lines):
-        reading += " Figures are means over seeds, ± half their 95 % interval."
+        reading += " Figures are means over seeds, ± half their 95 % interval (t-distribution)."
+    if any(len(line.runs) == 2 for line in lines.lines):
+        reading += " With two seeds it is 12.7 standard errors: use three or more."
+    if "frames" in first.columns:
+        reading += (
+            " Lines of cold frames, for which the path is too short, are not ranked with others:"
+            " choose more frames (`budget.frames`), or a path without cuts (`trajectory=orbit`)."
+        )
     if first.bold:
         reading += (
-            " The best figure of each column is **bold**, with those that differ from it by no more"
-            " than the interval, among lines with the same frames, protocol and machine."
+            " The best figure of each column is **bold**, with those from which the interval of its"
+            " difference, seed by seed, does not tell it, among lines with the same frames,"
+            " protocol and machine."
         )
     days = sorted(str(datetime.fromtimestamp(run.record["stored"], UTC).date()) for run in runs)
     when = " to ".join(dict.fromkeys((days[0], days[-1])))
@@ -82,7 +90,10 @@ def _tradeoffs(lines: Lines) -> Iterator[Part]:
         if len(plot.marks) > 1:
             yield f"## {title}"
             yield plot
-            yield f"One mark a line: further up is better, further left is {better}."
+            yield (
+                f"One mark a line, bars are intervals; further up is better, further left is"
+                f" {better}. The axis across is logarithmic."
+            )
 
 
 def _pictures(runs: Sequence[Run]) -> Iterator[Part]:

@@ -42,19 +42,20 @@ def main(options: argparse.Namespace) -> int:
     for name, why in missing.items():
         print(f"missing: {name}: {why}", file=sys.stderr)
     shown = data_sets(scenes_of(words, data))
-    tables = chosen(getattr(options, "table", None), words, options.beside, shown)
+    one = getattr(options, "table", None)
+    tables = chosen(one, words, options.beside, shown)
     jobs = [job for table in tables for job in plan(table, words, data)]
     outputs = Path(jobs[0].config.outputs)
     failed = 0
     if options.command != "report":
         failed = run_jobs(jobs, Launcher([*options.config_dir, *of_hydra], outputs))
-    runs = newest(Store(outputs) if options.command == "paper" else existing_store(outputs))
+    runs = newest(existing_store(outputs) if options.command == "report" else Store(outputs))
     broken = outliers(list(chain(*runs.values())))
-    folder = options.report or outputs / "paper"
+    folder = options.report or outputs / (one or "paper")
     measured = gather(jobs, runs)
     page = write_paper_page(tables, measured, broken, folder, missing)
-    if options.format:
-        print(export.exported_tables(tables, measured, options.format), end="")
+    if options.format or options.command == "table":
+        print(export.exported_tables(tables, measured, options.format or "markdown"), end="")
     print(f"report: {page}", file=sys.stderr)
     return int(failed > 0)
 

@@ -72,7 +72,7 @@ def test_a_mean_shares_the_rank_of_a_better_one_within_their_intervals(make):
         return Repeated("", [changed(make("m", psnr=x), {}, seed=n) for n, x in enumerate(psnr)])
 
     best, close, far = line(31.0, 31.2), line(30.9, 31.25), line(20.0, 20.2)
-    assert ranks([best, close, far], "psnr") == {0: 1, 1: 1, 2: 2}
+    assert ranks([best, close, far], "psnr") == {0: 1, 1: 1}
     assert ranks([best, close], "psnr") == {}  # all alike
     paired = line(30.9, 31.1)  # 0.1 dB below the best with each seed
     assert ranks([best, paired, far], "psnr") == {0: 1, 1: 2}

@@ -110,7 +110,7 @@ def test_the_method_of_the_document_has_a_line_in_a_table(mine, monkeypatch):
 def test_the_table_of_the_document_is_measured_reported_and_the_same_sweep(steerbench, mine):
     words = typed("table shades --config-dir configs")
     steerbench(*words, *WITHOUT_LPIPS).ok()
-    page = Path("outputs/paper/report.md")
+    page = Path("outputs/shades/report.md")
     written = page.read_text()
     assert written.startswith("# Shades of the mean colour\n")
     assert "| method.shade=1.0 | **19.83** |" in written  # 20 log10(255 / 26)

@@ -302,5 +302,5 @@ def test_the_page_of_a_data_set_has_means_scenes_and_gaps(steerbench, tmp_path):
     assert f"| Table 9, PSNR, dB: a dark one < a grey | +0.50 | +{by:.2f} |" in page
     assert "2 scenes × 2 seeds" in page
     again = steerbench("report", "--table", "table9", *words)
-    assert f"| a grey | **{mean}** |" in (tmp_path / "outputs/paper/report.md").read_text()
+    assert f"| a grey | **{mean}** |" in (tmp_path / "outputs/table9/report.md").read_text()
     assert again.status == 0
