@@ -28,6 +28,12 @@ def write_page(
     lines = as_lines(load_runs(store, keys))
     runs = lines.runs
     few = len(runs) <= MOST_RENDERINGS
+    several = any(len(line.runs) > 1 for line in lines.lines)
+    named = [
+        replace(run, label=line.label + f", seed {run.facts['seed']}" * several)
+        for line in lines.lines
+        for run in line.runs
+    ]
     parts = [
         *_heading(lines, failures),
         *_tradeoffs(lines),
@@ -37,7 +43,7 @@ def write_page(
         " includes the stages inside it. Time outside all stages is `other`.",
         *_pictures([replace(line.runs[0], label=line.label) for line in lines.lines]),
         *(part for run in runs if few for part in _figures(run)),
-        *_provenance(runs),
+        *_provenance(named),
     ]
     return publish(parts, folder, runs)
 

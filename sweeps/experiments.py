@@ -5,7 +5,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from bench.errors import unknown
+from bench.errors import SteerbenchError, unknown
 from bench.study import Axis
 from sweeps.overrides import choices, swept
 
@@ -16,7 +16,9 @@ def experiment(name: str, words: Sequence[str] = ()) -> Any:
     """What the file of an experiment holds."""
     files = choices("experiment", words)
     if name not in files:
-        raise unknown("table", name, files)
+        tables = [each for each, file in files.items() if "table" in OmegaConf.load(file)]
+        error = unknown("table", name, tables)
+        raise SteerbenchError(f"{error} --config-dir DIR names a folder with further ones")
     return OmegaConf.to_container(OmegaConf.load(files[name]))
 
 
