@@ -101,7 +101,7 @@ def test_the_worker_of_the_document_takes_turns_with_ours(steerbench, documented
 def test_the_worker_of_the_document_has_a_line_in_a_table(steerbench, documented):
     words = typed("table table1 --config-dir")
     steerbench(*(word.replace("table1", "table9") for word in words), *WHITE, "seed=0").ok()
-    assert "| mine |" in Path("outputs/table1/report.md").read_text()
+    assert "| mine |" in Path("outputs/table9/report.md").read_text()
 
 
 def test_the_worker_of_the_document_is_drawn_along_a_path(steerbench, documented):
