@@ -25,7 +25,7 @@ class ConsoleLog:
     def __init__(
         self, root: Path, quiet: bool = False, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self.followers: list[Callable[[str], object]] = []  # are told the progress, too
+        self.followers: list[Callable[[str], object]] = []  # each gets every line of progress
         self._root = root
         self._console = Console(stderr=True, quiet=quiet)
         self._clock = clock

@@ -195,9 +195,11 @@ class Store:
 
 
 def existing_store(root: Path) -> Store:
-    """The store below `root`, for whoever only reads it; SteerbenchError if that has no runs."""
+    """The store below `root`, to read from; SteerbenchError if it has no runs."""
     store, unread = Store(root), [f"`steerbench run outputs={root}` makes one"]
-    if store.rows(report=unread.append).empty:
+    names = (folder.name for folder in store.folder.glob("[!.]*"))
+    if all(store.rows(lambda _: None, [name]).empty for name in names):  # the first one suffices
+        store.rows(unread.append)
         there = "no runs to read" if store.folder.is_dir() else "there is no store of runs"
         raise SteerbenchError(f"{root}: {there}; {unread[-1]}")
     return store

@@ -1,7 +1,7 @@
 """Tables of several runs, a line for each of their settings, with the best figures in bold."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from bench.errors import SteerbenchError
 from bench.rows import UNITS, half_interval
-from reports.lines import Lines
+from reports.lines import COMMON, Lines
 from reports.runs import Repeated, Run
 from reports.tables import NOT_AVAILABLE, QUALITY, Metric, Table, decimal, megabytes
 
@@ -22,9 +22,6 @@ COST = {
     "train_s": Metric("training, s", "↓", partial(decimal, decimals=0)),
 }
 """The columns other than quality metrics."""
-
-COMMON = ("scene", "resolution", "trajectory", "budget", "protocol", "device")
-"""Facts that a heading lists."""
 
 COLD_FRAMES = (
     "Cold frames: the first of a path, which have fewer preceding frames than the method uses"
@@ -39,7 +36,9 @@ def comparison(lines: Lines, failures: Mapping[str, str]) -> list[Table]:
     missing, by label: each is a line of its own.
     """
     metrics = columns_of(lines)
-    title = f"Comparison: {common(lines)}" if lines.lines else "Comparison"
+    title = (
+        f"Comparison: {conditions_of(lines.runs, lines.settings)}" if lines.lines else "Comparison"
+    )
     tables = [_table(title, lines.settings, lines.lines, metrics)]
     blank = ("",) * (len(tables[0].columns) - 1)
     failed = tuple((f"{label}: failed: {why}", *blank) for label, why in failures.items())
@@ -174,18 +173,13 @@ def machines(runs: Sequence[Run]) -> str:
     return " / ".join(dict.fromkeys(f"{x['cpu']} with {x['threads']} threads" for x in found))
 
 
-def conditions(runs: Sequence[Run], names: Sequence[str] = COMMON) -> dict[str, str]:
+def conditions(runs: Sequence[Run], names: Sequence[str]) -> dict[str, str]:
     """The facts `names` of `runs`, each with all of its values."""
     facts = {name: dict.fromkeys(str(run.facts[name]) for run in runs) for name in names}
     return {name: " / ".join(values) for name, values in facts.items()}
 
 
-def common(lines: Lines) -> str:
-    """Scene, resolution and so on, as text, where they are no columns."""
-    names = [name for name in COMMON if name not in lines.settings]
-    return ", ".join(map(" ".join, conditions(lines.runs, names).items()))
-
-
-def conditions_of(runs: Sequence[Run]) -> str:
-    """Scene, resolution, trajectory and so on of `runs`, as text."""
-    return ", ".join(map(" ".join, conditions(runs).items()))
+def conditions_of(runs: Sequence[Run], without: Collection[str] = ()) -> str:
+    """Scene, resolution, trajectory and so on of `runs`, as text, `without` some of them."""
+    names = [name for name in COMMON if name not in without]
+    return ", ".join(map(" ".join, conditions(runs, names).items()))

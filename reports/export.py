@@ -36,22 +36,19 @@ MARKS = (r"\textbf{%s}", r"\underline{%s}")
 
 def exported(table: Table, figures: pd.DataFrame, form: str) -> str:
     """A table as `markdown` or `latex`, or its `figures` as `csv` or `json`."""
-    match form:
-        case "markdown":
-            return f"## {table.title}\n\n{table.markdown()}\n"
-        case "latex":
-            rows = [
-                [
-                    MARKS[0] % escaped(text) if (row, column) in table.bold else escaped(text)
-                    for column, text in enumerate(line)
-                ]
-                for row, line in enumerate(table.lines)
-            ]
-            sides = "".join("lr"[table.right(column)] for column in range(len(table.columns)))
-            return _tabular(f"{table.title}.", "", sides, table.columns, [rows])
-        case "csv":
-            return figures.to_csv(index=False)
-    return figures.to_json(orient="records", indent=1, double_precision=15) + "\n"
+    if form == "markdown":
+        return table.section()
+    if form != "latex":
+        return _for_programs(figures, form)
+    rows = [
+        [
+            MARKS[0] % escaped(text) if (row, column) in table.bold else escaped(text)
+            for column, text in enumerate(line)
+        ]
+        for row, line in enumerate(table.lines)
+    ]
+    sides = "".join("lr"[table.right(column)] for column in range(len(table.columns)))
+    return _tabular(f"{table.title}.", "", sides, table.columns, [rows])
 
 
 def exported_tables(tables: Sequence[PaperTable], measured: Measured, form: str) -> str:
@@ -64,9 +61,14 @@ def exported_tables(tables: Sequence[PaperTable], measured: Measured, form: str)
         return "\n".join(_latex(table, measured) for table in tables)
     blocks = [(table, block) for table in tables for block in table.shown(measured)]
     if form == "markdown":
-        shown = (exported(figure_table(block), pd.DataFrame(), form) for _, block in blocks)
-        return "\n".join(shown)
-    return exported(Table("", (), ()), _figures(blocks), form)
+        return "\n".join(figure_table(block).section() for _, block in blocks)
+    return _for_programs(_figures(blocks), form)
+
+
+def _for_programs(figures: pd.DataFrame, form: str) -> str:
+    if form == "csv":
+        return figures.to_csv(index=False)
+    return figures.to_json(orient="records", indent=1, double_precision=15) + "\n"
 
 
 def _latex(table: PaperTable, measured: Measured) -> str:

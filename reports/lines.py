@@ -9,15 +9,18 @@ from typing import Any
 import pandas as pd
 
 from bench.results import Store, content_key
-from reports.runs import Repeated, Run, flat, over_common_frames, readable
+from reports.runs import Repeated, Run, over_common_frames, readable, unseeded
 
 METHOD = "method"  # the first column
 
-FACTS = ("scene", "resolution", "trajectory", "budget", "protocol", "device", "engine", "precision")
+COMMON = ("scene", "resolution", "trajectory", "budget", "protocol", "device")
+"""Facts that a heading lists."""
+
+FACTS = (*COMMON, "engine", "precision")
 """Columns of rows that are shown where they differ, beside the method."""
 
-HIDDEN = ("seed", "pictures", "budget.name", "protocol.name", "scene.name", "method.name")
-"""Settings that make no column: repetitions, what changes no figure, and what `FACTS` show."""
+HIDDEN = ("pictures", "budget.name", "protocol.name", "scene.name", "method.name")
+"""Settings that make no column: what changes no figure, and what `FACTS` show."""
 
 LOGARITHM = "log2_"  # begins the names of settings that are exponents of 2
 
@@ -37,11 +40,6 @@ class Lines:
     def runs(self) -> list[Run]:
         """The runs of all lines."""
         return [run for line in self.lines for run in line.runs]
-
-    @property
-    def cells(self) -> list[tuple[str, ...]]:
-        """The settings of each line."""
-        return list(zip(*self.settings.values(), strict=True))
 
     def frame(self, metrics: Sequence[str]) -> pd.DataFrame:
         """A row each: settings, number of seeds, means of metrics and halves of their intervals."""
@@ -101,15 +99,14 @@ def varied(runs: Sequence[Run]) -> dict[str, list[str]]:
         for fact in FACTS
         if len(set(values := [str(run.facts[fact]) for run in runs])) > 1
     }
-    facts = dict(columns)
     methods = [run.label for run in runs]
     settings = [_settings(run) for run in runs]
     typed = dict.fromkeys(word for run in runs for word in _typed(run))
     names = dict.fromkeys(name for of_run in settings for name in of_run)
     for name in dict.fromkeys((*(name for name in typed if name in names), *names)):
         values = [of_run.get(name, "") for of_run in settings]
-        shown = columns if name not in typed or name.partition(".")[0] in facts else {}
-        if not (_follows([methods], values) or _follows([methods, *shown.values()], values)):
+        shown = columns if name not in typed or name.partition(".")[0] in columns else {}
+        if not _follows([methods, *shown.values()], values):
             columns[name] = values
     return columns
 
@@ -144,12 +141,7 @@ def _line_of(run: Run) -> str:
 def _settings(run: Run) -> dict[str, str]:
     """The settings of a run by name, without seeds, as text; none for scored pictures."""
     config = run.record["made_of"].get("config", {})
-    kept = {name: value for name, value in flat(config) if name not in HIDDEN}
-    return {name: _text(name, value) for name, value in kept.items() if not _is_seed(name)}
-
-
-def _is_seed(name: str) -> bool:
-    return name.startswith("method.") and name.endswith(".seed")
+    return {name: _text(name, of) for name, of in unseeded(config) if name not in HIDDEN}
 
 
 def _text(name: str, value: Any) -> str:

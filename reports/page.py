@@ -8,7 +8,7 @@ from pathlib import Path
 
 from bench.results import Store
 from reports import figures
-from reports.comparison import common, comparison, machines
+from reports.comparison import comparison, conditions_of, machines
 from reports.images import MOST_RENDERINGS, Part, Picture, frame_section, kept_frames
 from reports.lines import Lines, as_lines
 from reports.publish import publish
@@ -77,7 +77,7 @@ def _heading(lines: Lines, failures: Mapping[str, str]) -> Iterator[Part]:
     days = sorted(str(datetime.fromtimestamp(run.record["stored"], UTC).date()) for run in runs)
     when = " to ".join(dict.fromkeys((days[0], days[-1])))
     yield f"# {': '.join(filter(None, (labels, ', '.join(varied))))} on {scenes}"
-    yield f"Measured {when} on {machines(runs)}: {common(lines)}."
+    yield f"Measured {when} on {machines(runs)}: {conditions_of(runs, varied)}."
     yield first
     yield reading
     for table in further:

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from reports.claims import Claim, Comparison, apart, compare, gap, told
-from reports.comparison import COMMON, conditions, machines, marked, shown_as, written
+from reports.comparison import conditions, machines, marked, shown_as, written
+from reports.lines import COMMON
 from reports.runs import Repeated, Run, missing_figures
 from reports.tables import ABSENT, Table
 

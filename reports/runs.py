@@ -279,6 +279,14 @@ def flat(node: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]
             yield f"{before}{name}", value
 
 
+def unseeded(config: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """The `flat` settings of a run without its seed, and without those of its method, which have
+    the same."""
+    for name, value in flat(config):
+        if name != "seed" and not (name.startswith("method.") and name.endswith(".seed")):
+            yield name, value
+
+
 def missing_figures(runs: Sequence[Run]) -> list[str]:
     """Notes about every metric that could not be measured."""
     notes = (f"{name}: n/a. {why}" for run in runs for name, why in run.record["missing"].items())

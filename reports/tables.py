@@ -55,6 +55,10 @@ class Table:
         figures = sum(re.match(r"[-+±×*]*\d", cell) is not None for cell in cells)
         return column > 0 and 2 * figures >= len(cells)
 
+    def section(self) -> str:
+        """The table in GitHub's Markdown below its title, and an end of line."""
+        return f"## {self.title}\n\n{self.markdown()}\n"
+
     def markdown(self) -> str:
         """The table in GitHub's Markdown, without its title."""
         rules = ("---:" if self.right(column) else "---" for column in range(len(self.columns)))

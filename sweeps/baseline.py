@@ -15,7 +15,7 @@ from bench.errors import SteerbenchError, explained
 from bench.results import Store, existing_store
 from bench.sharing import whole
 from reports.regression import LIMITS, Assertion, Figures, Limit, changes, limited
-from reports.runs import flat, readable
+from reports.runs import readable, unseeded
 from sweeps.measurement import PLACES
 
 SCHEMA = 3  # of baseline files
@@ -57,11 +57,7 @@ def _stored(store: Store) -> list[Entry]:
         command = shlex.join(word for word in words if word.partition("=")[0] not in others)
         made_of, seed = run.record["made_of"], str(run.facts["seed"])
         config = {**made_of.get("config", {"command": command}), "in_turns": "turns" in made_of}
-        settings = {
-            name: portable(str(value))
-            for name, value in flat(config)
-            if not (re.fullmatch(r"seed|method\..*seed", name) and str(value) == seed)
-        }
+        settings = {name: portable(str(value)) for name, value in unseeded(config)}
         entry = Entry([str(run.facts[x]) for x in SUBJECT], command, settings, {})
         key = json.dumps([entry.subject, settings], sort_keys=True)
         found.setdefault(key, entry).seeds[seed] = run

@@ -20,7 +20,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from bench.errors import unexpected
-from sweeps.overrides import CONFIGS, explain, of_hydra, searched, settled, swept
+from sweeps.overrides import CONFIGS, explain, further, of_hydra, settled, swept
 
 if TYPE_CHECKING:  # these load torch, which --help and completion do not need
     from sweeps.execute import Ended
@@ -75,7 +75,7 @@ def run_hydra(
         sources = present.runtime.config_sources
         folders = [f"--config-dir={x.path}" for x in sources if x.provider == "command-line"]
         command = ["steerbench", "run", *folders, *present.overrides.task]
-        config = settled(config, searched(folders)[1:])
+        config = settled(config, further(folders))
         if present.mode == RunMode.MULTIRUN:
             _one_of_many(config, command)
             return

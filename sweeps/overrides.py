@@ -45,7 +45,7 @@ def composed(words: Sequence[str], **options: bool) -> DictConfig:
     overrides = [*_overrides(words), *([f"hydra.searchpath=[{paths}]"] if paths else [])]
     try:
         with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-            return settled(compose("run", overrides=overrides, **options), searched(words)[1:])
+            return settled(compose("run", overrides=overrides, **options), further(words))
     except Exception as error:
         if not of_hydra(error):
             raise
@@ -230,18 +230,23 @@ def _overrides(words: Sequence[str]) -> list[str]:
 
 
 def searched(words: Sequence[str]) -> list[Path]:
-    """Our configurations, the folders named in `words`, and those of installed plug-ins."""
-    return [CONFIGS, *_typed(words), *(x for x in plug_ins().values() if isinstance(x, Path))]
+    """Our configurations, and the `further` folders."""
+    return [CONFIGS, *further(words)]
+
+
+def further(words: Sequence[str]) -> list[Path]:
+    """The folders named in `words`, and those of installed plug-ins."""
+    return [*_typed(words), *(x for x in plug_ins().values() if isinstance(x, Path))]
 
 
 def _typed(words: Sequence[str]) -> list[Path]:
     """The folders named in `words` by `--config-dir=DIR` or by its form in two words."""
-    further = []
+    folders = []
     for word, after in pairwise([*words, ""]):
         name, equals, value = word.partition("=")
         if name in FLAGS:
-            further.append(Path(value if equals else after).resolve())
-    return further
+            folders.append(Path(value if equals else after).resolve())
+    return folders
 
 
 @cache
@@ -269,7 +274,7 @@ class _InstalledChoices(SearchPathPlugin):
     """Appends the plug-ins' folders to Hydra's search path, so that our names take precedence."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        for folder in searched(())[1:]:
+        for folder in further(()):
             search_path.append("steerbench-plug-in", f"file://{folder}")
 
 

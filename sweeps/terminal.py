@@ -44,7 +44,7 @@ def show(table: Table, figures: pd.DataFrame | None = None, form: str | None = N
     elif sys.stdout.isatty():
         console().print(rich_table(table))
     else:
-        print(f"## {table.title}\n\n{table.markdown()}\n", flush=True)
+        print(table.section(), flush=True)
 
 
 def show_run(run: Run, heading: str) -> None:

@@ -79,9 +79,10 @@ def _show(runs: Sequence[Run], failed: Mapping[str, str], form: str | None) -> N
     from sweeps.terminal import show
 
     lines = as_lines(runs)
-    tables = comparison(lines, failed)
-    for table in tables[:1] if form else tables:
-        show(table, lines.frame(columns_of(lines)), form)
+    first, *further = comparison(lines, failed)
+    show(first, lines.frame(columns_of(lines)) if form else None, form)
+    for table in () if form else further:
+        show(table)
 
 
 def _without_form(argv: Sequence[str]) -> tuple[list[str], str | None]:
