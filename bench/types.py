@@ -113,7 +113,9 @@ class Split:
 class Scene:
     """Everything a method may learn from and everything it is scored on.
 
-    A point of the data set is origin + unit_length * scene point, with the same axes. `exact`
+    A point of the data set is origin + unit_length * scene point, with the same axes. `space` is
+    "box" if there is nothing outside the unit cube, or "all": what is seen goes on to infinity, and
+    the middle half of the cube is the part that deserves most detail. `exact`
     renders the true picture of any camera as in a split, `surface` its z-depth [H, W] at the centres
     of pixels, +inf where empty; None if the scene cannot, or has no opaque surface.
     """
@@ -125,8 +127,15 @@ class Scene:
     unit_length: float  # of one scene unit, in the data set's own unit
     digest: str  # content hash of cameras, pictures and normalisation
     origin: Tensor = field(default_factory=lambda: torch.zeros(3))
+    space: str = "box"
     exact: Callable[[Camera], Tensor] | None = None
     surface: Callable[[Camera], Tensor] | None = None
+
+    @property
+    def cells(self) -> Tensor:
+        """[2, 3] lower and upper corner of the part of the unit cube that may hold matter, if all
+        of space is contracted into it."""
+        return self.bounds if self.space == "box" else torch.tensor([[0.0] * 3, [1.0] * 3])
 
 
 @dataclass(frozen=True)

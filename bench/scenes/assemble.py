@@ -1,6 +1,7 @@
 """Makes a Scene from described views, the last step of every loader; holds pictures out of it.
 
-The part of a data set's space that is rendered, a `Box`, fills the unit cube.
+The part of a data set's space that is rendered, a `Box`, fills the unit cube. Where all of space
+is rendered, the box has most detail, and fills the middle half of the cube along each axis.
 """
 
 from __future__ import annotations
@@ -22,6 +23,9 @@ from bench.threads import in_parallel, torch_threads
 from bench.types import BACKGROUNDS, Camera, Log, Scene, Split
 
 MARGIN = 0.05  # enlarges the box of a hull by this share of its longest side, half at each end
+
+SPACES = ("auto", "box", "all")
+PULL = 1e-3  # of the centres of cameras on the point that they look at, of that of their axes
 
 CELLS = 64  # along each side of the cube that is searched for the visual hull
 BLOCK, GLANCES = 4, 16
@@ -67,25 +71,28 @@ def assemble(
     *,
     background: str,
     camera_files: Iterable[Path],
+    space: str = "box",
 ) -> Scene:
-    """The scene, scaled so that `box` fills the unit cube.
+    """The scene, scaled so that `box` fills the unit cube, or the middle of all `space`.
 
     The digest covers the bytes of `camera_files` and of all picture files, the background, the
-    resolution and the box. Raises SteerbenchError if the box, or a camera in its units, exceeds
+    resolution, the box and the space. Raises SteerbenchError if the box, or a camera in its units, exceeds
     the range of float32.
     """
     if background not in BACKGROUNDS:
         raise unexpected("background", " or ".join(BACKGROUNDS), repr(background))
     _check_float32("bounds", [box.side], box.origin.tolist())
     corners = box.lower.tolist(), box.upper.tolist()
-    digest = hashlib.sha256(repr((background, corners)).encode())
+    named = (background, corners) if space == "box" else (background, corners, space)
+    digest = hashlib.sha256(repr(named).encode())
     for path in camera_files:
         digest.update(hashlib.sha256(path.read_bytes()).digest())
+    outer = box if space == "box" else box.middle_of()
     splits = {}
     for split, of_split in pictures.items():
         cameras, names = [], []
         for picture in of_split.described:
-            camera = move_camera(picture.camera, 1 / box.side, -box.origin / box.side)
+            camera = move_camera(picture.camera, 1 / outer.side, -outer.origin / outer.side)
             others = [camera.cx, camera.cy, *camera.c2w.flatten().tolist()]
             _check_float32(picture.view.name, [camera.fx, camera.fy], others)
             digest.update(f"{split} {camera.width} {camera.height} {picture.sha256}".encode())
@@ -96,10 +103,11 @@ def assemble(
         name=name,
         splits=splits,
         background=torch.full((3,), BACKGROUNDS[background]),
-        bounds=box.in_unit_cube(),
-        unit_length=box.side,
+        bounds=outer.place_of(box),
+        unit_length=outer.side,
         digest=digest.hexdigest(),
-        origin=box.origin.float(),
+        origin=outer.origin.float(),
+        space=space,
     )
 
 
@@ -157,14 +165,46 @@ class Box:
         """The data set's coordinates of the corner (0, 0, 0) of the unit cube, [3] float64."""
         return (self.lower + self.upper) / 2 - self.side / 2
 
-    def in_unit_cube(self) -> Tensor:
-        """[2, 3] float32 corners once the box is centred and its longest side has length 1."""
-        corners = torch.stack((self.lower, self.upper))
+    def place_of(self, other: Box) -> Tensor:
+        """[2, 3] float32 corners of `other` once this box is centred in the unit cube."""
+        corners = torch.stack((other.lower, other.upper))
         return ((corners - self.origin) / self.side).float().clamp(0, 1)
+
+    def middle_of(self) -> Box:
+        """The cube whose middle half along each axis is the cube around this box."""
+        middle = (self.lower + self.upper) / 2
+        return Box(middle - self.side, middle + self.side)
 
     def grown(self, share: float = MARGIN) -> Box:
         """The box, longer along every axis by `share` of its longest side."""
         return Box(self.lower - share * self.side / 2, self.upper + share * self.side / 2)
+
+
+def space_of(space: str, pictures: Mapping[str, Pictures]) -> str:
+    """What `scene.space` stands for, "box" or "all": "auto" is all of space if no training picture
+    is transparent anywhere, so that there is a background."""
+    if space not in SPACES:
+        raise unexpected("scene.space", " or ".join(SPACES), repr(space))
+    if space != "auto":
+        return space
+    train = pictures["train"]
+    masked = any(picture.shape[2] == 4 and (picture[..., 3] < 255).any() for picture in train)
+    return "box" if masked else "all"
+
+
+def box_of_cameras(cameras: Sequence[Camera]) -> Box:
+    """The cube around the point that cameras look at, with all of them inside or on a face.
+
+    The point is the nearest to their optical axes, and a little to their centres, so that there is
+    one if they are parallel."""
+    poses = torch.stack([camera.c2w.double() for camera in cameras])
+    ahead, centres = poses[:, :, 2], poses[:, :, 3]
+    across = torch.eye(3).double() - ahead[:, :, None] * ahead[:, None] + PULL * torch.eye(3)
+    sums = (across @ centres[:, :, None]).sum(dim=0).squeeze(1)
+    middle = torch.linalg.solve(across.sum(dim=0), sums)
+    half = (centres - middle).abs().max()
+    half = half if half > 0 else torch.ones_like(half)
+    return Box(middle - half, middle + half)
 
 
 def cube(half: float) -> Box:

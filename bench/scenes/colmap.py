@@ -12,7 +12,16 @@ from torch import Tensor
 
 from bench.cameras import scale_camera
 from bench.errors import Unavailable, install_command, unexpected
-from bench.scenes.assemble import Box, assemble, describe_splits, every_nth, leave_out, parse_box
+from bench.scenes.assemble import (
+    Box,
+    assemble,
+    box_of_cameras,
+    describe_splits,
+    every_nth,
+    leave_out,
+    parse_box,
+    space_of,
+)
 from bench.scenes.files import data_folder, inside, rigid_pose
 from bench.scenes.images import Lens, View, image_size
 from bench.types import Camera, Log, Scene
@@ -36,14 +45,15 @@ def load(
     bounds: str | list = "auto",
     downscale: int = 1,
     background: str = "white",
+    space: str = "auto",
     log: Log,
 ) -> Scene:
     """Read the capture folder `path`: its pictures in `images`, its sparse model in `model`.
 
     The pictures may be smaller than those that COLMAP saw; the model is by default the first of
-    `MODELS`. `bounds` fill the unit cube: the box of the points without outliers ("auto"), or
-    [[x, y, z], [x, y, z]]. For `split_every` see `transforms.load`, for `downscale` and
-    `background` `blender.load`.
+    `MODELS`. `bounds` are those of the box: "auto" or [[x, y, z], [x, y, z]]. "auto" is the box of
+    the points without outliers, or, in all of space, that of the cameras. For `split_every` and
+    `space` see `transforms.load`, for `downscale` and `background` `blender.load`.
 
     Lens distortion is undone for every COLMAP camera model that has a focal length, and pictures
     are cropped to what the lens saw. Pictures that COLMAP did not register are ignored. Registered
@@ -53,16 +63,20 @@ def load(
     folder = model_folder(root, model)
     reconstruction = read_model(folder)
     splits = every_nth(read_views(root, images, folder, reconstruction, log), split_every, folder)
+    pictures = describe_splits(splits, downscale, log)
+    space = space_of(space, pictures)
     if bounds != "auto":
         box = parse_box(bounds)
+    elif space == "all":
+        box = box_of_cameras([view.camera for view in splits["train"]])
     elif not reconstruction.num_points3D():
         raise unexpected(folder, "points, or scene.bounds=[[x,y,z],[x,y,z]]", "no point")
     else:
         points = reconstruction.compute_bounding_box(STRAY, 1 - STRAY)
         box = Box(torch.tensor(points.min), torch.tensor(points.max)).grown()
-    pictures = describe_splits(splits, downscale, log)
     files = sorted(folder.glob(f"*{_kind(folder)}"))
-    return assemble(root.name, pictures, box, background=background, camera_files=files)
+    where = {"background": background, "space": space, "camera_files": files}
+    return assemble(root.name, pictures, box, **where)
 
 
 def model_folder(root: Path, model: str | None) -> Path:

@@ -9,7 +9,15 @@ from torch import Tensor
 
 from bench.cameras import scale_camera
 from bench.errors import unexpected
-from bench.scenes.assemble import Box, assemble, describe_splits, every_nth, leave_out
+from bench.scenes.assemble import (
+    Box,
+    assemble,
+    box_of_cameras,
+    describe_splits,
+    every_nth,
+    leave_out,
+    space_of,
+)
 from bench.scenes.files import (
     data_folder,
     describe,
@@ -50,14 +58,18 @@ def load(
     aabb_scale: float | None = None,
     downscale: int = 1,
     background: str = "white",
+    space: str = "auto",
     log: Log,
 ) -> Scene:
     """Read the capture folder `path`; for `downscale` and `background` see `blender.load`.
 
+    `space` is "box", the cube of instant-ngp; "all", without end around what the cameras look at;
+    or "auto", the latter if the pictures have a background: no training picture is transparent.
+
     Pictures 0, split_every, 2 * split_every ..., in the order of their names, are the test split,
-    all others the training split. `aabb_scale` is the side of our unit cube relative to that of
+    all others the training split. `aabb_scale` is the side of the box relative to that of
     instant-ngp, x * 0.33 + 0.5; by default the value in the file, or 1. `scale` and `offset` in the
-    file replace 0.33 and 0.5.
+    file replace 0.33 and 0.5. In all of space, the file's box is not needed.
 
     Intrinsics of a frame take precedence over those of the file. Lens distortion is undone, and
     pictures are cropped to what the lens saw. Frames without a picture are logged and left out.
@@ -65,9 +77,12 @@ def load(
     root = data_folder(path)
     record, path = read_json(root, CAMERA_FILE), root / CAMERA_FILE
     splits = every_nth(read_views(root, record, log), split_every, path)
-    box = capture_box(path, record, aabb_scale)
     pictures = describe_splits(splits, downscale, log)
-    return assemble(root.name, pictures, box, background=background, camera_files=[path])
+    space, cameras = space_of(space, pictures), [view.camera for view in splits["train"]]
+    around = space == "all" and aabb_scale is None
+    box = box_of_cameras(cameras) if around else capture_box(path, record, aabb_scale)
+    where = {"background": background, "space": space, "camera_files": [path]}
+    return assemble(root.name, pictures, box, **where)
 
 
 def read_views(root: Path, record: dict, log: Log) -> list[View]:

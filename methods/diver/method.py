@@ -94,6 +94,7 @@ class Diver(Student):
     faint: float
 
     kind, model, computed = "diver", ("resolution",), IN_FP32
+    contracts = False
     study = Study(
         knobs={
             "stop": turned("stop", "method.stop", ("1e-1", "1e-3", "1e-4")),

@@ -79,13 +79,14 @@ class TrainingOptions(PixelOptions):
 
 def new_grid(scene: Scene, device: torch.device) -> DensityGrid:
     """Make the density grid for a training of `scene`, as it is before the first step."""
-    cells = learnable_cells(scene.bounds.to(device), scene.splits["train"].cameras)
+    contracted = scene.space == "all"
+    cells = learnable_cells(scene.cells.to(device), scene.splits["train"].cameras, contracted)
     if not cells.any():
         raise SteerbenchError(
             f"scene {scene.name}: no part of the unit cube is seen by {MIN_VIEWS} training "
             "cameras: expected pictures that overlap there; look at the poses and the scale"
         )
-    return DensityGrid(cells)
+    return DensityGrid(cells, contracted)
 
 
 class PixelTraining(loop.Training, ABC):
@@ -108,6 +109,7 @@ class PixelTraining(loop.Training, ABC):
         self.batches = PixelBatches(scene.splits["train"], device)
         self.errors = ErrorMap(len(self.batches), device) if options.by_error else None
         self.background = scene.background.to(device)
+        self.opaque = scene.space == "all"  # what is not transparent must hide what is behind it
         self.rays = min(1024, options.max_rays)
         self.generator = torch.Generator(device).manual_seed(seed)
 
@@ -157,11 +159,12 @@ class PixelTraining(loop.Training, ABC):
     def _target(self, colours: Tensor) -> tuple[Tensor, Tensor]:
         """Composite colours on a background; also return that background, [3] or [R, 3]."""
         background, generator = self.background, self.generator
-        if colours.shape[-1] == 3:
-            return colours, background
-        if self.options.random_background:
+        solid = colours.shape[-1] == 3
+        if self.options.random_background and (self.opaque or not solid):
             count, device = len(colours), colours.device
             background = torch.rand(count, 3, generator=generator, device=device)
+        if solid:
+            return colours, background
         rgb, alpha = colours[:, :3], colours[:, 3:]
         return rgb * alpha + background * (1 - alpha), background
 

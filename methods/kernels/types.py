@@ -40,22 +40,27 @@ def check_rays(rays: Rays) -> int:
 
 class Occupancy:
     """Which cells of the unit cube may hold matter. `cells` [G, G, G] bool is indexed (x, y, z); G
-    is a multiple of 16, at most `LARGEST_SIDE`. The derived properties let a ray cross all space
-    known to be empty around it in one step."""
+    is a multiple of 16, at most `LARGEST_SIDE`. If `contracted`, all of space is in the cube, as
+    `march.contraction` says. The derived properties let a ray cross all space known to be empty
+    around it in one step."""
 
-    def __init__(self, cells: Tensor) -> None:
+    def __init__(self, cells: Tensor, contracted: bool = False) -> None:
         size = cells.shape[0]
         check_shape("cells", cells, size, size, size)
         sides = f"a side that is a multiple of 16, at most {LARGEST_SIDE}"
         expect(not size % BRICK**2 and size <= LARGEST_SIDE, "cells", sides, size)
-        self.cells = cells.bool()
+        self.cells, self.contracted = cells.bool(), contracted
 
     @classmethod
-    def at(cls, coordinates: Tensor, resolution: int) -> Occupancy:
+    def at(cls, coordinates: Tensor, resolution: int, contracted: bool = False) -> Occupancy:
         """A grid of `resolution`^3 cells in which those at `coordinates` [V, 3] are occupied."""
         cells = torch.zeros([resolution] * 3, dtype=torch.bool, device=coordinates.device)
         cells[coordinates.long().unbind(dim=1)] = True
-        return cls(cells)
+        return cls(cells, contracted)
+
+    def everywhere(self) -> Occupancy:
+        """The grid of the same space in which every cell is occupied."""
+        return Occupancy(torch.ones_like(self.cells), self.contracted)
 
     @property
     def resolution(self) -> int:

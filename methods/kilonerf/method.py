@@ -88,7 +88,7 @@ class KiloNerf(FieldStudent):
         return KiloField(self.grid, self.teacher.backend, generator).to(self.teacher.device)
 
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> KiloTraining:
-        bounds = scene.bounds.to(self.teacher.device)
+        bounds = scene.cells.to(self.teacher.device)
         self.occupancy = teacher.occupancy
         self.grid, pieces = place_networks(teacher.occupancy, bounds, self.networks)
         training = KiloTraining(self, self.new_field(), teacher, scene, budget)

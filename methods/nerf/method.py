@@ -39,7 +39,7 @@ class Nerf(FieldStudent):
         """The occupied cells and a march through them, or the whole cube and every sample."""
         if self.skip:
             return super().renderer(probe)
-        cube = Occupancy(torch.ones_like(self.occupancy.cells))
+        cube = self.occupancy.everywhere()
 
         def render(_: Tensor, rays: Rays) -> Pixels:
             canvas = Pixels.blank(len(rays.origins), self.field.channels, self.field.device)

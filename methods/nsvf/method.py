@@ -34,7 +34,8 @@ class Nsvf(FieldStudent):
 
     def occupied(self, teacher: TrainedField) -> Occupancy:
         size = self.resolution
-        return Occupancy.at(occupied_voxels(teacher.occupancy, size), size)
+        known = teacher.occupancy
+        return Occupancy.at(occupied_voxels(known, size), size, known.contracted)
 
     def sampling(self, budget: Budget) -> Sampling:
         return Sampling(step=self.step / self.resolution)

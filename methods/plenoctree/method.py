@@ -114,6 +114,7 @@ class PlenOctree(Student):
     stored: Literal["fp16", "fp32"]
 
     kind, model, computed = "plenoctree", ("extraction",), IN_FP32
+    contracts = False
     study = Study(
         knobs={
             "stop": turned("stop", "method.stop", ("1e-1", "1e-3", "1e-4")),

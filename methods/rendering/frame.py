@@ -91,8 +91,10 @@ def rays_at_matter(camera: Camera, occupancy: Occupancy) -> tuple[Tensor, Rays]:
 def sees_matter(camera: Camera, occupancy: Occupancy) -> Tensor:
     """Which pixels may see an occupied cell: [h, w] bool. A pixel may see an occupied brick if it
     lies in the bounding box of the brick's projected corners; if one of the corners is not in front
-    of the camera, every pixel may."""
+    of the camera, every pixel may. In contracted space every pixel may."""
     device = camera.c2w.device
+    if occupancy.contracted:
+        return torch.ones(camera.height, camera.width, dtype=torch.bool, device=device)
     bricks = occupancy.bricks.to(device)
     unit = torch.arange(2, device=device)
     corners = (bricks[:, None] + torch.cartesian_prod(unit, unit, unit)) * BRICK

@@ -18,6 +18,7 @@ from torch import Tensor
 from bench.cameras import place_camera, project, within
 from bench.types import Camera
 from methods.kernels.march import MAX_SAMPLES
+from methods.kernels.march.contraction import contract, expand, stretch
 from methods.kernels.types import BRICK, Occupancy
 from methods.rendering.field import CHUNK_SAMPLES, LOG_DENSITY_CLAMP, Field
 
@@ -41,7 +42,9 @@ LARGEST = math.exp(LOG_DENSITY_CLAMP)
 MIN_VIEWS = 2  # training cameras that must see a place before it may count as occupied
 
 
-def learnable_cells(bounds: Tensor, cameras: Sequence[Camera]) -> Tensor:
+def learnable_cells(
+    bounds: Tensor, cameras: Sequence[Camera], contracted: bool = False
+) -> Tensor:
     """Cells [G, G, G] that the pictures of `cameras` can show to be empty or not.
 
     They overlap `bounds` [2, 3] and lie in a brick of 4^3 cells that at least `MIN_VIEWS` cameras
@@ -58,13 +61,15 @@ def learnable_cells(bounds: Tensor, cameras: Sequence[Camera]) -> Tensor:
     side = RESOLUTION // BRICK
     axis = (torch.arange(side, device=device) + 0.5) / side
     centres = torch.cartesian_prod(axis, axis, axis)
+    points = expand(centres) if contracted else centres
     views = torch.zeros(len(centres), dtype=torch.int32, device=device)
     free = torch.ones(len(centres), dtype=torch.bool, device=device)
     for camera in cameras:
         camera = place_camera(camera, device)
-        pixels, depth = project(camera, centres)
+        pixels, depth = project(camera, points)
         views += (depth > 0) & within(pixels, camera.width, camera.height)
-        free &= (centres - camera.c2w[:, 3]).abs().amax(dim=1) > 1.5 / side
+        at = contract(camera.c2w[:, 3]) if contracted else camera.c2w[:, 3]
+        free &= (centres - at).abs().amax(dim=1) > 1.5 / side
     bricks = ((views >= MIN_VIEWS) & free).view(side, side, side)
     for dim in range(3):
         bricks = bricks.repeat_interleave(BRICK, dim=dim)
@@ -73,12 +78,13 @@ def learnable_cells(bounds: Tensor, cameras: Sequence[Camera]) -> Tensor:
 
 class DensityGrid:
     """The running maximum of the density in [G, G, G] cells of the unit cube, and their occupancy.
-    Only `cells` [G, G, G] bool may ever be occupied."""
+    Only `cells` [G, G, G] bool may ever be occupied. In `contracted` space densities are per length
+    in the cube, as long as a ray's steps are there."""
 
-    def __init__(self, cells: Tensor) -> None:
+    def __init__(self, cells: Tensor, contracted: bool = False) -> None:
         self.density = INITIAL * cells.float()
         self._candidates = cells.flatten().nonzero().squeeze(1)
-        self.occupancy = Occupancy(cells)
+        self.occupancy = Occupancy(cells, contracted)
 
     def restore(self, density: Tensor) -> None:
         """Restore the density of a checkpoint."""
@@ -104,7 +110,9 @@ class DensityGrid:
         place = cells // (rows * columns), cells // columns % rows, cells % columns
         corner = torch.stack(place, dim=-1)
         jitter = torch.rand(len(cells), 3, generator=generator, device=cells.device)
-        return field.density((corner + jitter) / RESOLUTION)[0]
+        places = (corner + jitter) / RESOLUTION
+        sigma = field.density(places)[0]
+        return sigma * stretch(places) if self.occupancy.contracted else sigma
 
     def _draw(self, samples: int, generator: torch.Generator) -> Tensor:
         device = self.density.device
@@ -116,4 +124,5 @@ class DensityGrid:
 
     def _threshold(self) -> None:
         mean = self.density.sum() / len(self._candidates)  # others have a density of 0
-        self.occupancy = Occupancy(self.density > mean.clamp(max=THRESHOLD))
+        cells = self.density > mean.clamp(max=THRESHOLD)
+        self.occupancy = Occupancy(cells, self.occupancy.contracted)

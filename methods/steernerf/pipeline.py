@@ -125,7 +125,7 @@ class Pipeline:
 
     @cached_property
     def _cube(self) -> Occupancy:
-        return Occupancy(torch.ones_like(self.occupancy.cells))
+        return self.occupancy.everywhere()
 
 
 def near_matter(seen: Tensor) -> Rectangle:

@@ -88,7 +88,7 @@ class FieldStudent(Student):
         return StudentTraining(self, self.new_field(), teacher, scene, budget)
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        self.occupancy = Occupancy(tensors["cells"].to(self.teacher.device))
+        self.occupancy = Occupancy(tensors["cells"].to(self.teacher.device), self.contracted)
         self.field = self.new_field()
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
 

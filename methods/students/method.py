@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from bench.cameras import place_camera
+from bench.errors import unexpected
 from bench.provenance import computed_by
 from bench.study import Study, turned
 from bench.threads import torch_threads
@@ -40,6 +41,7 @@ class Student(ABC):
     kind: ClassVar[str]  # name of its trained stage, for example "nerf"
     model: ClassVar[tuple[str, ...]] = ()  # its settings that its training depends on
     computed: ClassVar[Mapping[str, str]] = {}  # what rows say of it but not of its teacher
+    contracts: ClassVar[bool] = True  # whether it can be trained in contracted space
     study = Study(
         knobs={"stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3"))},
         exact=("method.stop=1e-4",),
@@ -76,6 +78,10 @@ class Student(ABC):
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         budget = replace(budget, renderer_steps=self.steps or budget.renderer_steps)
+        self.contracted = scene.space == "all"
+        if self.contracted and not self.contracts:
+            straight = "a scene of space=box: its rays cross voxels in straight lines"
+            raise unexpected(f"method={self.kind}", straight, f"space=all of {scene.name}")
         with torch_threads(budget.threads):
             teacher = train_field(self.teacher, scene, budget, log)
             settings = asdict(self)

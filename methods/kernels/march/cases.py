@@ -123,13 +123,13 @@ OUTPUTS = ("offsets", "ray", "t", "delta", "positions", "resume")
 
 
 @cache
-def _occupancy(kind: str, device: torch.device) -> Occupancy:
-    return Occupancy(cells(kind, 128 if kind == "shell" else 32).to(device))
+def _occupancy(kind: str, contracted: bool, device: torch.device) -> Occupancy:
+    return Occupancy(cells(kind, 128 if kind == "shell" else 32).to(device), contracted)
 
 
 def _march(given: Given, backend: str) -> tuple[Tensor, ...]:
     rays, how = given["rays"], given["how"]
-    occupancy = _occupancy(given["grid"], rays.origins.device)
+    occupancy = _occupancy(given["grid"], given.get("contracted", False), rays.origins.device)
     samples = march(rays, occupancy, **how, backend=backend)
     return tuple(getattr(samples, name) for name in OUTPUTS)
 
@@ -166,11 +166,14 @@ def _agreements() -> list[Case]:
         "long directions": (long_rays(), "porous shell", {}),
     }
     found = []
-    for name, (rays, grid, options) in kinds.items():
-        given = {"rays": rays, "grid": grid, "how": {"step": LONG} | options}
-        found += MARCH.cases(name, partial(dict, given))
     many = {"rays": some_rays(1 << 13), "grid": "shell", "how": {"step": STEP}}
-    return [*found, *MARCH.cases("hollow sphere", partial(dict, many), items=1 << 13)]
+    for contracted in (False, True):
+        where, inside = {"contracted": contracted}, "contracted, " if contracted else ""
+        for name, (rays, grid, options) in kinds.items():
+            given = {"rays": rays, "grid": grid, "how": {"step": LONG} | options} | where
+            found += MARCH.cases(f"{inside}{name}", partial(dict, given))
+        found += MARCH.cases(f"{inside}hollow sphere", partial(dict, many | where), items=1 << 13)
+    return found
 
 
 def _ways() -> Iterator[Case]:

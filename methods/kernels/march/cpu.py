@@ -15,6 +15,8 @@ from torch import Tensor
 
 from methods.kernels.cpu import arrays, check_float32, f32, i32, jit, slope, u64
 from methods.kernels.march import LEAST_STEP, Segments, longest_ray
+from methods.kernels.march.contraction import BEYOND, Course
+from methods.kernels.march.reference import clip
 from methods.kernels.types import Extent, Occupancy, Samples, offsets_of
 
 CHUNK = 128  # rays that are marched together; their numbers stay in the first-level cache
@@ -33,6 +35,7 @@ FAR_AWAY = f32(2**30)  # a step that no ray reaches; the numbers of steps are in
 ORIGIN, DIRECTION, SLOPE = 0, 3, 6  # three rows each
 NEAR, FAR, STEP, RATE, PHASE, FIRST, T = 9, 10, 11, 12, 13, 14, 15
 FLOATS = 16
+MIDDLE, REACH, BEGIN = 6, 7, 8  # in contracted space, in place of the slopes: see `Course`
 # ... and in int32. FREE is the clearance, or -1 in an occupied cell.
 K, RAY, COUNT, CELL, FREE = 0, 1, 2, 3, 6
 INTEGERS = 7
@@ -55,13 +58,27 @@ def march(segments: Segments, occupancy: Occupancy, extent: Extent | None) -> Sa
     given = arrays(origins, directions, segments.window, segments.jitter, segments.start)
     grid = arrays(occupancy.words.flatten(), occupancy.clearance.flatten(), occupancy.bounds)
     found = arrays(scratch, owners, counts, resume)
-    _find(tuple(given), tuple(grid), occupancy.resolution, f32(step), most, tuple(found))
+    if occupancy.contracted:
+        course = Course.of(segments.rays, step)
+        _, far, _, alive = clip(segments, course)
+        where = arrays(course.middle, course.reach, course.first, course.length, far)
+        start = torch.where(alive, segments.start, -1).int().numpy()
+        ways, width = (*where, start), course.width
+    else:
+        ways, width = tuple(np.empty(0, np.float32) for _ in range(5)), step
+        ways = (*ways, given[4])
+    contracted = occupancy.contracted
+    size = occupancy.resolution
+    _find(tuple(given), ways, tuple(grid), size, f32(width), most, contracted, tuple(found))
     offsets = offsets_of(counts)
     total = int(offsets[-1])
     t, positions = torch.empty(total), torch.empty(total, 3)
+    delta = torch.full((total,), step)
     ray = torch.empty(total, dtype=torch.int32)
     _place(*given[:2], *found[:2], most, *arrays(offsets, t, positions, ray))
-    return Samples(t, torch.full((total,), step), offsets, ray, positions, resume)
+    if contracted:
+        _contract(*ways[:4], *arrays(t, ray, positions, delta))
+    return Samples(t, delta, offsets, ray, positions, resume)
 
 
 @jit()
@@ -215,15 +232,126 @@ def _advance(floats, integers, rays, width):
 
 
 @jit()
+def _begin_contracted(floats, integers, ways, first, rays, width):
+    """As `_begin`, in contracted space: rays have their course and no end but that of a window."""
+    middle, reach, begin, _, far, start = ways
+    for i in range(rays):
+        floats[_at(MIDDLE, i)] = middle[first + i]
+        floats[_at(REACH, i)] = reach[first + i]
+        floats[_at(BEGIN, i)] = begin[first + i]
+        floats[_at(FAR, i)] = far[first + i]
+        floats[_at(STEP, i)] = width
+        floats[_at(RATE, i)] = f32(1) / width
+        integers[_at(K, i)] = start[first + i]
+        integers[_at(FREE, i)] = start[first + i] >= 0
+
+
+@jit(error_model="numpy")
+def _contracted(x, y, z):
+    """`contraction.contract`."""
+    x, y, z = (x - f32(0.5)) * f32(4), (y - f32(0.5)) * f32(4), (z - f32(0.5)) * f32(4)
+    inverse = f32(1) / max(abs(x), max(abs(y), abs(z)))
+    shrunk = (f32(2) - inverse) * inverse if inverse < f32(1) else f32(1)
+    quarter, half = f32(0.25), f32(0.5)
+    return x * shrunk * quarter + half, y * shrunk * quarter + half, z * shrunk * quarter + half
+
+
+@jit(error_model="numpy")
+def _locate_contracted(floats, integers, rays, size):
+    """As `_locate`, in contracted space."""
+    for i in range(_padded(rays)):
+        k = f32(integers[_at(K, i)]) + floats[_at(PHASE, i)]
+        v = floats[_at(BEGIN, i)] + k * floats[_at(STEP, i)]
+        reach = abs(v)
+        reach = reach if reach <= f32(1) else f32(1) / max(f32(2) - reach, f32(BEYOND))
+        t = floats[_at(MIDDLE, i)] + floats[_at(REACH, i)] * (-reach if v < f32(0) else reach)
+        inside = t < floats[_at(FAR, i)]
+        at = t if inside else f32(0)
+        x, y, z = _three(floats, ORIGIN, i)
+        dx, dy, dz = _three(floats, DIRECTION, i)
+        x, y, z = _contracted(x + at * dx, y + at * dy, z + at * dz)
+        integers[_at(CELL, i)] = _cell(x, size)
+        integers[_at(CELL + 1, i)] = _cell(y, size)
+        integers[_at(CELL + 2, i)] = _cell(z, size)
+        floats[_at(T, i)] = t if inside else INF
+
+
+@jit()
+def _room(place, cell, free, width):
+    """How far `place` is, along one axis, from the end of the empty space around; see
+    `_leave_axis`."""
+    brick = i32(cell >> i32(2))
+    low = i32(i32(i32(brick - free) + i32(1)) << i32(2)) if free > 0 else cell
+    high = i32(i32(brick + free) << i32(2)) if free > 0 else i32(cell + i32(1))
+    return min(place - f32(low) * width, f32(high) * width - place)
+
+
+@jit(error_model="numpy")
+def _advance_contracted(floats, integers, rays, width):
+    """As `_advance`, in contracted space, where rays are bent: to leave the empty space, a place
+    goes at least as far as `room`, and it goes `steep` times as far as its point at most. Beyond
+    n, that is 4/n - 3/n^2, or 4/3 if n < 3/2; in the box it is 1."""
+    for i in range(_padded(rays)):
+        free, t = integers[_at(FREE, i)], floats[_at(T, i)]
+        x, y, z = _three(floats, ORIGIN, i)
+        dx, dy, dz = _three(floats, DIRECTION, i)
+        x, y, z = _contracted(x + t * dx, y + t * dy, z + t * dz)
+        a = _room(x, integers[_at(CELL, i)], free, width)
+        b = _room(y, integers[_at(CELL + 1, i)], free, width)
+        c = _room(z, integers[_at(CELL + 2, i)], free, width)
+        room = min(a, min(b, c))
+        room = room if room > f32(0) else f32(0)
+        size = max(abs(x - f32(0.5)), max(abs(y - f32(0.5)), abs(z - f32(0.5))))
+        inverse = f32(2) - f32(4) * (size - room)  # 1/n, at least
+        steep = (f32(4) - f32(3) * inverse) * inverse
+        steep = f32(4 / 3) if inverse > f32(2 / 3) else steep
+        steep = f32(1) if size + room < f32(0.25) else steep
+        leave = t + room / (steep * max(abs(dx), max(abs(dy), abs(dz))))
+        r = (leave - floats[_at(MIDDLE, i)]) / floats[_at(REACH, i)]
+        v = abs(r)
+        v = v if v <= f32(1) else f32(2) - f32(1) / v
+        to = ((-v if r < f32(0) else v) - floats[_at(BEGIN, i)]) * floats[_at(RATE, i)]
+        beyond = _whole(to - floats[_at(PHASE, i)])
+        after = i32(integers[_at(K, i)] + i32(1))
+        beyond = beyond if free >= 0 else after
+        integers[_at(K, i)] = beyond if beyond > after else after
+
+
+@jit(parallel=True)
+def _contract(middle, reach, begin, length, t, ray, positions, delta):
+    """Contract the places of samples, and set the lengths of their steps."""
+    for n in prange(len(t)):
+        own = ray[n]
+        x, y, z = _contracted(positions[n, 0], positions[n, 1], positions[n, 2])
+        positions[n, 0], positions[n, 1], positions[n, 2] = x, y, z
+        r = (t[n] - middle[own]) / reach[own]
+        delta[n] = length[own] * max(r * r, f32(1))
+
+
+@jit()
 def _march_chunk(
-    floats, integers, active, words, clearance, resolution, limit, scratch, owners, counts, resume
+    floats,
+    integers,
+    active,
+    words,
+    clearance,
+    resolution,
+    limit,
+    contracted,
+    scratch,
+    owners,
+    counts,
+    resume,
 ):
     """March the rays in the first `active` columns to their ends."""
     used = u64(0)
     side = resolution // 4
     size, width = f32(resolution), f32(1) / f32(resolution)
     while active > 0:
-        _locate(floats, integers, active, size)
+        if contracted:
+            _locate_contracted(floats, integers, active, size)
+        else:
+            _locate(floats, integers, active, size)
         for i in range(active - 1, -1, -1):  # a ray that ends makes room for one seen before
             t = floats[_at(T, i)]
             ray, found = u64(integers[_at(RAY, i)]), integers[_at(COUNT, i)]
@@ -244,11 +372,14 @@ def _march_chunk(
             counts[ray], resume[ray] = found, again
             active -= 1
             _move(floats, integers, active, i)
-        _advance(floats, integers, active, width)
+        if contracted:
+            _advance_contracted(floats, integers, active, width)
+        else:
+            _advance(floats, integers, active, width)
 
 
 @jit(parallel=True)
-def _find(given, grid, resolution, step, most, found):
+def _find(given, ways, grid, resolution, step, most, contracted, found):
     origins, directions, window, jitter, start = given
     words, clearance, bounds = grid
     scratch, owners, counts, resume = found
@@ -262,13 +393,17 @@ def _find(given, grid, resolution, step, most, found):
         active = min(CHUNK, rays - first)
         counts[first : first + active], resume[first : first + active] = 0, -1
         _load(floats, integers, origins, directions, window, jitter, start, first, active)
-        _begin(floats, integers, active, low, high, step)
+        if contracted:
+            _begin_contracted(floats, integers, ways, first, active, step)
+        else:
+            _begin(floats, integers, active, low, high, step)
         for i in range(active - 1, -1, -1):
             if not integers[_at(FREE, i)]:
                 active -= 1
                 _move(floats, integers, active, i)
         own = scratch[first * most :], owners[first * most :], counts[first:], resume[first:]
-        _march_chunk(floats, integers, active, words, clearance, resolution, most, *own)
+        part = floats, integers, active, words, clearance, resolution, most, contracted
+        _march_chunk(*part, *own)
 
 
 @jit(parallel=True)

@@ -13,6 +13,7 @@ from torch import Tensor
 from methods.kernels.dispatch import interpreted
 from methods.kernels.gpu import check_types, launch, vector
 from methods.kernels.march import Segments
+from methods.kernels.march.contraction import Course
 from methods.kernels.march.reference import clip, slopes
 from methods.kernels.types import BRICK, Extent, Occupancy, Samples, offsets_of
 
@@ -38,6 +39,8 @@ def march(segments: Segments, occupancy: Occupancy, extent: Extent | None) -> Sa
     t, positions = (torch.empty(*shape, device=device) for shape in ((total,), (total, 3)))
     _launch(arguments, counts, resume, offsets, ray, t, positions)
     delta = torch.full_like(t, segments.step)
+    if occupancy.contracted:
+        delta = Course.of(segments.rays, segments.step).lengths(ray, t)
     return Samples(t, delta, offsets, ray, positions, resume, longest=extent.longest)
 
 
@@ -46,10 +49,16 @@ def _arguments(segments: Segments, occupancy: Occupancy) -> list[Any]:
     origins, directions = segments.rays.origins, segments.rays.directions
     window, jitter = segments.window, segments.jitter
     check_types(torch.float32, origins=origins, directions=directions, window=window, jitter=jitter)
-    near, far, step_t, alive = clip(segments)
+    course = Course.of(segments.rays, segments.step) if occupancy.contracted else None
+    near, far, step_t, alive = clip(segments, course)
     # Clamped to the cube: a window may lie outside it, beyond the range of integers.
     lowest = torch.minimum(torch.maximum(window[:, 0], near), far)
-    given = (origins, directions, slopes(directions)[0], near, far, step_t, lowest, jitter)
+    if course is None:
+        along = slopes(directions)[0]
+    else:
+        along = torch.stack((course.middle, course.reach, course.first), dim=1)
+        step_t = torch.full_like(step_t, course.width)
+    given = (origins, directions, along, near, far, step_t, lowest, jitter)
     return [
         *(x.contiguous() for x in given),
         torch.where(alive, segments.start, -1).int(),
@@ -57,6 +66,7 @@ def _arguments(segments: Segments, occupancy: Occupancy) -> list[Any]:
         occupancy.clearance,
         occupancy.resolution // BRICK,
         segments.limit,
+        occupancy.contracted,
         len(origins),
     ]
 
@@ -87,9 +97,55 @@ def _leave_slab(origin, slope, cell, free, width):
 
 
 @triton.jit
-def _cell(origin, direction, t, size):
-    cell = ((origin + t * direction) * size.to(tl.float32)).to(tl.int32)
+def _cell(place, size):
+    cell = (place * size.to(tl.float32)).to(tl.int32)
     return tl.minimum(tl.maximum(cell, 0), size - 1)
+
+
+@triton.jit
+def _contracted(x, y, z):
+    """`contraction.contract`."""
+    x, y, z = (x - 0.5) * 4, (y - 0.5) * 4, (z - 0.5) * 4
+    size = tl.maximum(tl.abs(x), tl.maximum(tl.abs(y), tl.abs(z)))
+    inverse = 1 / tl.maximum(size, 1.0)
+    shrunk = tl.where(inverse < 1, (2 - inverse) * inverse, 1.0)
+    return x * shrunk * 0.25 + 0.5, y * shrunk * 0.25 + 0.5, z * shrunk * 0.25 + 0.5
+
+
+@triton.jit
+def _spread(v):
+    """r at `v`, see `contraction`."""
+    size = tl.abs(v)
+    size = tl.where(size <= 1, size, 1 / tl.maximum(2 - size, 1e-6))
+    return tl.where(v < 0, -size, size)
+
+
+@triton.jit
+def _drawn_in(r):
+    """v at `r`, see `contraction`."""
+    size = tl.abs(r)
+    size = tl.where(size <= 1, size, 2 - 1 / tl.maximum(size, 1.0))
+    return tl.where(r < 0, -size, size)
+
+
+@triton.jit
+def _room(place, cell, free, width):
+    """How far `place` is, along one axis, from the end of the empty space around; see
+    `_leave_slab`."""
+    brick = cell >> 2
+    first = tl.where(free == 0, cell, (brick - free + 1) << 2).to(tl.float32)
+    end = tl.where(free == 0, cell + 1, (brick + free) << 2).to(tl.float32)
+    return tl.minimum(place - first * width, end * width - place)
+
+
+@triton.jit
+def _steepness(px, py, pz, room):
+    """How many times as far as its point a contracted place goes at most, within `room` of p; see
+    `cpu._advance_contracted`."""
+    size = tl.maximum(tl.abs(px - 0.5), tl.maximum(tl.abs(py - 0.5), tl.abs(pz - 0.5)))
+    inverse = 2 - 4 * (size - room)
+    steep = tl.where(inverse > 2 / 3, 4 / 3, (4 - 3 * inverse) * inverse)
+    return tl.where(size + room < 0.25, 1.0, steep)
 
 
 @triton.jit
@@ -107,6 +163,7 @@ def _march(
     clearance,
     side,
     limit,
+    contracted: tl.constexpr,
     rays,
     counts,
     resume,
@@ -116,7 +173,8 @@ def _march(
     out_positions,
     BLOCK: tl.constexpr,
 ):
-    """Count samples and find where to resume; with `offsets`, write the samples there."""
+    """Count samples and find where to resume; with `offsets`, write the samples there. In
+    `contracted` space, `slopes` are the middle, reach and first v of a `Course`."""
     ray = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = ray < rays
     k = tl.load(starts + ray, mask=inside, other=-1)
@@ -135,12 +193,22 @@ def _march(
     begin = count if offsets is None else tl.load(offsets + ray, mask=inside, other=0)
     again = tl.full([BLOCK], -1, tl.int32)
     # One step less, because rounding may affect the step before.
-    k = tl.where(going, tl.maximum(k, ((low - near) / step - phase).to(tl.int32) - 1), k)
+    if contracted:
+        ahead = (_drawn_in((low - sx) / sy) - sz) / step
+    else:
+        ahead = (low - near) / step
+    k = tl.where(going, tl.maximum(k, (ahead - phase).to(tl.int32) - 1), k)
     while tl.max(going.to(tl.int32), 0) > 0:
-        t = near + (k.to(tl.float32) + phase) * step
+        if contracted:
+            t = sx + sy * _spread(sz + (k.to(tl.float32) + phase) * step)
+        else:
+            t = near + (k.to(tl.float32) + phase) * step
         going = going & (t < far)
         t = tl.where(going, t, near)
-        x, y, z = _cell(ox, dx, t, size), _cell(oy, dy, t, size), _cell(oz, dz, t, size)
+        px, py, pz = ox + t * dx, oy + t * dy, oz + t * dz
+        if contracted:
+            px, py, pz = _contracted(px, py, pz)
+        x, y, z = _cell(px, size), _cell(py, size), _cell(pz, size)
         brick = ((x >> 2) * side + (y >> 2)) * side + (z >> 2)
         free = tl.load(clearance + brick, mask=going, other=0).to(tl.int32)
         word = tl.load(words + brick, mask=going & (free == 0), other=0)
@@ -151,20 +219,28 @@ def _march(
             place = begin + count
             tl.store(ray_of + place, ray.to(tl.int32), mask=hit)
             tl.store(out_t + place, t, mask=hit)
-            tl.store(out_positions + 3 * place, ox + t * dx, mask=hit)
-            tl.store(out_positions + 3 * place + 1, oy + t * dy, mask=hit)
-            tl.store(out_positions + 3 * place + 2, oz + t * dz, mask=hit)
+            tl.store(out_positions + 3 * place, px, mask=hit)
+            tl.store(out_positions + 3 * place + 1, py, mask=hit)
+            tl.store(out_positions + 3 * place + 2, pz, mask=hit)
         count += hit.to(tl.int64)
         full = hit & (count == limit)
         again = tl.where(full, k + 1, again)
         skips = going & passed & (hit == 0)
         k += 1
         if tl.max(skips.to(tl.int32), 0) > 0:
-            leave = _leave_slab(ox, sx, x, free, width)
-            leave = tl.minimum(leave, _leave_slab(oy, sy, y, free, width))
-            leave = tl.minimum(leave, _leave_slab(oz, sz, z, free, width))
+            if contracted:
+                room = tl.minimum(_room(px, x, free, width), _room(py, y, free, width))
+                room = tl.maximum(tl.minimum(room, _room(pz, z, free, width)), 0.0)
+                speed = tl.maximum(tl.abs(dx), tl.maximum(tl.abs(dy), tl.abs(dz)))
+                leave = t + room / (_steepness(px, py, pz, room) * speed)
+                ahead = (_drawn_in((leave - sx) / sy) - sz) / step
+            else:
+                leave = _leave_slab(ox, sx, x, free, width)
+                leave = tl.minimum(leave, _leave_slab(oy, sy, y, free, width))
+                leave = tl.minimum(leave, _leave_slab(oz, sz, z, free, width))
+                ahead = (leave - near) / step
             # Rounded down, so that the first step beyond the empty space is never skipped.
-            ahead = tl.where(skips, (leave - near) / step, 0.0) - phase
+            ahead = tl.where(skips, ahead, 0.0) - phase
             k = tl.maximum(k, ahead.to(tl.int32))
         going = going & (full == 0)
     if offsets is None:

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from methods.kernels.march import LEAST_STEP, Segments, longest_ray
+from methods.kernels.march.contraction import Course, contract
 from methods.kernels.types import PARALLEL, Extent, Occupancy, Samples, offsets_of
 
 BLOCK = 1 << 12  # rays that are tested at a time: [BLOCK, 1024, 3] positions are 50 MB
@@ -17,11 +18,12 @@ BLOCK = 1 << 12  # rays that are tested at a time: [BLOCK, 1024, 3] positions ar
 
 def count(segments: Segments, occupancy: Occupancy) -> Tensor:
     """How many samples a ray has, [R] int64."""
-    return torch.cat([counts for _, counts, _ in _Steps.of(segments).taken(occupancy)])
+    steps = _Steps.of(segments, occupancy)
+    return torch.cat([counts for _, counts, _ in steps.taken(occupancy)])
 
 
 def march(segments: Segments, occupancy: Occupancy, extent: Extent | None) -> Samples:
-    steps = _Steps.of(segments)
+    steps = _Steps.of(segments, occupancy)
     parts = zip(*steps.taken(occupancy), strict=True)
     kept, counts, resume = (torch.cat(column) for column in parts)
     if extent is None:
@@ -29,7 +31,8 @@ def march(segments: Segments, occupancy: Occupancy, extent: Extent | None) -> Sa
     place = torch.nonzero_static(kept.flatten(), size=extent.total).squeeze(1)
     ray, k = place // max(steps.most, 1), place % max(steps.most, 1)
     t, positions = steps.at(ray, k)
-    delta = torch.full_like(t, segments.step)
+    course = steps.course
+    delta = torch.full_like(t, segments.step) if course is None else course.lengths(ray, t)
     where = t, delta, offsets_of(counts), ray.int(), positions, resume
     return Samples(*where, longest=extent.longest)
 
@@ -44,21 +47,26 @@ class _Steps:
     length: Tensor
     alive: Tensor
     most: int
+    course: Course | None  # in contracted space
 
     @classmethod
-    def of(cls, segments: Segments) -> _Steps:
-        near, far, length, alive = clip(segments)
+    def of(cls, segments: Segments, occupancy: Occupancy) -> _Steps:
+        course = Course.of(segments.rays, segments.step) if occupancy.contracted else None
+        near, far, length, alive = clip(segments, course)
         most = longest_ray(segments.step)
-        if alive.device.type == "cpu":  # a GPU would make the host wait
+        if alive.device.type == "cpu" and course is None:  # a GPU would make the host wait
             count = torch.where(alive, (far - near) / length, 0).ceil()
             most = int(functional.pad(count, (0, 1)).max().clamp(max=most))
-        return cls(segments, near, far, length, alive, most)
+        return cls(segments, near, far, length, alive, most, course)
 
     def at(self, ray: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
         """t [...] and positions [..., 3] of the steps `k` of the rays `ray`."""
-        rays = self.segments.rays
-        t = self.near[ray] + (k + self.segments.jitter[ray]) * self.length[ray]
-        return t, rays.origins[ray] + t[..., None] * rays.directions[ray]
+        rays, phased = self.segments.rays, k + self.segments.jitter[ray]
+        if self.course is None:
+            t = self.near[ray] + phased * self.length[ray]
+            return t, rays.origins[ray] + t[..., None] * rays.directions[ray]
+        t = self.course.at(ray, phased)
+        return t, contract(rays.origins[ray] + t[..., None] * rays.directions[ray])
 
     def taken(self, occupancy: Occupancy) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """For each batch of rays: which steps are samples [R, most], counts [R], resume [R]."""
@@ -75,13 +83,17 @@ class _Steps:
             yield kept, counts, torch.where(counts == limit, last, -1).int()
 
 
-def clip(segments: Segments) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The range of t inside the cube, as far as the window reaches, the step in t, and whether to
-    march: near, far, step and mask, [R] each."""
+def clip(segments: Segments, course: Course | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The range of t inside the cube, as far as the window reaches, the step in t (at v = 0 of a
+    `course`), and whether to march: near, far, step and mask, [R] each."""
     origins, directions = segments.rays.origins, segments.rays.directions
-    slope, parallel = slopes(directions)
-    entry, leave = crossed(origins, parallel, -origins * slope, (1 - origins) * slope)
-    near, far = entry.clamp(min=0), torch.minimum(leave, segments.window[:, 1])
+    if course is None:
+        slope, parallel = slopes(directions)
+        entry, leave = crossed(origins, parallel, -origins * slope, (1 - origins) * slope)
+        near = entry.clamp(min=0)
+    else:
+        near, leave = torch.zeros_like(course.end), course.end
+    far = torch.minimum(leave, segments.window[:, 1])
     length = lengths(directions)
     # A true division: `step / length` would multiply by the reciprocal, which is an ulp off.
     step_t = torch.full_like(length, segments.step) / length
