@@ -22,6 +22,7 @@ from methods.gaussians.model import Gaussians
 from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.kernels.composite import STOP
+from methods.kernels.march.contraction import HALF
 from methods.kernels.types import expect
 from methods.rendering.frame import render_rays
 from methods.training import checkpoint, loop
@@ -77,6 +78,7 @@ class GaussianTraining(loop.Training):
         self.gaussians, self.options, self.backend = gaussians, options, setup.backend
         self.steps = steps
         self.split, self.background = scene.splits["train"], scene.background.to(setup.device)
+        self.endless = scene.space == "all"
         self.generator = torch.Generator(setup.device).manual_seed(setup.seed)
         self.views: list[int] = []  # still to come in this pass over the pictures
 
@@ -100,18 +102,25 @@ class GaussianTraining(loop.Training):
         share = self.step / self.steps
         camera, target = self._picture(half=share < options.half)
         pixels = gaussians.render(camera, STOP, NullProbe(), self.backend)
-        picture = pixels.over(self.background).values.view_as(target)
+        background = self.background
+        if self.endless:  # no gap may pass for the background: its colour is another one each time
+            background = torch.rand(3, generator=self.generator, device=background.device)
+        picture = pixels.over(background).values.view_as(target)
         loss = (1 - options.similarity) * functional.l1_loss(picture, target)
         if options.similarity:
             loss = loss + options.similarity * (1 - ssim(picture, target, backend=self.backend))
-        # Gaussians that are not needed fade.
+        # Gaussians that are not needed fade. Far ones are large, and go far.
+        before, far = gaussians.means.detach().clone(), self._distances()
         costs = options.opacity_cost * gaussians.opacities.mean()
-        costs = costs + options.scale_cost * gaussians.log_scales.exp().mean()
+        costs = costs + options.scale_cost * (gaussians.log_scales.exp() / far).mean()
         (loss + costs).backward()
         errors = loop.look(self, {"": functional.mse_loss(picture, target)}, {"picture": picture})
         rate = options.means * options.final_means**share
         self.optimiser.param_groups[0]["lr"] = rate
         self.optimiser.step()
+        if self.endless:
+            with torch.no_grad():
+                gaussians.means.copy_(before.lerp(gaussians.means, far))
         self.optimiser.zero_grad(set_to_none=True)
         self.step += 1
         if options.relocate_from <= share < options.relocate_to and self.step % options.every == 0:
@@ -119,6 +128,13 @@ class GaussianTraining(loop.Training):
         if options.noise:
             disturb(gaussians, options.noise * rate, self.generator)
         return errors
+
+    def _distances(self) -> Tensor:
+        """n of the means where all of space is rendered, see `contraction`, at least 1: [N, 1]."""
+        if not self.endless:
+            return self.background.new_ones(1)
+        away = (self.gaussians.means.detach() - 0.5).abs().amax(dim=1, keepdim=True)
+        return (away / HALF).clamp(min=1)
 
     def _picture(self, half: bool) -> tuple[Camera, Tensor]:
         """The next training view and its picture [H, W, 3]; a pass uses every view once."""

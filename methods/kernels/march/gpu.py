@@ -194,6 +194,7 @@ def _march(
     again = tl.full([BLOCK], -1, tl.int32)
     # One step less, because rounding may affect the step before.
     if contracted:
+        sy = tl.where(going, sy, 1.0)
         ahead = (_drawn_in((low - sx) / sy) - sz) / step
     else:
         ahead = (low - near) / step
@@ -232,7 +233,7 @@ def _march(
                 room = tl.minimum(_room(px, x, free, width), _room(py, y, free, width))
                 room = tl.maximum(tl.minimum(room, _room(pz, z, free, width)), 0.0)
                 speed = tl.maximum(tl.abs(dx), tl.maximum(tl.abs(dy), tl.abs(dz)))
-                leave = t + room / (_steepness(px, py, pz, room) * speed)
+                leave = t + room / tl.maximum(_steepness(px, py, pz, room) * speed, 1e-38)
                 ahead = (_drawn_in((leave - sx) / sy) - sz) / step
             else:
                 leave = _leave_slab(ox, sx, x, free, width)
