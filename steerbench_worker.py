@@ -39,6 +39,10 @@ LENGTH = struct.Struct("<I")
 MOST_HEADER, MOST_ARRAY = 1 << 26, 1 << 32  # bytes; more is no message, but something else
 
 
+class SteerbenchError(Exception):
+    """An error whose message says all: the user sees nothing else."""
+
+
 class Channel:
     """Messages over a connected socket: a JSON header with its length before it, then arrays.
 
@@ -201,6 +205,7 @@ def serve(kind):
     name, device, precision, memory: attributes for rows; `memory`: preceding frames that are used
     knobs: a dict of settings that need no new training, each with a list of values to try
     files: those that the pictures depend on, beside the modules that are loaded
+    notes: lines to show to the user once it has loaded
     """
     if VARIABLE not in os.environ:
         sys.exit("This is a worker: run it by `steerbench run method=external method.command=...`.")
@@ -233,6 +238,7 @@ def _converse(channel, kind):
             job = Job(header, channel)
             getattr(renderer, message)(job)
             files = [path for path in job.state.rglob("*") if path.is_file()] if job.state else []
+            answer = {"notes": list(getattr(renderer, "notes", ()))}
             stored = {"model": sum(path.stat().st_size for path in files)} if files else {}
             _forget_peak()
         elif message == "reset":

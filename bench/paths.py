@@ -10,6 +10,8 @@ from collections import ChainMap
 from collections.abc import Sequence
 from pathlib import Path
 
+import torch
+
 from bench.cameras import move_camera
 from bench.errors import unexpected
 from bench.scenes.export import data_camera
@@ -47,13 +49,23 @@ def read_path(file: Path, scene: Scene) -> list[Camera]:
     elif record.get("format") == NERFBASELINES:
         cameras = _of_nerfbaselines(record, file)
     else:
-        usual = scene.splits["test"].cameras[0]
-        cameras = [
-            read_camera(ChainMap(frame, record), opengl_pose(frame, where), usual, where)
-            for where, frame in entries_of(record, "frames", file)
-        ]
+        cameras = []
+        for where, frame in entries_of(record, "frames", file):
+            settings, pose = ChainMap(frame, record), opengl_pose(frame, where)
+            cameras.append(read_camera(settings, pose, _usual(settings, scene, where), where))
     scale, offset = 1 / scene.unit_length, -scene.origin.double() / scene.unit_length
     return [move_camera(camera, scale, offset) for camera in cameras]
+
+
+def _usual(settings: ChainMap, scene: Scene, where: str) -> Camera:
+    """The camera that has what the `settings` of a frame lack."""
+    if scene.splits:
+        return scene.splits["test"].cameras[0]
+    if not {"w", "h"} <= settings.keys():
+        raise unexpected(
+            where, "w and h, or scene=..., whose first test camera has them", "neither"
+        )
+    return Camera(torch.eye(4)[:3], 0, 0, 0.5, 0.5, 1, 1)
 
 
 def _of_viewer(record: dict, file: Path) -> list[Camera]:

@@ -2,10 +2,12 @@
 
 import hashlib
 import math
+import os
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from glob import glob
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -23,8 +25,13 @@ from bench.scoring import PICTURES, Scoring
 from bench.trajectories import resolution, spread
 from bench.types import BACKGROUNDS, Camera, Log, Split, SteerbenchError, composite
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+SUFFIXES = (
+    ".png", ".jpg", ".jpeg", ".webp", ".avif", ".bmp", ".gif", ".jp2", ".ppm", ".tif", ".tiff",
+)  # fmt: skip
 """Endings of files that count as pictures; other files in a folder are ignored."""
+
+MAP = re.compile(r"(.+)_(acc|accumulation|albedo|alpha|depth|disp|mask|normals?)(_\d+)?")
+"""File names, without ending, of maps beside a picture, which are ignored: r_0_depth_0001."""
 
 OF_A_RUN = re.compile(r"\d+-(rendered|truth|error)")
 """File names, without ending, of the pictures that a run keeps."""
@@ -47,28 +54,32 @@ class Pair(NamedTuple):
 def pairs_with_folder(pictures: Path, truth: Path, match: Match = "name") -> list[Pair]:
     """Pair each picture of the folder `truth` with its counterpart in `pictures`; see `matched`."""
     true = listed(truth)
-    files = matched(pictures, [path.stem for path in true], match)
-    return [Pair(file, path.name, path) for file, path in zip(files, true, strict=True)]
+    names = [path.relative_to(truth).as_posix() for path in true]
+    return [Pair(*pair) for pair in zip(matched(pictures, names, match), names, true, strict=True)]
 
 
 def pairs_with_split(pictures: Path, split: Split, match: Match = "name") -> list[Pair]:
     """Pair each picture of a scene's `split` with its counterpart in `pictures`; see `matched`."""
-    files = matched(pictures, [Path(name).stem for name in split.names], match)
+    files = matched(pictures, split.names, match)
     cameras: Sequence[Camera | None] = split.cameras or [None] * len(files)
     return [Pair(*pair) for pair in zip(files, split.names, split.images, cameras, strict=True)]
 
 
 def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
-    """The file of `folder` for each of `names`; raises if one is missing, surplus or ambiguous."""
+    """The file of `folder` for each of `names`, without ending: by its path below the folder, or by
+    its name if all are in the folder. Raises if one is missing, surplus or ambiguous."""
     files = listed(folder)
     if match == "order":
         if len(files) != len(names):
             raise unexpected(folder, f"{len(names)} pictures, as many as true ones", len(files))
         return files
+    keys, names = _keys([path.relative_to(folder).as_posix() for path in files]), _keys(names)
+    if not any("/" in key for key in keys):
+        names = [Path(name).name for name in names]
     if twice := _repeated(names):
         wanted = "true pictures of different names; --match order takes both in their order"
         raise unexpected(folder, wanted, f"several of {_some(twice)}")
-    known = {path.stem: path for path in files}
+    known = dict(zip(keys, files, strict=True))
     missing = [name for name in names if name not in known]
     further = sorted(known.keys() - set(names), key=_natural)
     if missing or further:
@@ -79,30 +90,48 @@ def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
     return [known[name] for name in names]
 
 
+def _keys(names: Sequence[str]) -> list[str]:
+    """`names` without ending, and without the folders that all of them are in."""
+    paths = [Path(name.lstrip("/")).with_suffix("") for name in names]
+    shared = os.path.commonpath([path.parent for path in paths] or [""])
+    return [str(path.relative_to(shared)) for path in paths]
+
+
 def listed(folder: Path) -> list[Path]:
-    """The pictures in a folder, 10 after 9; raises if none, or two names differ in their ending."""
+    """The pictures in a folder, if it has none in those below it, 10 after 9; raises if there are
+    none, or two names differ in their ending."""
     if not folder.is_dir():
         raise unexpected(folder, "a folder", "a file" if folder.exists() else "nothing there")
-    files = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
-    files.sort(key=lambda path: _natural(path.name))
-    if not files:
-        raise unexpected(folder, f"pictures ({', '.join(SUFFIXES)})", "none")
+    for pattern in ("*", "**/*"):
+        # Unlike those of Path, it follows links, and leaves out what is hidden.
+        found = glob(pattern, root_dir=folder, recursive=True)  # noqa: PTH207
+        below = sorted(found, key=_natural)
+        names = [name for name in below if Path(name).suffix.lower() in SUFFIXES]
+        if names:
+            break
+    else:
+        raise unexpected(folder, f"pictures ({', '.join(SUFFIXES)})", _some(below) or "none")
+    stems = [str(Path(name).with_suffix("")) for name in names]
+    if twice := _repeated(stems):
+        raise unexpected(folder, "one picture of a name", f"several of {_some(twice)}")
+    known = set(stems)
+    maps = {stem for stem in stems if (of := MAP.fullmatch(stem)) and of[1] in known}
+    files = [folder / name for name, stem in zip(names, stems, strict=True) if stem not in maps]
     if all(OF_A_RUN.fullmatch(path.stem) for path in files):
         raise SteerbenchError(
             f"{folder}: these are renderings, truths and error maps of a run, which is scored "
             "already: `steerbench results`; `steerbench compare` compares it with another run"
         )
-    if twice := _repeated([path.stem for path in files]):
-        raise unexpected(folder, "one picture of a name", f"several of {_some(twice)}")
     return files
 
 
 def reported_times(file: Path, pairs: Sequence[Pair]) -> list[float]:
     """The time of each picture in milliseconds, the column `frame_ms` of a CSV file.
 
-    With a column `name`, lines are matched by the name of the true picture without its ending, and
-    others are ignored; without, there is one for each picture, in their order. Raises
-    SteerbenchError if the file cannot be read, or a time is missing or not above 0.
+    With a column `name`, lines are matched by the name of the true picture without its ending, also
+    without its folder if names then differ, and others are ignored; without, there is one for each
+    picture, in their order. Raises SteerbenchError if the file cannot be read, or a time is missing
+    or not above 0.
     """
     try:
         table = pd.read_csv(file, dtype={"name": "str"})
@@ -112,8 +141,11 @@ def reported_times(file: Path, pairs: Sequence[Pair]) -> list[float]:
         raise unexpected(file, "a column frame_ms", ", ".join(map(str, table)) or "none")
     if "name" in table:
         table = table.dropna(subset="name").set_index("name")
-        table.index = table.index.map(lambda name: Path(name).stem)
-        names = [Path(pair.name).stem for pair in pairs]
+        names = [str(Path(pair.name).with_suffix("")) for pair in pairs]
+        table.index = table.index.map(lambda name: str(Path(name).with_suffix("")))
+        if not _repeated([Path(name).name for name in names]):
+            names = [Path(name).name for name in names]
+            table.index = table.index.map(lambda name: Path(name).name)
         counts = table.index.value_counts().reindex(names, fill_value=0)
         if wrong := [name for name in names if counts[name] != 1]:
             raise unexpected(

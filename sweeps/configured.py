@@ -102,13 +102,13 @@ def training_threads(config: DictConfig) -> int:
     return min(threads, cores) if isinstance(threads, int) else cores
 
 
-def trained(config: DictConfig, log: Log) -> Method:
-    """The method that `config` describes, trained on its scene."""
+def trained(config: DictConfig, log: Log, scene: Scene | None = None) -> Method:
+    """The method that `config` describes, trained on its scene, or on `scene`."""
     settings = checked_settings(config)
     use_threads(settings)
     torch.manual_seed(settings.seed)
     method, budget = (build(config, name) for name in ("method", "budget"))
-    method.fit(scene_of(config), budget, log)
+    method.fit(scene or scene_of(config), budget, log)
     return method
 
 

@@ -58,10 +58,12 @@ def describe_splits(
     """The pictures of every split, each file read once; pixels are decoded on demand."""
     whole_number(downscale, "downscale", 1)
     every = [view for split in views.values() for view in split]
-    described = iter(
-        in_parallel(lambda view: describe(view, downscale), every, "read pictures", log)
-    )
-    return {name: Pictures([next(described) for _ in split], log) for name, split in views.items()}
+    described = in_parallel(lambda view: describe(view, downscale), every, "read pictures", log)
+    for turned, how in ((True, "turned"), (False, "not turned, as their cameras are")):
+        if names := [of.view.name for of in described if of.turned is turned]:
+            log.info(f"EXIF orientation: {len(names)} pictures are {how}, {names[0]} is the first")
+    rest = iter(described)
+    return {name: Pictures([next(rest) for _ in split], log) for name, split in views.items()}
 
 
 def assemble(

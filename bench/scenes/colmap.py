@@ -141,7 +141,7 @@ def read_views(root: Path, images: str, folder: Path, reconstruction: Any, log: 
             missing.append(image.name)
             continue
         camera, lens = read_camera(image, file, where)
-        views.append(View(image.name, file, camera, lens))
+        views.append(View(image.name, file, camera, lens, stored=True))
     leave_out(missing, views, str(folder), log)
     return views
 
@@ -154,7 +154,7 @@ def read_camera(image: Any, file: Path, where: str) -> tuple[Camera, Lens | None
     pose = rigid_pose(image.cam_from_world().inverse().matrix().tolist(), where)
     (fx, _, cx), (_, fy, cy), _ = of_image.calibration_matrix().tolist()
     camera = Camera(pose, fx, fy, cx, cy, of_image.width, of_image.height)
-    width, height = image_size(file)
+    width, height = image_size(file, (camera.width, camera.height))
     if abs((width / camera.width) / (height / camera.height) - 1) > ASPECT:
         expected = f"{camera.width} x {camera.height} pixels, or as wide for its height"
         raise unexpected(file, f"a picture of {expected}", f"{width} x {height}")

@@ -8,7 +8,7 @@ with the same intrinsics.
 import hashlib
 import io
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -19,7 +19,7 @@ import torch
 from kornia.geometry.calibration import distort_points
 from kornia.geometry.camera import distort_points_kannala_brandt
 from kornia.geometry.transform import remap
-from PIL import Image
+from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -43,6 +43,7 @@ class View:
     path: Path
     camera: Camera  # in the data set's units, in float64: a scene may lie far from the origin
     lens: Lens | None = None  # None: a pinhole
+    stored: bool = False  # whether the camera is of the pixels as stored, whatever EXIF says
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ class ScaledView:
     downscale: int
     camera: Camera
     sha256: str
+    turned: bool | None = None  # whether its EXIF orientation is obeyed; None: it is upright
 
 
 class Pictures(Sequence[Tensor]):
@@ -94,14 +96,28 @@ def opened(source: Path | io.BytesIO, where: Path) -> Iterator[Image.Image]:
                 size = f"{image.width} x {image.height}"
                 raise unexpected(where, f"a picture of at most {MOST_PIXELS:,} pixels", size)
             yield image
+    except UnidentifiedImageError as error:
+        got = f"one that Pillow does not read ({where.suffix})"
+        raise unexpected(where, "a whole picture of 8 bits a channel, such as PNG", got) from error
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise unexpected(where, "a whole picture", error) from error
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height in pixels, read from the file's header only."""
+def orientation(image: Image.Image) -> int:
+    """EXIF's, 1 (upright) to 8; from 5 on it exchanges the sides. Pillow itself turns a TIFF."""
+    with suppress(Exception):  # a damaged block says nothing
+        number = Image.Image.getexif(image).get(0x112)  # PNG's own method decodes the picture
+        return number if number in range(1, 9) and image.format != "TIFF" else 1
+    return 1
+
+
+def image_size(path: Path, like: tuple[int, int] | None = None) -> tuple[int, int]:
+    """Width and height in pixels, read from the file's header only, as viewers show it; with a size
+    that it is to be `like`, as stored if that has the same shape."""
     with opened(path, path) as image:
-        return image.size
+        shown = image.size[::-1] if orientation(image) > 4 else image.size
+        shape = like[0] / like[1] if like else 0
+        return min(image.size, shown, key=lambda x: abs(x[0] / x[1] - shape)) if like else shown
 
 
 def describe(view: View, downscale: int) -> ScaledView:
@@ -109,13 +125,29 @@ def describe(view: View, downscale: int) -> ScaledView:
     content, camera = contents(view.path), view.camera
     with opened(io.BytesIO(content), view.path) as image:
         check_mode(image, view.path)
-        if image.size != (camera.width, camera.height):
+        turned = obeyed(image, view)
+        size = image.size[::-1] if turned and orientation(image) > 4 else image.size
+        if size != (camera.width, camera.height):
             expected = f"{camera.width} x {camera.height} pixels"
-            raise unexpected(view.path, expected, f"{image.width} x {image.height}")
+            raise unexpected(view.path, expected, "{} x {}".format(*size))
     if view.lens:
         camera = undistorted_camera(camera, view.lens, view.path)
     camera = shrunk_camera(camera, downscale, view.path)
-    return ScaledView(view, downscale, camera, hashlib.sha256(content).hexdigest())
+    return ScaledView(view, downscale, camera, hashlib.sha256(content).hexdigest(), turned)
+
+
+def obeyed(image: Image.Image, view: View) -> bool | None:
+    """Whether the EXIF orientation of a picture is obeyed; None if it is upright. Programs that
+    find cameras often ignore it: the camera's size decides. Raises if that cannot."""
+    if (number := orientation(image)) == 1:
+        return None
+    if number > 4 and image.width != image.height:
+        return image.size != (view.camera.width, view.camera.height)
+    if view.stored:
+        return False
+    how = "turn the pixels (mogrify -auto-orient) or remove it (exiftool -Orientation=)"
+    got = f"EXIF orientation {number}, which the camera may mean or not: {how}"
+    raise unexpected(view.path, "pixels that are stored upright", got)
 
 
 def decode(picture: ScaledView) -> Tensor:
@@ -123,7 +155,7 @@ def decode(picture: ScaledView) -> Tensor:
     view, content = picture.view, contents(picture.view.path)
     if hashlib.sha256(content).hexdigest() != picture.sha256:
         raise unexpected(view.path, "the picture that was there at the start", "another one")
-    image = decode_bytes(content, view.path)
+    image = decode_bytes(content, view.path, upright=bool(picture.turned))
     if view.lens:
         image = undistort(image, view.camera, view.lens)
     return shrink(image, picture.downscale)
@@ -137,10 +169,13 @@ def contents(path: Path) -> bytes:
         raise unexpected(path, "a readable picture", error) from error
 
 
-def decode_bytes(content: bytes, path: Path) -> Tensor:
-    """Decode the 8-bit picture in `content` to uint8 [H, W, 3], or [H, W, 4] if it has alpha."""
+def decode_bytes(content: bytes, path: Path, upright: bool = True) -> Tensor:
+    """Decode the 8-bit picture in `content` to uint8 [H, W, 3], or [H, W, 4] if it has alpha;
+    turned `upright` as viewers show it, or as it is stored."""
     with opened(io.BytesIO(content), path) as image:
         check_mode(image, path)
+        if upright and orientation(image) > 1:
+            image = ImageOps.exif_transpose(image)
         if image.mode == "P" and image.palette is None:
             raise unexpected(path, "a palette beside numbers of colours", "none")
         mode = "RGBA" if image.has_transparency_data else "RGB"
@@ -148,8 +183,13 @@ def decode_bytes(content: bytes, path: Path) -> Tensor:
 
 
 def check_mode(image: Image.Image, path: Path) -> None:
+    """Raise unless it is one picture of 8 bits a channel."""
+    # The further pictures of a camera's JPEG (MPO) are previews, depth or gain maps.
+    if image.format != "MPO" and getattr(image, "is_animated", False):
+        raise unexpected(path, "one picture", "several: an animation, or pages")
     if image.mode.startswith(("I", "F")):
-        raise unexpected(path, "8 bits a channel", f"mode {image.mode}")
+        kind = {"F": "floats", "I": "32"}.get(image.mode, "16")
+        raise unexpected(path, "8 bits a channel", f"{kind} (mode {image.mode})")
     # Pillow reads 16 bits of colour as 8 and says so only in the raw mode of its decoder.
     if any(";16" in str(tile) for tile in getattr(image, "tile", ())):
         raise unexpected(path, "8 bits a channel", "16")

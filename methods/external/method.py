@@ -111,6 +111,11 @@ class External:
         return Study({name: turned(name, f"++method.options.{name}", of) for name, of in knobs})
 
     @property
+    def trains(self) -> bool:
+        """Whether it learns from a scene; if not, it was trained elsewhere."""
+        return "fit" in self._about["can"]
+
+    @property
     def reads(self) -> list[Path]:
         """The files that its pictures depend on: code that it has loaded, words, and `files`."""
         words = map(Path, self._typed)
@@ -154,9 +159,9 @@ class External:
             "renderer_steps": budget.renderer_steps,
             "seed": self.seed,
         }
-        if "fit" not in can:
+        if not self.trains:
             if "load" in can:
-                self._worker.ask("load", self.start_s, {**job, "state": None})
+                self._load({**job, "state": None}, log)
             return
         folder = log.stage_dir("external", self._key(job))
         stored = {**job, "state": str(folder / "state")}
@@ -172,7 +177,12 @@ class External:
                 log.info(f"{self.name}: found in {folder}")
                 self.train_s = json.loads(finished.read_text())["train_s"]
         if "load" in can:
-            self._worker.ask("load", self.start_s, stored)
+            self._load(stored, log)
+
+    def _load(self, job: Mapping[str, object], log: Log) -> None:
+        told, _ = self._worker.ask("load", self.start_s, job)
+        for note in told.get("notes") or ():
+            log.info(f"{self.name}: {note}")
 
     def _restart(self) -> None:
         """End the process, and begin another one with the same options."""

@@ -91,7 +91,9 @@ class Worker:
             self._end()
             raise
         if header["message"] == "error":
-            raise self.fault(f"failed at {message!r}: {header.get('text')}")
+            fault = self.fault(f"failed at {message!r}: {header.get('text')}")
+            kind, _, said = str(header.get("text")).partition(": ")
+            raise SteerbenchError(f"{self.name}: {said}") if kind == "SteerbenchError" else fault
         self.expect(header["message"] == message, message, "the same message", header)
         return header, arrays
 

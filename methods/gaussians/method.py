@@ -60,7 +60,7 @@ class GaussianSplatting(OnField):
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """Train field and Gaussians, load what was trained before, or read the `checkpoint`."""
         if self.reads:
-            gaussians = ply.read(self.reads[0], scene).to(self.setup.device)
+            gaussians = ply.read(self.reads[0], scene, log.info).to(self.setup.device)
         else:
             with torch_threads(budget.threads):
                 gaussians = self._trained(scene, budget, log)

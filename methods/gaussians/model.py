@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from bench.types import Camera, Probe
 from methods.gaussians.kernels.blending import blend
-from methods.gaussians.kernels.projection import project_gaussians
+from methods.gaussians.kernels.projection import BLUR, project_gaussians
 from methods.kernels.shade import shade
 from methods.kernels.types import Pixels
 
@@ -31,8 +31,10 @@ class Gaussians(nn.Module):
         logits: Tensor,  # [N] of the opacity at the centre
         base: Tensor,  # [N, 1, 3] coefficients of the first spherical harmonic
         view: Tensor,  # [N, C - 1, 3] of the others, in the order of `methods.kernels.spherical`
+        antialiased: bool = False,  # whether what BLUR adds to an ellipse is taken from its opacity
     ) -> None:
         super().__init__()
+        self.antialiased = antialiased
         self.means = nn.Parameter(means)
         self.log_scales = nn.Parameter(log_scales)
         self.rotations = nn.Parameter(rotations)
@@ -71,6 +73,10 @@ class Gaussians(nn.Module):
             opacities = self.opacities
             shape = self.means, self.log_scales.exp(), self.rotations
             ellipses = project_gaussians(*shape, opacities, camera, backend=backend)
+            if self.antialiased:  # Mip-Splatting's 2D filter (Yu et al. 2024)
+                a, b, c = ellipses.conics.unbind(dim=1)
+                kept = 1 - BLUR * (a + c) + BLUR**2 * (a * c - b * b)  # |V' - BLUR I| / |V'|
+                opacities = opacities * kept.clamp(min=0).sqrt()
         probe.count("gaussians", (ellipses.extents[:, 0] > 0).sum(), len(self))
         with probe.stage("shade"):
             towards = functional.normalize(self.means.detach() - camera.c2w[:, 3], dim=1)
@@ -83,15 +89,18 @@ class Gaussians(nn.Module):
 
 def rounded(gaussians: Gaussians) -> Gaussians:
     """Gaussians as they come back from storage: means in 16 bits, everything else in 8; opacities
-    as they are, scales as logarithms, rotations normalised."""
+    as they are, scales as logarithms, rotations normalised. Flat ones get the least thickness."""
     opacities = _levels(gaussians.opacities, 8).clamp(1e-6, 1 - 1e-6)
+    log_scales = gaussians.log_scales.detach()
+    thinnest = log_scales[log_scales.isfinite()].min()
     return Gaussians(
         _levels(gaussians.means, 16),
-        _levels(gaussians.log_scales, 8),
+        _levels(log_scales.clamp(min=thinnest), 8),
         _levels(functional.normalize(gaussians.rotations, dim=1), 8),
         opacities.logit(),
         _levels(gaussians.base, 8, OUTLIERS),
         _levels(gaussians.view, 8, OUTLIERS),
+        gaussians.antialiased,
     )
 
 

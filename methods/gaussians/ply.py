@@ -4,10 +4,14 @@ Coordinates are those of the data set. Properties of a vertex: x y z, nx ny nz (
 (the first harmonic), f_rest_* (the others, all of red, then green, then blue), opacity (a logit),
 scale_0..2 (logarithms), rot_0..3 (w x y z). The file's harmonics have the Condon-Shortley phase,
 ours do not: those of odd order m change sign.
+
+`read` also takes what others write: infinite opacities, opaque or unseen; scales of minus infinity,
+or no scale_2 (2DGS), flat; filter_3D (Mip-Splatting); comments that ask for antialiasing.
 """
 
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +27,12 @@ POSITION, NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 BASE = tuple(f"f_dc_{i}" for i in range(3))
 SCALE = tuple(f"scale_{i}" for i in range(3))
 ROTATION = tuple(f"rot_{i}" for i in range(4))
-NEEDED = (*POSITION, *BASE, "opacity", *SCALE, *ROTATION)
+
+PACKED = (".spz", ".splat", ".ksplat", ".sog", ".lcc")
+"""Endings of files that splat-transform of PlayCanvas makes PLY files of."""
+
+MODE = re.compile(r"SplatRenderMode:?\s*(\w+)|\bantialiased\s+([01])", re.IGNORECASE)
+"""How a comment of Brush or Postshot says for which renderer the file was trained."""
 
 ODD = torch.tensor([(m % 2) == 1 for degree in range(4) for m in range(-degree, degree + 1)])
 """Which harmonics, in our order, have an odd m."""
@@ -48,51 +57,88 @@ def write(gaussians: Gaussians, scene: Scene, path: Path) -> None:
         PlyData([PlyElement.describe(rows, "vertex")]).write(new)
 
 
-def read(path: Path, scene: Scene) -> Gaussians:
-    """Read the Gaussians of a file in the coordinates of the data set of `scene`; SteerbenchError
-    says what is wrong with the file or its numbers, or that nothing lies inside the scene."""
+def read(path: Path, scene: Scene, say: Callable[[str], object]) -> Gaussians:
+    """Read the Gaussians of a file in the coordinates of the data set of `scene`. Those that cannot
+    be drawn are left out; `say` gets a line about these, and about what is not read as it stands.
+
+    SteerbenchError says what is wrong with the file, or that nothing lies inside the scene.
+    """
 
     def refuse(wrong: bool, why: str) -> None:
         if wrong:
             raise SteerbenchError(f"{path}: {why}")
 
     refuse(not path.is_file(), "expected a PLY file of 3D Gaussians, there is none")
+    convert = f"convert it: splat-transform {path.name} {path.name.partition('.')[0]}-plain.ply"
+    kind = path.suffix.lower()
+    refuse(kind in PACKED, f"expected a PLY file of 3D Gaussians, got {kind}; {convert}")
     try:
-        vertices: np.ndarray = PlyData.read(path, mmap=False)["vertex"].data
+        file = PlyData.read(path)
+        vertices: np.ndarray = file["vertex"].data
     except (PlyParseError, KeyError, ValueError, UnicodeDecodeError) as error:
         why = "expected a PLY file of 3D Gaussians, could not read one"
         raise SteerbenchError(f"{path}: {why} ({error})") from error
     refuse(not len(vertices), "expected 3D Gaussians, it has none")
     names = vertices.dtype.names or ()
-    missing = ", ".join(name for name in NEEDED if name not in names)
-    refuse(bool(missing), f"expected the properties of 3D Gaussians, there is no {missing}")
+    packed = "packed_position" in names
+    refuse(packed, f"expected plain 3D Gaussians, got SuperSplat's compressed PLY; {convert}")
+    flat = SCALE[1] in names and SCALE[2] not in names
+    scale = SCALE[:2] if flat else SCALE
+    needed = (*POSITION, *BASE, "opacity", *scale, *ROTATION)
+    missing = ", ".join(name for name in needed if name not in names)
+    got = f"there is no {missing}, but {', '.join(names[:12])}"
+    refuse(bool(missing), f"expected the properties of 3D Gaussians, {got}")
     rest = sorted((n for n in names if re.fullmatch(r"f_rest_\d+", n)), key=lambda n: int(n[7:]))
     degrees = "0, 9, 24 or 45 properties f_rest_* (degrees 0 to 3)"
     refuse(len(rest) not in (0, 9, 24, 45), f"expected {degrees}, got {len(rest)}")
+    smooth = [name for name in names if name.lower() == "filter_3d"]
 
     def columns(*group: str) -> Tensor:
-        return torch.from_numpy(np.stack([vertices[name] for name in group], axis=1)).float()
+        """[N, len(group)] in the file's own precision."""
+        found = np.stack([vertices[name] for name in group], axis=1)
+        return torch.from_numpy(found.astype(found.dtype.newbyteorder("=")))
 
+    places, rotations = columns(*POSITION), columns(*ROTATION).float()
+    means = ((places - scene.origin.to(places)) / scene.unit_length).float()
+    log_scales, logits = columns(*scale).float(), columns("opacity")[:, 0].float()
+    harmonics = columns(*BASE, *rest).float()
+    if flat:
+        log_scales = torch.cat((log_scales, torch.full_like(logits, -math.inf)[:, None]), dim=1)
+        say(f"{path}: without scale_2 (2DGS): drawn as flat 3D Gaussians")
+    if smooth:
+        logits, log_scales = _fused(logits, log_scales, columns(*smooth).double())
+        say(f"{path}: filter_3D is fused into scales and opacities, as Mip-Splatting exports it")
+    comments = [*file.comments, *(comment for part in file for comment in part.comments)]
+    modes = ["".join(found).lower() for found in MODE.findall("\n".join(comments))][-1:]
+    if antialiased := modes in (["mip"], ["1"]):
+        say(f"{path}: drawn antialiased, as a comment in it says")
+    known = {*needed, *rest, *smooth, *NORMAL, "vertex", "default", "mip", "2dgs", "0", "1"}
+    there = *names, *(part.name for part in file), *modes
+    if unread := ", ".join(name for name in there if name not in known):
+        say(f"{path}: not read: {unread}")
+
+    drawn = torch.cat((means, rotations, harmonics), dim=1).isfinite().all(dim=1)
+    drawn &= (rotations != 0).any(dim=1) & (log_scales < math.inf).all(dim=1) & ~logits.isnan()
     of_all = f"of {len(vertices):,} Gaussians"
-    bad = int((~columns(*NEEDED, *rest).isfinite()).any(dim=1).sum())
-    refuse(bad > 0, f"{bad:,} {of_all} are not finite")
-    rotations = columns(*ROTATION)
-    bad = int((rotations == 0).all(dim=1).sum())
-    refuse(bad > 0, f"{bad:,} {of_all} have a rotation of zeros")
-    means = (columns(*POSITION) - scene.origin) / scene.unit_length
+    if left := int((~drawn).sum()):
+        say(f"{path}: {left:,} {of_all} are left out: NaN, infinity or no rotation")
     low, high = scene.bounds
-    inside = ((means >= low) & (means <= high)).all(dim=1).any()
+    inside = ((means >= low) & (means <= high)).all(dim=1)[drawn].any()
     elsewhere = "lies inside the scene: expected the coordinates of the data set"
     refuse(not inside, f"none {of_all} {elsewhere}")
-    view = columns(*rest).view(-1, 3, len(rest) // 3) if rest else torch.zeros(len(means), 3, 0)
-    return Gaussians(
-        means,
-        columns(*SCALE) - math.log(scene.unit_length),
-        rotations,
-        columns("opacity")[:, 0],
-        columns(*BASE)[:, None],
-        _flipped(view.transpose(1, 2).contiguous()),
-    )
+    view = harmonics[:, 3:].reshape(len(means), 3, len(rest) // 3).transpose(1, 2)
+    log_scales -= math.log(scene.unit_length)
+    parts = means, log_scales, rotations, logits, harmonics[:, None, :3], _flipped(view)
+    return Gaussians(*(part[drawn].contiguous() for part in parts), antialiased=antialiased)
+
+
+def _fused(logits: Tensor, log_scales: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
+    """Logits and log scales with the 3D filter of Mip-Splatting (Yu et al. 2024), a Gaussian of
+    `width` [N, 1]: variances are added, what is spread is as much fainter."""
+    scales = log_scales.double().exp()
+    wide = torch.hypot(scales, width)
+    opacities = logits.double().sigmoid() * (scales / wide).prod(dim=1)
+    return opacities.logit().float(), wide.log().float()
 
 
 def _flipped(view: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from types import ModuleType
 
 import numpy as np
 import torch
+from omegaconf import DictConfig
 from PIL import Image
 
 from bench.console import ConsoleLog
@@ -21,7 +22,7 @@ from bench.paths import write_path
 from bench.results import existing_store
 from bench.scoring import check_frame
 from bench.trajectories import MIXED
-from bench.types import Camera, Method, NullProbe
+from bench.types import BACKGROUNDS, Camera, Method, NullProbe, Scene
 from sweeps.configured import build, scene_of, trained
 from sweeps.overrides import beside, composed, setting
 
@@ -36,16 +37,17 @@ def main(options: argparse.Namespace) -> int:
         place = setting("trajectory.path", str(options.path.resolve()))
         words = [*words, "trajectory=path", place]
     config = composed(words)
-    log, scene = ConsoleLog(Path(config.outputs)), scene_of(config)
+    others = [composed(beside(name, words)) for name in options.beside]
+    log = ConsoleLog(Path(config.outputs))
+    scene = seen(options.path, words, [config, *others]) or scene_of(config)
     trajectory = build(config, "trajectory", scene)
     if options.video:
         if trajectory.resolution == MIXED:
             raise SteerbenchError("--video: expected frames of one size, the path has several")
         pyav(options.video)  # before any training
-    others = [composed(beside(name, words)) for name in options.beside]
-    methods = [trained(each, log) for each in (config, *others)]
+    methods = [trained(each, log, scene) for each in (config, *others)]
     cameras = [step.camera for step in trajectory.steps]
-    drawn = "-".join([scene.name, *(method.name for method in methods), trajectory.name])
+    drawn = "-".join(filter(None, [scene.name, *(one.name for one in methods), trajectory.name]))
     folder = options.to or Path(config.outputs) / "render" / drawn
     with explained(folder), ExitStack() as stack:
         folder.mkdir(parents=True, exist_ok=True)
@@ -68,6 +70,17 @@ def main(options: argparse.Namespace) -> int:
     if options.video:
         log.info(f"video: {options.video}")
     return 0
+
+
+def seen(path: Path | None, words: Sequence[str], configs: Sequence[DictConfig]) -> Scene | None:
+    """A scene without pictures, in the coordinates of files: for a `path` of its own and methods
+    that are trained already, unless `words` name a scene, which may take minutes to make."""
+    named = any(re.match(r"[+~]*scene(\.name)?=", word) for word in words)
+    if not path or named or any(getattr(build(c, "method"), "trains", True) for c in configs):
+        return None
+    background = torch.full((3,), BACKGROUNDS[configs[0].scene.background])
+    cube = torch.stack((torch.zeros(3), torch.ones(3)))
+    return Scene("", {}, background, cube, unit_length=1.0, digest="")
 
 
 @torch.no_grad()

@@ -66,6 +66,36 @@ def test_names_match_without_their_endings_and_folders(tmp_path, quiet_log):
     assert found.frames["name"].tolist() == split.names
 
 
+@pytest.mark.parametrize("folder", ["", "out/"])
+def test_pictures_in_subfolders_match_by_their_path(tmp_path, quiet_log, folder):
+    images = {name: noise(seed=k) for k, name in enumerate(("back/1", "front/1", "front/2"))}
+    for name, image in images.items():
+        path = tmp_path / f"ours/{folder}{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(image.numpy()).save(path)
+    split = Split([], list(images.values()), [f"images/{name}.jpg" for name in images])
+    times = tmp_path / "times.csv"
+    times.write_text(
+        "name,frame_ms\nimages/front/1.jpg,1\nimages/front/2.jpg,2\nimages/back/1.jpg,3\n"
+    )
+    for pairs in (
+        pictures.pairs_with_split(tmp_path / "ours", split),
+        pictures.pairs_with_split(tmp_path / "ours", split, "order"),
+    ):
+        found = pictures.score(pairs, QUICK, {}, FACTS, quiet_log)
+        assert found.frames["psnr"].tolist() == [math.inf] * 3
+        assert pictures.reported_times(times, pairs) == [3, 1, 2]
+    flat = write(tmp_path / "flat", {"1.png": noise(), "2.png": noise()})
+    with pytest.raises(SteerbenchError, match=r"true pictures of different names.* several of 1"):
+        pictures.pairs_with_split(flat, split)
+
+
+def test_depth_and_normals_beside_a_picture_are_ignored(tmp_path):
+    names = ["r_0.png", "r_0_depth_0001.png", "r_0_normal.png", "r_1_depth.png"]
+    there = pictures.listed(write(tmp_path / "there", dict.fromkeys(names, noise())))
+    assert [path.name for path in there] == ["r_0.png", "r_1_depth.png"]
+
+
 @pytest.mark.parametrize(
     ("match", "names", "said"),
     [
@@ -84,6 +114,10 @@ def test_pictures_that_do_not_match_are_named(tmp_path, match, names, said):
         pictures.pairs_with_folder(ours, true, match)
     with pytest.raises(SteerbenchError, match="expected a folder, got nothing there"):
         pictures.listed(tmp_path / "nowhere")
+    (tmp_path / "linear").mkdir()
+    (tmp_path / "linear/0.exr").touch()
+    with pytest.raises(SteerbenchError, match=r"expected pictures .* got 0\.exr"):
+        pictures.listed(tmp_path / "linear")
 
 
 def test_pictures_that_a_run_kept_are_refused_by_their_names(tmp_path):

@@ -5,9 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
+from bench.paths import write_path
 from bench.results import Store
+from methods.gaussians import ply
+from tests.methods.gaussians.test_ply import some
 
 SCENE = ("scene=totem", "scene.width=24", "scene.train=3", "scene.test=3")
 QUICK = ("budget=tiny", "budget.steps=4", "budget.samples=512", "budget.frames=2")
@@ -46,3 +50,16 @@ def test_every_frame_of_a_run_is_written_and_its_path_can_be_followed_and_timed(
     timed = rows[rows["run"] != run].set_index("metric")
     assert timed["n"]["frame_ms"] == 2
     assert timed["n"]["psnr"] == 0  # without ground truth
+
+
+def test_a_ply_file_and_a_path_need_no_scene(steerbench, tiny_scene):
+    ply.write(some(), tiny_scene, Path("some.ply"))
+    write_path(Path("path.json"), tiny_scene.splits["test"].cameras[:2], tiny_scene)
+    words = ("method=ply", "method.options.file=some.ply", "--to", "there")
+    steerbench("render", *words, "--path", "path.json").ok()
+    assert [picture.shape for picture in pictures("there")] == [(32, 40, 3)] * 2
+    assert not Path("outputs").exists()  # where an embedded scene would be
+    frame = {"transform_matrix": torch.eye(4).tolist(), "camera_angle_x": 0.7}
+    Path("bare.json").write_text(json.dumps({"frames": [frame]}))
+    said = steerbench("render", *words, "--path", "bare.json").refused()
+    assert "frames[0]: expected w and h, or scene=" in said

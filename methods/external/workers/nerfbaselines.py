@@ -20,7 +20,7 @@ from nerfbaselines.backends import mount
 from nerfbaselines.datasets import dataset_load_features
 from nerfbaselines.training import get_presets_and_config_overrides
 
-from steerbench_worker import serve
+from steerbench_worker import SteerbenchError, serve
 
 
 class NerfBaselines:
@@ -45,7 +45,7 @@ class NerfBaselines:
 
     def fit(self, job):
         if self.presets is None and list(job.background) != [1, 1, 1]:
-            raise ValueError("presets: those for this layout are for a white background")
+            raise SteerbenchError("presets: those for this layout are for a white background")
         random.seed(job.seed)
         np.random.seed(job.seed)
         if self.torch:

@@ -14,7 +14,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.eval_utils import eval_setup
 
-from steerbench_worker import serve
+from steerbench_worker import SteerbenchError, serve
 
 METRICS = ("psnr", "ssim", "lpips")  # submodules of a model that no picture needs
 
@@ -37,7 +37,9 @@ class Nerfstudio:
         seen = Cameras(pose.float()[None], *lens).to(self.pipeline.device)
         pictures = self.pipeline.model.get_outputs_for_camera(seen)
         if self.output not in pictures:
-            raise ValueError(f"output: expected one of {', '.join(pictures)}, got {self.output}")
+            raise SteerbenchError(
+                f"output: expected one of {', '.join(pictures)}, got {self.output}"
+            )
         return pictures[self.output]
 
     def sizes(self):

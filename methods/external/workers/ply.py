@@ -34,13 +34,15 @@ class Ply:
     def __init__(self, file: str, stop: float = 1e-4) -> None:
         self.files = [file, *map(str, sources(Gaussians).values())]  # kernels are loaded later
         self.stop, self.knobs = stop, {"stop": [1e-1, 1e-2, 1e-3]}
+        self.notes: list[str] = []
         self.device = "cuda" if torch.cuda.is_available() else "cpu"
 
     def load(self, job: Any) -> None:
         everywhere = torch.tensor([[-torch.inf] * 3, [torch.inf] * 3])
         self.background = torch.tensor(job.background).to(self.device)
         scene = Scene("", {}, self.background, everywhere, unit_length=1.0, digest="")
-        self.gaussians = ply.read(Path(self.files[0]), scene).to(self.device)
+        gaussians = ply.read(Path(self.files[0]), scene, self.notes.append)
+        self.gaussians = gaussians.to(self.device)
 
     @torch.no_grad()
     def render(self, camera: Camera) -> dict[str, torch.Tensor]:

@@ -1,14 +1,17 @@
 """Area averaging, exact and weighed by alpha; pictures decoded when they are asked for."""
 
+import io
 from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
 
 from bench.scenes import images
+from bench.scenes.assemble import describe_splits
 from bench.scenes.images import (
     MOST_PIXELS,
     Pictures,
@@ -65,13 +68,80 @@ def test_what_fills_no_block_is_left_out_and_the_camera_stays_exact():
 
 
 @pytest.mark.parametrize(
-    ("mode", "channels"), [("RGB", 3), ("RGBA", 4), ("L", 3), ("LA", 4), ("P", 3), ("1", 3)]
+    ("mode", "channels"),
+    [("RGB", 3), ("RGBA", 4), ("L", 3), ("LA", 4), ("P", 3), ("1", 3), ("CMYK", 3)],
 )
 def test_every_8_bit_mode_becomes_rgb_or_rgba(mode, channels):
     colour = 1 if mode in "1LP" else tuple(range(1, len(mode) + 1))
-    image = decode_bytes(encoded(mode, size=(5, 4), colour=colour), HERE)
+    kind = "TIFF" if mode == "CMYK" else "PNG"
+    image = decode_bytes(encoded(mode, kind, size=(5, 4), colour=colour), HERE)
     assert image.dtype == torch.uint8
     assert image.shape == (4, 5, channels)
+
+
+def with_orientation(stored: Image.Image, number: int) -> bytes:
+    exif, file = Image.Exif(), io.BytesIO()
+    exif[0x112] = number
+    stored.save(file, "PNG", exif=exif)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("number", "back"), [(1, None), (2, 0), (3, 3), (4, 1), (5, 5), (6, 2), (7, 6), (8, 4)]
+)
+def test_a_picture_is_turned_as_viewers_show_it(number, back):
+    upright = Image.fromarray(picture(0, 5, 4, 3))
+    stored = upright if back is None else upright.transpose(back)
+    found = decode_bytes(with_orientation(stored, number), HERE)
+    assert np.array_equal(found.numpy(), picture(0, 5, 4, 3))
+
+
+@pytest.mark.parametrize(
+    ("size", "number", "of_camera", "colmap", "said"),
+    [
+        ((5, 4), 6, (5, 4), False, "1 pictures are not turned"),
+        ((5, 4), 6, (4, 5), False, "1 pictures are turned"),
+        ((5, 5), 6, (5, 5), True, "1 pictures are not turned"),
+        ((5, 4), 3, (5, 4), True, "1 pictures are not turned"),
+        ((5, 5), 6, (5, 5), False, "got EXIF orientation 6"),
+        ((5, 4), 3, (5, 4), False, "got EXIF orientation 3"),
+    ],
+)
+def test_the_camera_says_whether_its_picture_is_turned(
+    size, number, of_camera, colmap, said, tmp_path, log
+):
+    path, image = tmp_path / "a.png", Image.fromarray(picture(0, *size, 3))
+    path.write_bytes(with_orientation(image, number))
+    view = View("a.png", path, pinhole(*of_camera), stored=colmap)
+    if "got" in said:
+        with pytest.raises(SteerbenchError, match=f"a.png: .* {said}"):
+            describe_splits({"": [view]}, 1, log)
+        return
+    pixels = describe_splits({"": [view]}, 1, log)[""][0]
+    turned = image if "not" in said else image.transpose(Image.Transpose.ROTATE_270)
+    assert np.array_equal(pixels.numpy(), np.array(turned))
+    assert said in log.messages[0]
+    assert image_size(path, like=of_camera) == of_camera
+
+
+def animation() -> bytes:
+    file, frames = io.BytesIO(), [Image.new("RGB", (5, 4), (k, k, k)) for k in (0, 90)]
+    frames[0].save(file, "WEBP", save_all=True, append_images=frames[1:], lossless=True)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("content", "name", "said"),
+    [
+        (encoded("F", "TIFF"), "a.tif", "8 bits a channel, got floats"),
+        (encoded("I;16"), "a.png", "8 bits a channel, got 16"),
+        (animation(), "a.webp", "one picture, got several: an animation"),
+        (b"v/1\x01" + bytes(40), "a.exr", r"such as PNG, got one that Pillow .* \(.exr\)$"),
+    ],
+)
+def test_other_pictures_are_refused_by_what_they_are(content, name, said):
+    with pytest.raises(SteerbenchError, match=f"{name}: expected .*{said}"):
+        decode_bytes(content, Path(name))
 
 
 def test_a_palette_that_is_missing_is_named():

@@ -9,6 +9,7 @@ import torch
 
 from bench.cameras import move_camera
 from bench.clock import StageClock
+from bench.console import ConsoleLog
 from bench.scenes import blender
 from bench.scenes.assemble import hold_out
 from bench.study import Variant
@@ -237,6 +238,7 @@ def test_a_ply_file_is_rendered_without_its_data_set(external, moved_scene, tmp_
     ply.write(gaussians, moved_scene, path)
     method = external("ply", options={"file": str(path)})
     method.fit(moved_scene, BUDGET, quiet_log)
+    assert not method.trains
     camera = moved_scene.splits["test"].cameras[2]
     frame = method.render(camera, NullProbe())
     with torch.no_grad():
@@ -247,6 +249,21 @@ def test_a_ply_file_is_rendered_without_its_data_set(external, moved_scene, tmp_
     assert method.sizes() == {"gaussians": 50 * 59 * 4}
     assert path in method.reads
     assert not (tmp_path / "outputs").exists()  # nothing was trained, nothing was written
+
+
+def test_what_is_said_of_a_ply_file_is_shown_and_nothing_beside_it(
+    external, moved_scene, tmp_path, capfd
+):
+    path, log = tmp_path / "some.ply", ConsoleLog(tmp_path)
+    ply.write(some(), moved_scene, path)
+    path.write_bytes(path.read_bytes().replace(b"1.0\n", b"1.0\ncomment antialiased 1\n", 1))
+    external("ply", options={"file": str(path)}).fit(moved_scene, BUDGET, log)
+    assert f"ply: {path}: drawn antialiased" in capfd.readouterr().err
+    path.write_text("no Gaussians\n")
+    with pytest.raises(SteerbenchError) as error:
+        external("ply", options={"file": str(path)}).fit(moved_scene, BUDGET, log)
+    assert str(error.value).startswith(f"ply: {path}: expected a PLY file of 3D Gaussians, could")
+    assert "last words" not in str(error.value)
 
 
 STUDIO = """

@@ -1,19 +1,22 @@
-"""Gaussians as PLY: both ways, in the data set's coordinates, and files that are no good."""
+"""Gaussians as PLY: both ways, in the data set's coordinates; files of others, and no good ones."""
 
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from numpy.lib.recfunctions import repack_fields
+from numpy.lib.recfunctions import append_fields, repack_fields
 from plyfile import PlyData, PlyElement
 
-from bench.types import Scene, SteerbenchError
+from bench.types import Camera, NullProbe, Scene, SteerbenchError
 from methods.gaussians import ply
-from methods.gaussians.model import Gaussians
+from methods.gaussians.model import Gaussians, rounded
 from methods.kernels.shade import shade
+
+NEEDED = (*ply.POSITION, *ply.BASE, "opacity", *ply.SCALE, *ply.ROTATION)
 
 
 @pytest.fixture
@@ -46,7 +49,7 @@ def test_what_is_written_is_read_and_holds_the_coordinates_of_the_data_set(
     path = tmp_path / "a.ply"
     given = some(degree=degree)
     ply.write(given, moved_scene, path)
-    found = ply.read(path, moved_scene)
+    found = ply.read(path, moved_scene, print)
     for name, value in given.named_parameters():
         # A product and a sum in float32, of numbers below 8.
         torch.testing.assert_close(getattr(found, name), value, rtol=0, atol=8 * 2.0**-22)
@@ -91,36 +94,127 @@ def vertices_of(scene: Scene, path: Path, **changes: float) -> np.ndarray:
     return vertices
 
 
+def read_again(vertices: np.ndarray, path: Path, scene: Scene, **how: Any) -> tuple[Gaussians, str]:
+    """The Gaussians of a file that is written otherwise, and what is said of it."""
+    PlyData([PlyElement.describe(vertices, "vertex")], **how).write(path)
+    said: list[str] = []
+    return ply.read(path, scene, said.append), "; ".join(said)
+
+
+@pytest.mark.parametrize(
+    ("how", "kind"), [({"text": True}, "f4"), ({"byte_order": ">"}, "f4"), ({}, "f8")]
+)
+def test_text_the_other_byte_order_and_doubles_are_read_alike(how, kind, tiny_scene, tmp_path):
+    vertices = vertices_of(tiny_scene, tmp_path / "a.ply")
+    other = vertices.astype([(name, kind) for name in vertices.dtype.names])
+    found, said = read_again(other, tmp_path / "b.ply", tiny_scene, **how)
+    assert said == ""
+    for name, value in ply.read(tmp_path / "a.ply", tiny_scene, print).named_parameters():
+        torch.testing.assert_close(getattr(found, name), value, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"x": math.nan}, {"scale_0": math.inf}, dict.fromkeys(ply.ROTATION, 0.0)]
+)
+def test_gaussians_that_cannot_be_drawn_are_left_out_and_counted(changes, tiny_scene, tmp_path):
+    path = tmp_path / "a.ply"
+    found, said = read_again(vertices_of(tiny_scene, path, **changes), path, tiny_scene)
+    assert "1 of 50 Gaussians are left out" in said
+    torch.testing.assert_close(found.means, some().means[1:])
+
+
+@pytest.mark.parametrize(
+    ("name", "infinite", "finite"),
+    [("opacity", math.inf, 30), ("opacity", -math.inf, -30), ("scale_1", -math.inf, -40)],
+)
+def test_an_infinite_opacity_or_no_thickness_is_drawn(name, infinite, finite, tiny_scene, tmp_path):
+    path, pictures = tmp_path / "a.ply", []
+    for value in (infinite, finite):
+        vertices = vertices_of(tiny_scene, path, **{name: value})
+        found, _ = read_again(vertices, path, tiny_scene)
+        assert all(x.isfinite().all() for x in rounded(found).parameters())
+        camera = tiny_scene.splits["test"].cameras[0]
+        pictures.append(found.render(camera, 1e-4, NullProbe()).values)
+    torch.testing.assert_close(*pictures)
+
+
+@pytest.mark.parametrize(
+    ("comments", "antialiased"),
+    [
+        (["SplatRenderMode: mip"], True),
+        (["antialiased 1"], True),
+        (["SplatRenderMode: mip", "SplatRenderMode: default"], False),
+    ],
+)
+def test_a_comment_asks_for_opacities_without_what_the_blur_adds(
+    comments, antialiased, tiny_scene, tmp_path
+):
+    """A ball far smaller than a pixel, seen at the centre of one: sqrt(|V| / |V + BLUR I|)."""
+    path = tmp_path / "a.ply"
+    sizes = dict.fromkeys(ply.SCALE, -4.0)
+    scene = replace(tiny_scene, unit_length=1.0)
+    ball = vertices_of(scene, path, x=0.5, y=0.5, z=0.5, opacity=2.0, **sizes)[:1]
+    found, said = read_again(ball, path, scene, comments=comments)
+    assert ("antialiased" in said) == antialiased
+    pose = torch.eye(4)[:3] + torch.tensor([0, 0, 0, 1.0]) * torch.tensor([[0.5], [0.5], [-9.5]])
+    pixels = found.render(Camera(pose, 40.0, 40.0, 4.5, 4.5, 9, 9), 1e-4, NullProbe())
+    # One less two numbers near a half, in float32: the share has an error of a few 1e-7, squared.
+    variance = (math.exp(-4) * 40 / 10) ** 2
+    share = variance / (variance + 0.3) if antialiased else 1.0
+    assert pixels.alpha[40].item() == pytest.approx(share / (1 + math.exp(-2)), rel=1e-3)
+
+
+def test_the_filter_of_mip_splatting_is_fused_and_what_is_not_read_named(tiny_scene, tmp_path):
+    path, given, more = tmp_path / "a.ply", some(), ["filter_3D", "motion_0"]
+    plain = vertices_of(tiny_scene, path)
+    vertices = append_fields(plain, more, [np.full(50, 0.03)] * 2, usemask=False)
+    found, said = read_again(vertices, path, tiny_scene)
+    assert "filter_3D is fused" in said
+    assert "not read: motion_0" in said
+    scales = (given.log_scales.exp().square() + (0.03 / tiny_scene.unit_length) ** 2).sqrt()
+    torch.testing.assert_close(found.log_scales.exp(), scales)
+    share = (given.log_scales.exp() / scales).prod(dim=1)
+    torch.testing.assert_close(found.opacities, given.opacities * share)
+
+
+def test_surfels_of_2dgs_are_flat(tiny_scene, tmp_path):
+    vertices = vertices_of(tiny_scene, tmp_path / "a.ply")
+    flat = repack_fields(vertices[[name for name in vertices.dtype.names if name != "scale_2"]])
+    found, said = read_again(flat, tmp_path / "b.ply", tiny_scene)
+    assert "2DGS" in said
+    assert (found.log_scales[:, 2] == -math.inf).all()
+
+
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"x": math.nan}, "1 of 50 Gaussians are not finite"),
-        ({"scale_0": math.inf}, "1 of 50 Gaussians are not finite"),
-        (dict.fromkeys(ply.ROTATION, 0.0), "1 of 50 Gaussians have a rotation of zeros"),
-        (["x", "y", "z"], "there is no f_dc_0, f_dc_1"),
-        ([*ply.NEEDED, *(f"f_rest_{k}" for k in range(44))], "got 44"),
+        (["x", "y", "z"], "there is no f_dc_0, .*, but x, y, z"),
+        ([*NEEDED, *(f"f_rest_{k}" for k in range(44))], "got 44"),
         (slice(0), "it has none"),
     ],
 )
-def test_bad_vertices_are_refused(changes, complaint, tiny_scene, tmp_path):
+def test_files_without_gaussians_are_refused(changes, complaint, tiny_scene, tmp_path):
     path = tmp_path / "a.ply"
-    if isinstance(changes, dict):
-        vertices = vertices_of(tiny_scene, path, **changes)
-    else:
-        vertices = repack_fields(vertices_of(tiny_scene, path)[changes])
-    PlyData([PlyElement.describe(vertices, "vertex")]).write(path)
+    vertices = repack_fields(vertices_of(tiny_scene, path)[changes])
     with pytest.raises(SteerbenchError, match=complaint):
-        ply.read(path, tiny_scene)
+        read_again(vertices, path, tiny_scene)
+
+
+@pytest.mark.parametrize("name", ["a.spz", "a.compressed.ply"])
+def test_packed_files_are_named_with_what_converts_them(name, tiny_scene, tmp_path):
+    vertices = np.zeros(1, [("packed_position", "u4")])
+    with pytest.raises(SteerbenchError, match=f"splat-transform {name} a-plain.ply"):
+        read_again(vertices, tmp_path / name, tiny_scene)
 
 
 def test_a_missing_or_damaged_file_and_one_of_another_place_are_refused(tiny_scene, tmp_path):
     path = tmp_path / "a.ply"
     with pytest.raises(SteerbenchError, match="there is none"):
-        ply.read(path, tiny_scene)
+        ply.read(path, tiny_scene, print)
     ply.write(some(), tiny_scene, path)
     with pytest.raises(SteerbenchError, match="none of 50 Gaussians lies inside the scene"):
-        ply.read(path, replace(tiny_scene, origin=torch.full((3,), 100.0)))
+        ply.read(path, replace(tiny_scene, origin=torch.full((3,), 100.0)), print)
     for content in (path.read_bytes()[:-100], b"\x89PNG\r\n\x1a\n"):
         path.write_bytes(content)
         with pytest.raises(SteerbenchError, match="could not read one"):
-            ply.read(path, tiny_scene)
+            ply.read(path, tiny_scene, print)
