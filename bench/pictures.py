@@ -93,7 +93,7 @@ def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
 def _keys(names: Sequence[str]) -> list[str]:
     """`names` without ending, and without the folders that all of them are in."""
     paths = [Path(name.lstrip("/")).with_suffix("") for name in names]
-    shared = os.path.commonpath([path.parent for path in paths] or [""])
+    shared = os.path.commonpath([str(path.parent) for path in paths] or [""])
     return [str(path.relative_to(shared)) for path in paths]
 
 

@@ -105,9 +105,9 @@ def opened(source: Path | io.BytesIO, where: Path) -> Iterator[Image.Image]:
 
 def orientation(image: Image.Image) -> int:
     """EXIF's, 1 (upright) to 8; from 5 on it exchanges the sides. Pillow itself turns a TIFF."""
-    with suppress(Exception):  # a damaged block says nothing
-        number = Image.Image.getexif(image).get(0x112)  # PNG's own method decodes the picture
-        return number if number in range(1, 9) and image.format != "TIFF" else 1
+    with suppress(Exception):  # there is none, or a damaged one
+        number = Image.Image.getexif(image)[0x112]  # PNG's own method decodes the picture
+        return int(number) if number in range(1, 9) and image.format != "TIFF" else 1
     return 1
 
 

@@ -23,6 +23,8 @@ OUTLIERS = 1e-3
 class Gaussians(nn.Module):
     """N Gaussians."""
 
+    antialiased = False  # whether what BLUR adds to an ellipse is taken from its opacity
+
     def __init__(
         self,
         means: Tensor,  # [N, 3] centres, scene units
@@ -31,10 +33,8 @@ class Gaussians(nn.Module):
         logits: Tensor,  # [N] of the opacity at the centre
         base: Tensor,  # [N, 1, 3] coefficients of the first spherical harmonic
         view: Tensor,  # [N, C - 1, 3] of the others, in the order of `methods.kernels.spherical`
-        antialiased: bool = False,  # whether what BLUR adds to an ellipse is taken from its opacity
     ) -> None:
         super().__init__()
-        self.antialiased = antialiased
         self.means = nn.Parameter(means)
         self.log_scales = nn.Parameter(log_scales)
         self.rotations = nn.Parameter(rotations)
@@ -93,15 +93,16 @@ def rounded(gaussians: Gaussians) -> Gaussians:
     opacities = _levels(gaussians.opacities, 8).clamp(1e-6, 1 - 1e-6)
     log_scales = gaussians.log_scales.detach()
     thinnest = log_scales[log_scales.isfinite()].min()
-    return Gaussians(
+    found = Gaussians(
         _levels(gaussians.means, 16),
         _levels(log_scales.clamp(min=thinnest), 8),
         _levels(functional.normalize(gaussians.rotations, dim=1), 8),
         opacities.logit(),
         _levels(gaussians.base, 8, OUTLIERS),
         _levels(gaussians.view, 8, OUTLIERS),
-        gaussians.antialiased,
     )
+    found.antialiased = gaussians.antialiased
+    return found
 
 
 def stored_bytes(gaussians: Gaussians) -> int:

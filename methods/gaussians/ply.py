@@ -110,7 +110,7 @@ def read(path: Path, scene: Scene, say: Callable[[str], object]) -> Gaussians:
         say(f"{path}: filter_3D is fused into scales and opacities, as Mip-Splatting exports it")
     comments = [*file.comments, *(comment for part in file for comment in part.comments)]
     modes = ["".join(found).lower() for found in MODE.findall("\n".join(comments))][-1:]
-    if antialiased := modes in (["mip"], ["1"]):
+    if modes in (["mip"], ["1"]):
         say(f"{path}: drawn antialiased, as a comment in it says")
     known = {*needed, *rest, *smooth, *NORMAL, "vertex", "default", "mip", "2dgs", "0", "1"}
     there = *names, *(part.name for part in file), *modes
@@ -129,7 +129,9 @@ def read(path: Path, scene: Scene, say: Callable[[str], object]) -> Gaussians:
     view = harmonics[:, 3:].reshape(len(means), 3, len(rest) // 3).transpose(1, 2)
     log_scales -= math.log(scene.unit_length)
     parts = means, log_scales, rotations, logits, harmonics[:, None, :3], _flipped(view)
-    return Gaussians(*(part[drawn].contiguous() for part in parts), antialiased=antialiased)
+    found = Gaussians(*(part[drawn].contiguous() for part in parts))
+    found.antialiased = modes in (["mip"], ["1"])
+    return found
 
 
 def _fused(logits: Tensor, log_scales: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
