@@ -8,8 +8,9 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from bench.errors import SteerbenchError
-from bench.scenes.blender import camera_file, picture_path
+from bench.scenes.blender import camera_file
 from bench.scenes.files import data_folder, frames_of, read_json
+from bench.scenes.lookup import find_all
 from bench.scenes.nsvf import picture_files
 from reports.outliers import REFERENCES
 
@@ -80,14 +81,14 @@ def _lack(folder: Path, layout: str) -> str:
     root = data_folder(folder)
     try:
         if layout == "nsvf":
-            files = picture_files(root)
+            found: Sequence[Path | None] = picture_files(root)
         else:  # those named in the camera files
             names = [root / camera_file(split) for split in ("train", "test")]
             frames = [one for path in names for one in frames_of(read_json(root, path.name), path)]
-            files = [picture_path(root, frame["file_path"], where) for where, frame in frames]
+            found = find_all(root, [frame["file_path"] for _, frame in frames])
     except SteerbenchError as error:
         return str(error)
-    absent = [file for file in files if not file.is_file()]
-    if len(absent) == len(files):
+    absent = [*found].count(None)
+    if absent == len(found):
         return "no pictures"
-    return f"{len(absent)} of {len(files)} pictures are not there" if absent else ""
+    return f"{absent} of {len(found)} pictures are not there" if absent else ""

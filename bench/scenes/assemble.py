@@ -33,25 +33,6 @@ BLOCK, GLANCES = 4, 16
 dropped block drops all its cells."""
 
 
-def every_nth(views: Sequence[View], step: int, where: Path) -> dict[str, list[View]]:
-    """Split views, by name: 0, step, 2 step ... test, the others train; raises if none are left."""
-    whole_number(step, "split_every", 2)
-    views = sorted(views, key=lambda view: view.name)
-    if len(views) < 2:
-        got = f"{len(views)} pictures, each of which split_every={step} makes a test"
-        raise unexpected(where, "a picture to train on", got)
-    return {"train": [v for i, v in enumerate(views) if i % step], "test": views[::step]}
-
-
-def leave_out(missing: Sequence[str], views: Sequence[View], where: str, log: Log) -> None:
-    """Log the names of `missing` pictures; raises SteerbenchError if there are no other `views`."""
-    if not views:
-        raise unexpected(where, "pictures", f"none of {len(missing)} files is there")
-    if missing:
-        count = f"{len(missing)} of {len(views) + len(missing)}"
-        log.info(f"{where}: {count} pictures are not there, left out: {', '.join(missing)}")
-
-
 def describe_splits(
     views: Mapping[str, Sequence[View]], downscale: int, log: Log
 ) -> dict[str, Pictures]:

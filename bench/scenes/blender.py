@@ -1,11 +1,13 @@
 """Loads NeRF-Synthetic: `transforms_{train,val,test}.json` beside RGBA pictures."""
 
+import os
 from pathlib import Path
 
 from bench.errors import unexpected
 from bench.scenes.assemble import Box, assemble, cube, describe_splits, hull_box, parse_box
-from bench.scenes.files import data_folder, focal_length, frames_of, inside, opengl_pose, read_json
+from bench.scenes.files import data_folder, focal_length, frames_of, opengl_pose, read_json
 from bench.scenes.images import Pictures, View, image_size
+from bench.scenes.lookup import absent, find_all, report
 from bench.types import Camera, Log, Scene
 
 HALF_EXTENT = 1.5  # the objects of NeRF-Synthetic lie in [-1.5, 1.5]^3
@@ -53,14 +55,16 @@ def read_split(root: Path, split: str, log: Log) -> list[View]:
         return []
     record = read_json(root, path.name)
     frames = frames_of(record, path)
-    files = [picture_path(root, frame["file_path"], f"{at}.file_path") for at, frame in frames]
-    missing = [number for number, file in enumerate(files) if not file.is_file()]
-    if optional and len(missing) == len(files):
-        log.info(f"{path.name}: none of its {len(files)} pictures are there, split left out")
+    names = [frame["file_path"] for _, frame in frames]
+    found = find_all(root, names)
+    files = [file for file in found if file]
+    if optional and not files:
+        log.info(f"{path.name}: none of its {len(found)} pictures are there, split left out")
         return []
-    if missing:
-        where = f"{frames[missing[0]][0]}.file_path"
-        raise unexpected(where, "a picture", f"no file {files[missing[0]]}")
+    if len(files) < len(found):
+        first = found.index(None)
+        raise unexpected(f"{frames[first][0]}.file_path", "a picture", absent(root, names[first]))
+    report(root, names, found, path.name, log)
     frame = frames[0][1] if frames else {}
     if unread := [name for name in LENS if name in record or name in frame]:
         log.info(f"{path.name}: {', '.join(unread)} are not read; scene=transforms reads them")
@@ -70,14 +74,8 @@ def read_split(root: Path, split: str, log: Log) -> list[View]:
     for (at, frame), file in zip(frames, files, strict=True):
         pose = opengl_pose(frame, at)
         camera = Camera(pose, focal, focal, width / 2, height / 2, width, height)
-        views.append(View(str(file.relative_to(root)), file, camera))
+        views.append(View(os.path.relpath(file, root), file, camera))
     return views
-
-
-def picture_path(root: Path, file_path: str, where: str) -> Path:
-    """The picture that `file_path` refers to, with or without its extension."""
-    path = inside(root, file_path, where)
-    return path if path.is_file() else inside(root, f"{file_path}.png", where)
 
 
 def scene_box(bounds: str | list, train: Pictures, log: Log) -> Box:

@@ -1,8 +1,11 @@
 """Loads a capture reconstructed by COLMAP: a sparse model beside the pictures."""
 
-import struct
+import os
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +20,17 @@ from bench.scenes.assemble import (
     assemble,
     box_of_cameras,
     describe_splits,
-    every_nth,
-    leave_out,
     parse_box,
     space_of,
 )
-from bench.scenes.files import data_folder, inside, rigid_pose
+from bench.scenes.files import data_folder, number, rigid_pose
 from bench.scenes.images import Lens, View, image_size
+from bench.scenes.lookup import absent, bare, find_all, in_any_case, report, tidy
+from bench.scenes.sparse import Entry, read_cameras, read_images, read_points
+from bench.scenes.splits import Listed, divide, read_lists
 from bench.types import Camera, Log, Scene
 
 MODELS = ("sparse/0", "colmap/sparse/0", "sparse", ".")  # where a model may be, in this order
-
-LISTS = {"frames": (64, "<I", 16), "images": (64, "<Q", 24), "points3D": (43, "<Q", 8)}
-"""Layout of an entry in each binary list: bytes before the count of its parts (for an image, plus a
-name), the type of this count, bytes per part."""
 
 STRAY = 0.01  # share of the points, at either end of an axis, that the box may exclude
 ASPECT = 0.01  # largest relative difference of the aspect ratios of a picture and its camera
@@ -41,6 +41,7 @@ def load(
     *,
     images: str = "images",
     model: str | None = None,
+    split: str | None = None,
     split_every: int = 8,
     bounds: str | list = "auto",
     downscale: int = 1,
@@ -52,8 +53,9 @@ def load(
 
     The pictures may be smaller than those that COLMAP saw; the model is by default the first of
     `MODELS`. `bounds` are those of the box: "auto" or [[x, y, z], [x, y, z]]. "auto" is the box of
-    the points without outliers, or, in all of space, that of the cameras. For `split_every` and
-    `space` see `transforms.load`, for `downscale` and `background` `blender.load`.
+    the points without outliers, or, in all of space, that of the cameras. For `split`,
+    `split_every` and `space` see `transforms.load`, for `downscale` and `background`
+    `blender.load`.
 
     Lens distortion is undone for every COLMAP camera model that has a focal length, and pictures
     are cropped to what the lens saw. Pictures that COLMAP did not register are ignored. Registered
@@ -61,31 +63,33 @@ def load(
     """
     root = data_folder(path)
     folder = model_folder(root, model)
-    reconstruction = read_model(folder)
-    splits = every_nth(read_views(root, images, folder, reconstruction, log), split_every, folder)
+    if not find_spec("pycolmap"):
+        how = install_command("colmap")
+        raise Unavailable(f"{folder}: models of COLMAP need pycolmap: {how}")
+    lists = read_lists(root, split, {}, folder)
+    splits = divide(read_views(root, images, folder, log), split_every, lists, folder, log)
     pictures = describe_splits(splits, downscale, log)
     space = space_of(space, pictures)
     if bounds != "auto":
         box = parse_box(bounds)
     elif space == "all":
         box = box_of_cameras([view.camera for view in splits["train"]])
-    elif not reconstruction.num_points3D():
-        raise unexpected(folder, "points, or scene.bounds=[[x,y,z],[x,y,z]]", "no point")
     else:
-        points = reconstruction.compute_bounding_box(STRAY, 1 - STRAY)
-        box = Box(torch.tensor(points.min), torch.tensor(points.max)).grown()
+        box = points_box(folder)
     files = sorted(folder.glob(f"*{_kind(folder)}"))
-    where = {"background": background, "space": space, "camera_files": files}
-    return assemble(root.name, pictures, box, **where)
+    return assemble(
+        root.name, pictures, box, background=background, space=space, camera_files=files
+    )
 
 
 def model_folder(root: Path, model: str | None) -> Path:
     places = MODELS if model is None else (model,)
     for place in places:
-        folder = inside(root, place, "scene.model")
-        if _kind(folder):
+        folder = in_any_case(root / tidy(place), os.path.isdir)
+        if folder and _kind(folder):
             return folder
-    raise unexpected(root, f"cameras.bin or cameras.txt in {' or '.join(places)}", "neither")
+    expected = f"cameras.bin or cameras.txt in {' or '.join(places)}"
+    raise unexpected(root, expected, absent(root, f"{places[0]}/cameras.bin"))
 
 
 def _kind(folder: Path) -> str:
@@ -93,67 +97,79 @@ def _kind(folder: Path) -> str:
     return next((end for end in (".bin", ".txt") if (folder / f"cameras{end}").is_file()), "")
 
 
-def read_model(folder: Path) -> Any:
-    try:
-        import pycolmap
-    except ImportError as error:
-        how = install_command("colmap")
-        raise Unavailable(f"{folder}: models of COLMAP need pycolmap: {how}") from error
-    for name in LISTS:
-        check_length(folder / f"{name}.bin")
-    try:
-        return pycolmap.Reconstruction(folder)
-    except (ValueError, RuntimeError, LookupError, MemoryError) as error:
-        raise unexpected(folder, "a whole model of COLMAP", " ".join(str(error).split())) from error
+def points_box(folder: Path) -> Box:
+    """The box of a model's points without outliers; of the first list that has any."""
+    files = (in_any_case(folder / f"points3D{ending}") for ending in (".bin", ".txt", ".ply"))
+    points = next(filter(len, map(read_points, filter(None, files))), np.empty((0, 3)))
+    points = np.sort(points[np.isfinite(points).all(axis=1)], axis=0)
+    if not len(points):
+        expected = "points3D.bin, .txt or .ply with points, or scene.bounds=[[x,y,z],[x,y,z]]"
+        raise unexpected(folder, expected, "no point")
+    last, stray = len(points) - 1, int(STRAY * (len(points) - 1))
+    return Box(*torch.from_numpy(points[[stray, last - stray]])).grown()
 
 
-def check_length(file: Path) -> None:
-    """Raise if a binary list is shorter than its counts say: pycolmap would read on for minutes."""
-    if not file.is_file():
-        return
-    content = file.read_bytes()
-    head, count, size = LISTS[file.stem]
-    try:
-        (entries,) = struct.unpack_from("<Q", content)
-        end = 8
-        for _ in range(entries):
-            end += head
-            if file.stem == "images":
-                end = content.index(0, end) + 1  # the end of its name
-            (parts,) = struct.unpack_from(count, content, end)
-            end += struct.calcsize(count) + parts * size
-        whole = end <= len(content)
-    except (struct.error, ValueError, OverflowError):
-        whole = False
-    if not whole:
-        raise unexpected(file.parent, "a whole model of COLMAP", f"{file.name} cut short")
-
-
-def read_views(root: Path, images: str, folder: Path, reconstruction: Any, log: Log) -> list[View]:
-    pictures = inside(root, images, "scene.images")
-    views, missing = [], []
-    for image in reconstruction.images.values():
-        if not image.has_pose:
-            continue
-        where = f"{folder}: {image.name}"
-        file = inside(pictures, image.name, where)
-        if not file.is_file():
-            missing.append(image.name)
-            continue
-        camera, lens = read_camera(image, file, where)
-        views.append(View(image.name, file, camera, lens, stored=True))
-    leave_out(missing, views, str(folder), log)
+def read_views(root: Path, images: str, folder: Path, log: Log) -> Listed:
+    place = in_any_case(root / tidy(images), os.path.isdir)
+    if not place:
+        raise unexpected("scene.images", "a folder of pictures", absent(root, images))
+    cameras = read_cameras(folder / f"cameras{_kind(folder)}")
+    entries = read_images(folder / f"images{_kind(folder)}", log)
+    names = [words[-1] for _, words in entries]
+    files = find_all(place, names)
+    if not any(files) and (ordered := in_order(root / "images", names, place)):
+        files, first = ordered, f"{ordered[0]} for {names[0]}"
+        log.info(f"{place}: pictures are paired in the order of names: {first}")
+    else:
+        report(place, names, files, str(folder), log)
+    views: Listed = []
+    for entry, name, file in zip(entries, map(tidy, names), files, strict=True):
+        view = file and View(name, file, *read_camera(entry, cameras, file), stored=True)
+        views.append((name, view))
     return views
 
 
-def read_camera(image: Any, file: Path, where: str) -> tuple[Camera, Lens | None]:
+def in_order(full: Path, names: Sequence[str], folder: Path) -> list[Path | None]:
+    """The pictures in `folder` in the order of `names`, as LLFF's images_8 are paired with images.
+
+    Where the folder `full` has all `names`, its other pictures count, too: those that COLMAP did
+    not register. Nothing if there are more or fewer, or if names sort differently by letters and by
+    numbers and do not have the same numbers.
+    """
+
+    def digits(name: str) -> list[str | int]:
+        parts = re.split(r"(\d+)", bare(name))
+        return [int(part) if part.isdecimal() else part for part in parts]
+
+    there, every = (
+        sorted(str(file.relative_to(of)) for file in of.rglob("*") if bare(file.name) != file.name)
+        for of in (folder, full)
+    )
+    every = every if {*names} <= {*every} else sorted(names)
+    sure = [sorted(of, key=digits) for of in (there, every)] == [there, every]
+    there, every = sorted(there, key=digits), sorted(every, key=digits)
+    same = [digits(name) for name in there] == [digits(name) for name in every]
+    if len(there) != len(every) or not (sure or same):
+        return []
+    return [folder / there[every.index(name)] for name in names]
+
+
+def read_camera(
+    entry: Entry, cameras: Mapping[str, Entry], file: Path
+) -> tuple[Camera, Lens | None]:
     """The pinhole camera of an image, at the size of its picture, and its lens."""
-    of_image = image.camera
+    import pycolmap
+
+    where, (*pose, camera_id, name) = entry
+    where = f"{where}: {name}"
+    of_image = camera_of(cameras, str(camera_id), where)
     if not of_image.focal_length_idxs():
         raise unexpected(where, "a camera model with a focal length", of_image.model_name)
-    pose = rigid_pose(image.cam_from_world().inverse().matrix().tolist(), where)
+    qw, qx, qy, qz, *shift = (number(float(word), where) for word in pose)
+    from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array((qx, qy, qz, qw))), np.array(shift))
+    c2w = rigid_pose(from_world.inverse().matrix().tolist(), where)
     (fx, _, cx), (_, fy, cy), _ = of_image.calibration_matrix().tolist()
-    camera = Camera(pose, fx, fy, cx, cy, of_image.width, of_image.height)
+    camera = Camera(c2w, fx, fy, cx, cy, of_image.width, of_image.height)
     width, height = image_size(file, (camera.width, camera.height))
     if abs((width / camera.width) / (height / camera.height) - 1) > ASPECT:
         expected = f"{camera.width} x {camera.height} pixels, or as wide for its height"
@@ -161,6 +177,24 @@ def read_camera(image: Any, file: Path, where: str) -> tuple[Camera, Lens | None
     pinhole = of_image.is_perspective_pinhole() and of_image.is_undistorted()
     lens = None if pinhole else ColmapLens(of_image.model_name, tuple(of_image.params))
     return scale_camera(camera, width, height), lens
+
+
+def camera_of(cameras: Mapping[str, Entry], camera_id: str, image: str) -> Any:
+    """The camera of an `image`, as pycolmap has it; raises if it is missing or damaged."""
+    import pycolmap
+
+    where, words = cameras.get(camera_id, (image, ("CAMERA_ID", camera_id, "without an entry")))
+    try:
+        _, model, width, height, *params = words
+        kind, size = pycolmap.CameraModelId.__members__[model], (int(width), int(height))
+        params = [number(float(word), where) for word in params]
+        camera = pycolmap.Camera(model=kind, width=size[0], height=size[1], params=params)
+        if camera.verify_params() and min(size) > 0:
+            return camera
+    except (ValueError, LookupError, RuntimeError, TypeError):
+        pass
+    expected = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[] as COLMAP has them"
+    raise unexpected(where, expected, " ".join(map(str, words)))
 
 
 @dataclass(frozen=True)

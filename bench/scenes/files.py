@@ -1,4 +1,4 @@
-"""Reads the files of a data set: never outside its folder, and every error says where it occurred.
+"""Reads the files of a data set; every error says where it occurred.
 
 The argument `where` is the start of an error message: the file, and the field inside it.
 """
@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from bench.errors import unexpected
+from bench.scenes.lookup import absent
 
 SMALLEST_ANGLE = 1e-9  # of view in radians: below any telescope's, but its tangent is not 0
 ORTHONORMAL_TOLERANCE = 1e-3  # largest entry of R^T R - I; poses have at least three digits
@@ -27,25 +28,13 @@ def data_folder(path: str | Path) -> Path:
     return root.resolve()
 
 
-def inside(root: Path, relative: str, where: str | Path) -> Path:
-    """`root / relative`; raises if that is outside `root` (.., an absolute path, a link)."""
-    try:
-        path = (root / relative).resolve()
-        path.exists()  # raises for names that are too long
-    except (ValueError, RuntimeError, OSError) as error:  # a NUL, a cycle of links, a long name
-        raise unexpected(where, "the name of a file", f"{relative!r} ({error})") from error
-    if not path.is_relative_to(root):
-        raise unexpected(where, f"a path inside {root}", repr(relative))
-    return path
-
-
 def read_text(root: Path, relative: str) -> str:
-    path = inside(root, relative, root / relative)
-    if not path.is_file():
-        raise unexpected(path, "a file", "nothing there")
+    path = root / relative
     try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        return path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise unexpected(path, "a file", absent(root, relative)) from error
+    except (OSError, ValueError) as error:
         raise unexpected(path, "a readable text file", error) from error
 
 

@@ -1,5 +1,6 @@
 """Loads NSVF's layout, also of Tanks & Temples: `bbox.txt intrinsics.txt pose/*.txt rgb/*`."""
 
+import os
 import re
 from pathlib import Path
 
@@ -7,8 +8,9 @@ import torch
 
 from bench.errors import unexpected
 from bench.scenes.assemble import MARGIN, Box, assemble, describe_splits
-from bench.scenes.files import data_folder, inside, number, numbers, read_text, rigid_pose
+from bench.scenes.files import data_folder, number, numbers, read_text, rigid_pose
 from bench.scenes.images import View, image_size
+from bench.scenes.lookup import absent, in_any_case
 from bench.types import Camera, Log, Scene
 
 SPLITS = {"0": "train", "1": "val", "2": "test"}  # by the first character of a picture's name
@@ -35,8 +37,9 @@ def load(path: str | Path, *, downscale: int = 1, background: str = "white", log
     camera_files = [root / "bbox.txt", root / "intrinsics.txt"]
     for file in files:
         where = root / "pose" / f"{file.stem}.txt"
+        where = in_any_case(where) or where
         camera_files.append(where)
-        rows = numbers(read_text(root, f"pose/{where.name}"), where)
+        rows = numbers(read_text(where.parent, where.name), where)
         camera = Camera(rigid_pose(rows, str(where)), *inner)
         view = View(f"rgb/{file.name}", file, camera)
         views.setdefault(SPLITS[file.name[0]], []).append(view)
@@ -81,10 +84,10 @@ def read_intrinsics(root: Path) -> tuple[float, float, float, float]:
 
 
 def picture_files(root: Path) -> list[Path]:
-    folder = inside(root, "rgb", root / "rgb")
-    if not folder.is_dir():
-        raise unexpected(folder, "a folder of pictures", "nothing there")
+    folder = in_any_case(root / "rgb", os.path.isdir)
+    if not folder:
+        raise unexpected(root / "rgb", "a folder of pictures", absent(root, "rgb"))
     names = sorted(path.name for path in folder.iterdir() if PICTURE_NAME.fullmatch(path.name))
     if not names:
         raise unexpected(folder, "pictures named 0_*, 1_* or 2_*", "none")
-    return [inside(root, f"rgb/{name}", folder / name) for name in names]
+    return [folder / name for name in names]

@@ -1,5 +1,6 @@
 """Loads a hand-held capture: the `transforms.json` of instant-ngp and nerfstudio."""
 
+import os
 from collections import ChainMap
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,27 +10,20 @@ from torch import Tensor
 
 from bench.cameras import scale_camera
 from bench.errors import unexpected
-from bench.scenes.assemble import (
-    Box,
-    assemble,
-    box_of_cameras,
-    describe_splits,
-    every_nth,
-    leave_out,
-    space_of,
-)
+from bench.scenes.assemble import Box, assemble, box_of_cameras, describe_splits, space_of
 from bench.scenes.files import (
     data_folder,
     describe,
     focal_length,
     frames_of,
-    inside,
     number,
     opengl_pose,
     read_json,
     whole_number,
 )
 from bench.scenes.images import Fisheye, Lens, RadialTangential, View, image_size
+from bench.scenes.lookup import find_all, report, tidy
+from bench.scenes.splits import Listed, divide, read_lists
 from bench.types import Camera, Log, Scene
 
 CAMERA_FILE = "transforms.json"
@@ -54,6 +48,7 @@ OTHER_TERMS = ("k3", "k4", "k5", "k6", "p1", "p2", "ftheta_p0", "rolling_shutter
 def load(
     path: str | Path,
     *,
+    split: str | None = None,
     split_every: int = 8,
     aabb_scale: float | None = None,
     downscale: int = 1,
@@ -66,8 +61,10 @@ def load(
     `space` is "box", the cube of instant-ngp; "all", without end around what the cameras look at;
     or "auto", the latter if the pictures have a background: no training picture is transparent.
 
-    Pictures 0, split_every, 2 * split_every ..., in the order of their names, are the test split,
-    all others the training split. `aabb_scale` is the side of the box relative to that of
+    `split` is a file of names (see `splits.read_lists`), by default the `train_filenames`,
+    `val_filenames` and `test_filenames` of the file. Without any, or with "every", pictures 0,
+    split_every, 2 * split_every ..., in the order of their names, are the test split, all others
+    the training split. `aabb_scale` is the side of the box relative to that of
     instant-ngp, x * 0.33 + 0.5; by default the value in the file, or 1. `scale` and `offset` in the
     file replace 0.33 and 0.5. In all of space, the file's box is not needed.
 
@@ -76,22 +73,27 @@ def load(
     """
     root = data_folder(path)
     record, path = read_json(root, CAMERA_FILE), root / CAMERA_FILE
-    splits = every_nth(read_views(root, record, log), split_every, path)
+    lists = read_lists(root, split, record, path)
+    splits = divide(read_views(root, record, log), split_every, lists, path, log)
     pictures = describe_splits(splits, downscale, log)
     space, cameras = space_of(space, pictures), [view.camera for view in splits["train"]]
     around = space == "all" and aabb_scale is None
     box = box_of_cameras(cameras) if around else capture_box(path, record, aabb_scale)
-    where = {"background": background, "space": space, "camera_files": [path]}
-    return assemble(root.name, pictures, box, **where)
+    return assemble(
+        root.name, pictures, box, background=background, space=space, camera_files=[path]
+    )
 
 
-def read_views(root: Path, record: dict, log: Log) -> list[View]:
+def read_views(root: Path, record: dict, log: Log) -> Listed:
     path = root / CAMERA_FILE
-    views, missing = [], []
-    for where, frame in frames_of(record, path):
-        file = inside(root, frame["file_path"], f"{where}.file_path")
-        if not file.is_file():
-            missing.append(frame["file_path"])
+    frames = frames_of(record, path)
+    names = [frame["file_path"] for _, frame in frames]
+    files = find_all(root, names)
+    report(root, names, files, f"{path}: frames", log)
+    views: list[tuple[str, View | None]] = []
+    for (where, frame), name, file in zip(frames, map(tidy, names), files, strict=True):
+        if not file:
+            views.append((name, None))
             continue
         if "mask_path" in frame:
             expected = "none: masks are not read, but the alpha channel of a picture is"
@@ -101,8 +103,7 @@ def read_views(root: Path, record: dict, log: Log) -> list[View]:
         usual = Camera(pose, 0, 0, width / 2, height / 2, width, height)  # without a focal length
         camera = read_camera(settings, pose, usual, where)
         lens = read_lens(settings, where)
-        views.append(View(str(file.relative_to(root)), file, camera, lens))
-    leave_out(missing, views, f"{path}: frames", log)
+        views.append((name, View(os.path.relpath(file, root), file, camera, lens)))
     return views
 
 

@@ -1,5 +1,8 @@
 """Models of COLMAP: cameras, lenses, pictures of another size, and what is refused."""
 
+import re
+import shutil
+import struct
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +15,7 @@ from PIL import Image
 from bench.cameras import pixel_grid, project
 from bench.errors import SteerbenchError, Unavailable
 from bench.scenes import colmap
+from bench.scenes.assemble import Box
 from bench.scenes.images import Fisheye, RadialTangential
 from bench.types import Camera
 from tests.bench.scenes.conftest import picture, pose
@@ -64,13 +68,18 @@ def test_cameras_see_the_points_where_colmap_does(folder, log):
         )
 
 
-def test_the_box_holds_all_points_but_the_outermost(folder, log):
-    scene = colmap.load(folder(), log=log)
-    low = scene.origin + scene.unit_length * scene.bounds[0]
-    high = scene.origin + scene.unit_length * scene.bounds[1]
-    inside = ((torch.from_numpy(POINTS) >= low) & (torch.from_numpy(POINTS) <= high)).all(dim=1)
-    assert inside.double().mean() > 0.94  # of three axes
-    assert scene.unit_length < 1.06 * 6
+def test_the_box_is_that_of_the_points_without_outliers_and_of_a_ply_the_same(folder, log):
+    root = folder()
+    model, scene = root / "sparse" / "0", colmap.load(root, space="box", log=log)
+    box = pycolmap.Reconstruction(model).compute_bounding_box(colmap.STRAY, 1 - colmap.STRAY)
+    expected = Box(torch.tensor(box.min), torch.tensor(box.max)).grown()
+    assert scene.unit_length == expected.side
+    assert torch.equal(scene.bounds, expected.place_of(expected))
+    pycolmap.Reconstruction(model).export_PLY(model / "points3D.ply")
+    (model / "points3D.bin").unlink()
+    assert colmap.load(root, space="box", log=log).unit_length == pytest.approx(
+        scene.unit_length, rel=1e-6
+    )
 
 
 def test_smaller_pictures_have_smaller_cameras(folder, log):
@@ -129,25 +138,135 @@ def test_what_does_not_fit_is_named(folder, log):
         colmap.load(root, log=log)
 
 
-@pytest.mark.parametrize("kind", ["binary", "text"])
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_a_damaged_model_is_an_error_that_names_it(folder, log, kind, name):
-    root = folder(kind=kind)
-    (path,) = (root / "sparse" / "0").glob(f"{name}.*")
+def test_a_damaged_list_is_an_error_that_names_it(folder, log, name):
+    path = folder() / "sparse" / "0" / f"{name}.bin"
     content = path.read_bytes()
     path.write_bytes(content[: len(content) // 2])
-    # Of a shortened list of cameras pycolmap takes what was in memory: no camera then suits.
-    with pytest.raises(SteerbenchError, match=r"sparse/0: expected a whole model|\.png: expected"):
-        colmap.load(root, log=log)
+    with pytest.raises(SteerbenchError, match=rf"{name}.bin: expected a whole list, got a damaged"):
+        colmap.load(path.parents[2], space="box", log=log)
 
 
-def test_without_points_the_box_must_be_given(folder, log):
+def test_a_text_that_lacks_images_is_told(folder, log):
+    path = folder(kind="text") / "sparse" / "0" / "images.txt"
+    path.write_text("\n".join(path.read_text().splitlines()[:-4]))
+    assert len(colmap.load(path.parents[2], log=log).splits["train"]) == 7
+    assert "has 8 images, not 10 as its comment says" in log.messages[0]
+
+
+def no_end(text: str) -> str:
+    return text.rstrip("\n")
+
+
+def one_line(text: str) -> str:
+    return re.sub(r"\n+", "\n", text)
+
+
+def three_lines(text: str) -> str:
+    return text.replace("\n\n", "\n\n\n")
+
+
+def keypoints(text: str) -> str:
+    return text.replace("\n\n", "\n1 2 3 4.5 5.5 -1 7 8 9 10 11 12\n")
+
+
+def windows(text: str) -> str:
+    return "\ufeff" + text.replace("\n", "\r\n")
+
+
+@pytest.mark.parametrize("change", [no_end, one_line, three_lines, keypoints, windows])
+def test_every_image_of_a_text_is_read_by_its_whole_name(folder, log, change):
+    binary, root = colmap.load(folder(), log=log), folder(kind="text")
+    for path in (root / "images").iterdir():
+        path.rename(path.with_name(f"my  photo ({path.stem}).png"))
+    images, cameras = (root / "sparse/0" / f"{name}.txt" for name in ("images", "cameras"))
+    text = re.sub(r"(\d+)\.png", r"my  photo (\1).png", images.read_text())
+    images.write_bytes(change(text).encode())
+    cameras.write_text(cameras.read_text() + "9 NONE that no picture uses\n")
+    scene = colmap.load(root, log=log)
+    for split, of in scene.splits.items():
+        other = binary.splits[split]
+        assert of.names == [f"my  photo ({name[:-4]}).png" for name in other.names]
+        poses = [torch.stack([camera.c2w for camera in part.cameras]) for part in (of, other)]
+        torch.testing.assert_close(*poses)
+    assert log.messages == []
+
+
+@pytest.mark.parametrize(
+    ("name", "pattern", "new", "message"),
+    [
+        (
+            "images",
+            r"^3 .*",
+            "3 1 0 0 0 0 0 0 002.png",
+            r"line 9: expected IMAGE_ID QW .* got '3 1 0",
+        ),
+        (
+            "images",
+            r"1 002.png",
+            "7 002.png",
+            r"line 9: 002.png: .* got CAMERA_ID 7 without an entry",
+        ),
+        ("images", r"^3 \S+", "3 nan", r"line 9: 002.png: expected a finite number, got nan"),
+        ("cameras", r"PINHOLE", "PINHOLES", r"line 4: expected CAMERA_ID MODEL .* got 1 PINHOLES"),
+        ("cameras", r" \S+$", "", r"line 4: expected CAMERA_ID MODEL .* got 1 PINHOLE 8 6 9"),
+        (
+            "points3D",
+            r"^7 .*",
+            "7 0.5 x 1",
+            r"line \d+: expected POINT3D_ID X Y Z .* '7 0.5 x 1'",
+        ),
+    ],
+)
+def test_a_bad_entry_of_a_text_is_named(folder, log, name, pattern, new, message):
+    path = folder(kind="text") / "sparse" / "0" / f"{name}.txt"
+    path.write_text(re.sub(pattern, new, path.read_text(), flags=re.MULTILINE))
+    with pytest.raises(SteerbenchError, match=f"{name}.txt: {message}"):
+        colmap.load(path.parents[2], space="box", log=log)
+
+
+def test_only_what_is_needed_of_a_binary_model_must_be_right(folder, log):
+    root = folder()
+    wanted, model = colmap.load(root, space="box", log=log), root / "sparse" / "0"
+    cameras = (model / "cameras.bin").read_bytes()
+    bad = struct.pack("<IiQQ4d", 9, 1, 0, 0, *[float("nan")] * 4)
+    (model / "cameras.bin").write_bytes(struct.pack("<Q", 2) + cameras[8:] + bad)
+    track = [struct.pack("<Q3d3BdQ2I", 1, *p, 0, 0, 0, 0, 1, 1, 77) for p in POINTS]
+    (model / "points3D.bin").write_bytes(struct.pack("<Q", len(POINTS)) + b"".join(track))
+    scene = colmap.load(root, space="box", log=log)
+    assert scene.unit_length == wanted.unit_length
+    assert scene.splits["test"].names == wanted.splits["test"].names
+
+
+@pytest.mark.parametrize("content", ["", None])
+def test_without_points_the_box_must_be_given(folder, log, content):
     root = folder(kind="text")
-    (root / "sparse" / "0" / "points3D.txt").write_text("")
-    with pytest.raises(SteerbenchError, match=r"expected points, or scene\.bounds"):
-        colmap.load(root, log=log)
-    scene = colmap.load(root, bounds=[[-2, -2, -2], [2, 2, 2]], log=log)
+    path = root / "sparse" / "0" / "points3D.txt"
+    path.unlink() if content is None else path.write_text(content)
+    with pytest.raises(SteerbenchError, match=r"expected points3D.* or scene\.bounds"):
+        colmap.load(root, space="box", log=log)
+    scene = colmap.load(root, bounds=[[-2, -2, -2], [2, 2, 2]], space="box", log=log)
     assert scene.unit_length == 4
+
+
+@pytest.mark.parametrize("unregistered", [False, True])
+def test_pictures_of_other_names_are_paired_in_order(folder, log, unregistered):
+    root = folder()
+    full, small = root / "images", root / "images_8"
+    small.mkdir()
+    if unregistered:
+        (full / "000a.png").touch()
+    for place, path in enumerate(sorted(full.iterdir())):
+        shutil.copy(path, small / f"image{place:02}.jpg")
+    if not unregistered:
+        shutil.rmtree(full)
+    scene = colmap.load(root, images="images_8", log=log)
+    assert scene.splits["test"].names == ["000.png", "008.png"]
+    assert np.array_equal(scene.splits["test"].images[1], picture(8, channels=3))
+    assert "image00.jpg for 000.png" in log.messages[0]
+    (small / "image.jpg").touch()
+    with pytest.raises(SteerbenchError, match=r"none of 10 files: no '000.png' in .*images_8;"):
+        colmap.load(root, images="images_8", log=log)
 
 
 def test_without_pycolmap_it_says_what_to_install(folder, log, monkeypatch):

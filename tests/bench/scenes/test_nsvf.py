@@ -49,6 +49,14 @@ def test_prefixes_are_splits_poses_opencv_and_the_box_fills_the_unit_cube(folder
     torch.testing.assert_close(scene.bounds, bounds)
 
 
+def test_folders_may_be_links_and_have_another_case(folder, log):
+    digest = nsvf.load(folder, log=log).digest
+    (folder / "rgb").rename(folder.parent / "elsewhere")
+    (folder / "RGB").symlink_to(folder.parent / "elsewhere")
+    (folder / "pose").rename(folder / "Pose")
+    assert nsvf.load(folder, log=log).digest == digest
+
+
 def test_without_2_the_1_are_the_test_split(folder, log):
     (folder / "rgb" / "2_003.png").unlink()
     scene = nsvf.load(folder, log=log)
@@ -87,8 +95,8 @@ def test_every_form_of_intrinsics(folder, log, text, expected):
         ("intrinsics.txt", MATRIX.replace("9", "-9"), r"intrinsics.txt: fx: .* above 0, got -9"),
         ("intrinsics.txt", MATRIX.replace("8", "0"), r"intrinsics.txt: fy: .* above 0, got 0"),
         ("pose/0_001.txt", "1 0 0 0\n0 1 0 0\n", r"0_001.txt: expected a 4x4 matrix"),
-        ("bbox.txt", None, r"bbox.txt: expected a file, got nothing there"),
-        ("pose/2_003.txt", None, r"pose/2_003.txt: expected a file, got nothing there"),
+        ("bbox.txt", None, r"bbox.txt: expected a file, got no 'bbox.txt' in"),
+        ("pose/2_003.txt", None, r"pose/2_003.txt: expected a file, got no '2_003.txt'"),
         ("rgb/0_*.png", None, r"rgb: expected pictures 0_\*, got none"),
         ("rgb/[12]_*.png", None, r"rgb: expected pictures 2_\* or 1_\*, got none"),
         ("rgb/*.png", None, r"rgb: expected pictures named 0_\*"),

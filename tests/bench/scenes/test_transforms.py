@@ -76,7 +76,8 @@ def test_missing_pictures_are_named_once_and_left_out(folder, log):
     for k in (3, 7):
         (folder / "images" / f"{k:03}.png").unlink()
     scene = transforms.load(folder, log=log)
-    assert sum(map(len, scene.splits.values())) == 8
+    assert len(scene.splits["train"]) == 6
+    assert scene.splits["test"].names == ["images/000.png", "images/008.png"]
     (message,) = log.messages
     left_out = "2 of 10 pictures are not there, left out: images/007.png, images/003.png"
     assert message.endswith(left_out)
@@ -126,8 +127,6 @@ FAR = [[1, 0, 0, 1e308], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         (every(aabb_scale=0), r"transforms\.json: aabb_scale: .* above 0"),
         (every(scale=-1), r"transforms\.json: scale: .* above 0"),
         (every(offset=[1, 2]), r"transforms\.json: offset: expected three numbers"),
-        (first(file_path="images/\0.png"), r"frames\[0\].file_path: expected the name of a"),
-        (first(file_path="x" * 5000), r"frames\[0\].file_path: expected the name of a"),
         (first(camera_angle_x=5e-324), "camera_angle_x: expected a finite number above 1e-09"),
         (every(fl_x=1e-310), r"images/\d+.png: expected lengths of"),
         (every(fl_x=1e300), r"images/\d+.png: expected lengths of"),
