@@ -59,8 +59,8 @@ def assemble(
     """The scene, scaled so that `box` fills the unit cube, or the middle of all `space`.
 
     The digest covers the bytes of `camera_files` and of all picture files, the background, the
-    resolution, the box and the space. Raises SteerbenchError if the box, or a camera in its units, exceeds
-    the range of float32.
+    resolution, the box and the space. Raises SteerbenchError if the box, or a camera in its units,
+    exceeds the range of float32.
     """
     if background not in BACKGROUNDS:
         raise unexpected("background", " or ".join(BACKGROUNDS), repr(background))

@@ -122,7 +122,7 @@ def read_views(root: Path, images: str, folder: Path, log: Log) -> Listed:
         log.info(f"{place}: pictures are paired in the order of names: {first}")
     else:
         report(place, names, files, str(folder), log)
-    views: Listed = []
+    views: list[tuple[str, View | None]] = []
     for entry, name, file in zip(entries, map(tidy, names), files, strict=True):
         view = file and View(name, file, *read_camera(entry, cameras, file), stored=True)
         views.append((name, view))

@@ -42,9 +42,7 @@ LARGEST = math.exp(LOG_DENSITY_CLAMP)
 MIN_VIEWS = 2  # training cameras that must see a place before it may count as occupied
 
 
-def learnable_cells(
-    bounds: Tensor, cameras: Sequence[Camera], contracted: bool = False
-) -> Tensor:
+def learnable_cells(bounds: Tensor, cameras: Sequence[Camera], contracted: bool = False) -> Tensor:
     """Cells [G, G, G] that the pictures of `cameras` can show to be empty or not.
 
     They overlap `bounds` [2, 3] and lie in a brick of 4^3 cells that at least `MIN_VIEWS` cameras

@@ -92,7 +92,7 @@ MAPPED = {"scale": 0.1, "offset": [0.5, 0.7, 0.5]}
 )
 def test_the_cube_is_that_of_instant_ngp(folder, log, given, override, side, y):
     edit_json(folder / "transforms.json", lambda record: record.update(given))
-    scene = transforms.load(folder, aabb_scale=override, log=log)
+    scene = transforms.load(folder, aabb_scale=override, space="box", log=log)
     assert scene.unit_length == pytest.approx(side)
     assert scene.bounds.tolist() == [[0, 0, 0], [1, 1, 1]]
     # Picture 0 was taken from (0, -4, 0): scale x + offset in instant-ngp's cube of side 1.
@@ -139,7 +139,7 @@ FAR = [[1, 0, 0, 1e308], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 def test_a_bad_field_and_what_float32_cannot_hold_are_named(folder, log, change, message):
     edit_json(folder / "transforms.json", change)
     with pytest.raises(SteerbenchError, match=message):
-        transforms.load(folder, log=log)
+        transforms.load(folder, space="box", log=log)
 
 
 def test_too_few_pictures_and_a_bad_split_are_refused(folder, log):

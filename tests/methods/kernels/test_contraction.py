@@ -80,6 +80,4 @@ def test_a_wall_beyond_the_box_is_seen_at_its_depth_whatever_it_hides():
     pixels = composite(sigma, sigma[:, None], samples, stop=1e-4)
     step = STEP * (wall / HALF) ** 2 * 3  # b is up to 0.6 half sides farther than the axis
     torch.testing.assert_close(pixels.alpha, torch.ones(100))
-    torch.testing.assert_close(
-        pixels.depth_sum, torch.full((100,), wall - 0.5), rtol=0, atol=step
-    )
+    torch.testing.assert_close(pixels.depth_sum, torch.full((100,), wall - 0.5), rtol=0, atol=step)
