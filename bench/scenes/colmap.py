@@ -24,6 +24,7 @@ from bench.scenes.assemble import (
 )
 from bench.scenes.files import data_folder, inside, rigid_pose
 from bench.scenes.images import Lens, View, image_size
+from bench.scenes.masks import with_masks
 from bench.types import Camera, Log, Scene
 
 MODELS = ("sparse/0", "colmap/sparse/0", "sparse", ".")  # where a model may be, in this order
@@ -41,6 +42,7 @@ def load(
     *,
     images: str = "images",
     model: str | None = None,
+    masks: str | None = "auto",
     split_every: int = 8,
     bounds: str | list = "auto",
     downscale: int = 1,
@@ -52,8 +54,9 @@ def load(
 
     The pictures may be smaller than those that COLMAP saw; the model is by default the first of
     `MODELS`. `bounds` are those of the box: "auto" or [[x, y, z], [x, y, z]]. "auto" is the box of
-    the points without outliers, or, in all of space, that of the cameras. For `split_every` and
-    `space` see `transforms.load`, for `downscale` and `background` `blender.load`.
+    the points without outliers, or, in all of space, that of the cameras. For `masks` see
+    `masks.with_masks`, for `split_every` and `space` `transforms.load`, for `downscale` and
+    `background` `blender.load`.
 
     Lens distortion is undone for every COLMAP camera model that has a focal length, and pictures
     are cropped to what the lens saw. Pictures that COLMAP did not register are ignored. Registered
@@ -62,7 +65,8 @@ def load(
     root = data_folder(path)
     folder = model_folder(root, model)
     reconstruction = read_model(folder)
-    splits = every_nth(read_views(root, images, folder, reconstruction, log), split_every, folder)
+    views = read_views(root, images, folder, reconstruction, log)
+    splits = every_nth(with_masks(views, root, images, masks, log), split_every, folder)
     pictures = describe_splits(splits, downscale, log)
     space = space_of(space, pictures)
     if bounds != "auto":

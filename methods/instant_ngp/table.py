@@ -46,16 +46,16 @@ def detail(split: Split) -> float:
     from that of the pixel to the left or above by `CONTRAST` or more in some channel."""
     count = len(split.images)
     chosen = torch.linspace(0, count - 1, min(count, PICTURES)).long().unique()
-    return sum(_detailed(split.images[n]) for n in chosen.tolist()) / len(chosen)
+    return sum(_detailed(split.images[n], split.mask(n)) for n in chosen.tolist()) / len(chosen)
 
 
-def _detailed(picture: Tensor) -> int:
-    """Number of pixels with detail of `picture` uint8 [H, W, 3 or 4]."""
+def _detailed(picture: Tensor, mask: Tensor | None) -> int:
+    """Number of pixels with detail of `picture` uint8 [H, W, 3 or 4], of those that count."""
     rgb = picture[..., :3].float() / 255
-    shown = torch.ones_like(rgb[..., 0], dtype=torch.bool)
+    shown = torch.ones_like(rgb[..., 0], dtype=torch.bool) if mask is None else mask
     if picture.shape[-1] == 4:
         alpha = picture[..., 3:].float() / 255
-        rgb, shown = rgb * alpha, alpha[..., 0] > 0.5
+        rgb, shown = rgb * alpha, shown & (alpha[..., 0] > 0.5)
     here = rgb[1:, 1:]
     across, down = (here - rgb[1:, :-1]).abs(), (here - rgb[:-1, 1:]).abs()
     differs = torch.maximum(across, down).amax(dim=-1) >= CONTRAST
