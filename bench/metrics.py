@@ -144,10 +144,10 @@ def colour_corrected(
         terms = torch.cat([*products, colours, torch.ones_like(colours[:, :1])], dim=1)  # [P, T]
         used, colours = fitted & _unsaturated(colours), colours.clone()
         for channel in used.any(dim=0).nonzero().flatten().tolist():
-            rows, goal = terms[used[:, channel]], wanted[used[:, channel], channel]
+            rows = terms * used[:, channel, None]
             # Terms of a grey picture are alike: of all solutions, the shortest.
-            inverse = torch.linalg.pinv(rows.T @ rows, rtol=1e-12, hermitian=True)
-            colours[:, channel] = (terms @ (inverse @ (rows.T @ goal))).clamp(0, 1)
+            inverse = torch.linalg.pinv(rows.T @ terms, rtol=1e-12, hermitian=True)
+            colours[:, channel] = (terms @ (inverse @ (rows.T @ wanted[:, channel]))).clamp(0, 1)
     corrected = colours.view_as(image).to(image)
     return corrected if mask is None else corrected.where(mask[..., None], image)
 

@@ -4,6 +4,7 @@ A table that is too short blurs a scene, one that is too long takes time in ever
 memory.
 """
 
+import math
 from dataclasses import asdict
 
 import torch
@@ -52,10 +53,12 @@ def detail(split: Split) -> float:
 def _detailed(picture: Tensor, mask: Tensor | None) -> int:
     """Number of pixels with detail of `picture` uint8 [H, W, 3 or 4], of those that count."""
     rgb = picture[..., :3].float() / 255
-    shown = torch.ones_like(rgb[..., 0], dtype=torch.bool) if mask is None else mask
+    if mask is not None:
+        rgb[~mask] = math.nan  # which differs from nothing
+    shown = torch.ones_like(rgb[..., 0], dtype=torch.bool)
     if picture.shape[-1] == 4:
         alpha = picture[..., 3:].float() / 255
-        rgb, shown = rgb * alpha, shown & (alpha[..., 0] > 0.5)
+        rgb, shown = rgb * alpha, alpha[..., 0] > 0.5
     here = rgb[1:, 1:]
     across, down = (here - rgb[1:, :-1]).abs(), (here - rgb[:-1, 1:]).abs()
     differs = torch.maximum(across, down).amax(dim=-1) >= CONTRAST

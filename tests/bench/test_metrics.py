@@ -74,8 +74,8 @@ def plain_correction(image: np.ndarray, truth: np.ndarray, quadratic: bool) -> n
     return now
 
 
-@pytest.mark.parametrize("quadratic", [False, True])
-@pytest.mark.parametrize("grey", [False, True])
+# Products of the channels of a grey picture are too alike for a comparison.
+@pytest.mark.parametrize(("quadratic", "grey"), [(True, False), (False, False), (False, True)])
 def test_colours_are_corrected_as_in_mip_nerf_360(quadratic, grey, device):
     image = noise(20, 30).double()
     image = image.mean(dim=2, keepdim=True).expand(-1, -1, 3) if grey else image
@@ -84,7 +84,7 @@ def test_colours_are_corrected_as_in_mip_nerf_360(quadratic, grey, device):
     found = colour_corrected(image.to(device), truth.to(device), quadratic=quadratic).cpu()
     pixels = (x.reshape(-1, 3).numpy() for x in (image, truth))
     expected = plain_correction(*pixels, quadratic).reshape(20, 30, 3)
-    # The normal equations have the squared condition, at most 1e4 here, in float64.
+    # The normal equations have the squared condition of the terms, about 1e6 here, in float64.
     np.testing.assert_allclose(found, expected, atol=1e-6)
     assert psnr(found, truth) > psnr(image, truth)
     half = torch.arange(30) < 15
