@@ -47,8 +47,8 @@ class PixelBatches:
         if split.masks:
             pairs = zip(split.images, split.masks, strict=True)
             whole = [torch.ones(x.shape[:2]).bool() if mask is None else mask for x, mask in pairs]
-            strips = [strip.flatten() for mask in whole for strip in mask.split(STRIP, dim=1)]
-            self._counted = torch.cat(strips).nonzero().squeeze(1).to(device)
+            counts = [strip.flatten() for mask in whole for strip in mask.split(STRIP, dim=1)]
+            self._counted = torch.cat(counts).nonzero().squeeze(1).to(device)
             if not len(self._counted):
                 raise unexpected("masks of the training pictures", "a pixel that counts", "none")
 
