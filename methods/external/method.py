@@ -159,7 +159,9 @@ class External:
                 self._worker.ask("load", self.start_s, {**job, "state": None})
             return
         if scene.splits["train"].masks:
-            log.info(f"{self.name}: frames have a `mask_path`; whether it is heeded is up to it")
+            log.info(
+                f"{self.name} is given masks; whether it leaves out what they hide is up to it"
+            )
         folder = log.stage_dir("external", self._key(job))
         stored = {**job, "state": str(folder / "state")}
         finished = folder / "trained.json"
@@ -173,10 +175,8 @@ class External:
             else:
                 log.info(f"{self.name}: found in {folder}")
                 cost = json.loads(finished.read_text())
-            self.train_s, self.train_peak_bytes = (
-                cost["train_s"],
-                cost["train_peak_bytes"] or math.nan,
-            )
+            self.train_s = cost["train_s"]
+            self.train_peak_bytes = cost["train_peak_bytes"] or math.nan
         if "load" in can:
             self._worker.ask("load", self.start_s, stored)
 
