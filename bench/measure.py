@@ -77,6 +77,7 @@ def train(methods: Sequence[Method], task: Task, log: Log) -> None:
         _check_steady(methods, task.trajectory)
     for split in task.scene.splits.values():
         list(split.images)  # decode now, so damaged files raise here, not during training or timing
+        list(split.masks)
     for method in methods:
         with _named(method, len(methods) > 1):
             method.fit(task.scene, task.budget, log)
@@ -199,7 +200,8 @@ def _measurement(
         whole |= {"psnr_to_first": psnr_of_mse(statistics.fmean(mse)), "worst_to_first": max(worst)}
     whole |= {f"size_bytes.{part}": size for part, size in sizes.items()}
     whole |= {"size_bytes.total": sum(sizes.values())} if sizes else {}
-    whole |= {"peak_bytes": peak_bytes, "train_s": method.train_s, **scoring.whole()}
+    whole |= {"peak_bytes": peak_bytes, "train_s": method.train_s}
+    whole |= {"train_peak_bytes": getattr(method, "train_peak_bytes", math.nan), **scoring.whole()}
     summary = [
         *(row | {"phase": phase} for phase, of in of_phases if len(of) for row in phase_rows(of)),
         *(single(name, value) for name, value in whole.items()),
@@ -304,9 +306,11 @@ def _draw(take: _Take, task: Task, index: int, first: Tensor | None, *, scored: 
         take.waits.append(waits)
     figures: dict[str, Any] = {"frame": index, "phase": phase}
     truth: Tensor | None = None
+    mask: Tensor | None = None
     if step.truth is not None:
         split = task.scene.splits[task.trajectory.split]
         figures["name"], truth = split.names[step.truth], split.images[step.truth]
+        mask = split.mask(step.truth)
     elif protocol.flicker == "exact" and task.scene.exact is not None:
         truth = task.scene.exact(step.camera)
     if protocol.compared and phase == STEADY and step.truth is not None:
@@ -322,6 +326,7 @@ def _draw(take: _Take, task: Task, index: int, first: Tensor | None, *, scored: 
         cut=step.cut,
         camera=step.camera,
         depth=frame.depth,
+        mask=mask,
     )
     take.rows.append(figures | scores)
     return frame.rgb

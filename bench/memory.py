@@ -62,6 +62,10 @@ class MemoryMeter:
             torch.cuda.reset_peak_memory_stats(self._device)
 
     def __exit__(self, *exception: object) -> None:
+        self.look()
+
+    def look(self) -> int:
+        """The highest peak so far, also within a region."""
         if self.of_process:
             peak = _process_peak_bytes()
         else:
@@ -69,6 +73,7 @@ class MemoryMeter:
 
             peak = torch.cuda.max_memory_allocated(self._device)
         self.peak_bytes = max(self.peak_bytes, peak)
+        return self.peak_bytes
 
 
 def _reset_high_water_mark() -> bool:

@@ -18,7 +18,11 @@ from bench.types import Log, SteerbenchError, Unavailable, check_shape
 from bench.weights import load_features
 
 SMALLEST_SIDE = {"psnr": 1, "ssim": 11, "lpips_alex": 31, "lpips_vgg": 16, "flip": 1}
+SMALLEST_SIDE |= {f"cc_{metric}": side for metric, side in SMALLEST_SIDE.items()}
 """Smallest side in pixels: SSIM needs room for its window, LPIPS for one feature at its deepest."""
+
+FITS, SATURATED = 5, 0.5 / 255
+"""Of a correction of colours: how often it is fitted; how close to 0 or 1 it is saturated."""
 
 
 def check_size(metric: str, width: int, height: int) -> None:
@@ -40,10 +44,12 @@ def as_bytes(image: Tensor) -> np.ndarray:
     return image.mul(255.0).round().to(torch.uint8).numpy()
 
 
-def psnr(image: Tensor, reference: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB for a peak of 1; +inf where the pictures are equal."""
+def psnr(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB for a peak of 1, over all pixels or those in `mask` bool
+    [H, W]; +inf where the pictures are equal there."""
     check_pair(image, reference)
-    return psnr_of_mse((image.double() - reference.double()).square().mean().item())
+    errors = (image.double() - reference.double()).square()
+    return psnr_of_mse((errors if mask is None else errors[mask]).mean().item())
 
 
 def psnr_of_mse(mse: float) -> float:
@@ -115,6 +121,39 @@ class Lpips:
             distance = self._model.to(image.device)(pair[:1], pair[1:], normalize=True)
         self._model.cpu()  # on the GPU it would count as memory of the measured method
         return float(distance.item())
+
+
+def colour_corrected(
+    image: Tensor, reference: Tensor, mask: Tensor | None = None, quadratic: bool = False
+) -> Tensor:
+    """`image` in the colours that are most like those of `reference` in least squares, if each is a
+    function of the colour before: a sum of its channels and a constant and, if `quadratic`, of
+    their products, as in the evaluation of mip-NeRF 360 (`color_correct` of multinerf).
+
+    As there, pixels that are saturated in a channel are left out, in the reference and before or
+    after a fit, so it is fitted several times. Those not in `mask` bool [H, W] are left out and
+    stay as they are, as does a channel without any others.
+    """
+    check_pair(image, reference)
+    colours, wanted = (x.double().reshape(-1, 3) for x in (image, reference))
+    fitted = _unsaturated(colours) & _unsaturated(wanted)  # [P, 3]
+    if mask is not None:
+        fitted &= mask.reshape(-1, 1)
+    for _ in range(FITS):
+        products = [colours[:, c:] * colours[:, c : c + 1] for c in range(3 * quadratic)]
+        terms = torch.cat([*products, colours, torch.ones_like(colours[:, :1])], dim=1)  # [P, T]
+        used, colours = fitted & _unsaturated(colours), colours.clone()
+        for channel in used.any(dim=0).nonzero().flatten().tolist():
+            rows = terms * used[:, channel, None]
+            # Terms of a grey picture are alike: of all solutions, the shortest.
+            inverse = torch.linalg.pinv(rows.T @ terms, rtol=1e-12, hermitian=True)
+            colours[:, channel] = (terms @ (inverse @ (rows.T @ wanted[:, channel]))).clamp(0, 1)
+    corrected = colours.view_as(image).to(image)
+    return corrected if mask is None else corrected.where(mask[..., None], image)
+
+
+def _unsaturated(colours: Tensor) -> Tensor:
+    return (colours >= SATURATED) & (colours <= 1 - SATURATED)
 
 
 def declare_torchvision() -> None:

@@ -134,7 +134,7 @@ def read_results(file: Path) -> tuple[Measurement, dict[str, Any]]:
     frames.insert(2, "phase", STEADY)
     used = info.get("resources_utilization")
     memory = used.get("gpu_memory") if isinstance(used, dict) else None  # in MiB
-    told = {"train_s": (info.get("total_train_time"), 1), "peak_bytes": (memory, 2**20)}
+    told = {"train_s": (info.get("total_train_time"), 1), "train_peak_bytes": (memory, 2**20)}
     whole = {k: x * unit for k, (x, unit) in told.items() if isinstance(x, int | float)}
     summary = score_rows(frames, list(scores))
     summary += [single(name, value) for name, value in whole.items() if value]

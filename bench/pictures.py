@@ -42,13 +42,14 @@ Match = Literal["name", "order"]
 
 
 class Pair(NamedTuple):
-    """A file to score; `name`, `truth` (a file or uint8 [H, W, 3 or 4]) and, if known, `camera` of
-    its true picture."""
+    """A file to score; `name`, `truth` (a file or uint8 [H, W, 3 or 4]) and, if known, `camera` and
+    `mask` of its true picture."""
 
     picture: Path
     name: str
     truth: Path | Tensor
     camera: Camera | None = None
+    mask: Tensor | None = None
 
 
 def pairs_with_folder(pictures: Path, truth: Path, match: Match = "name") -> list[Pair]:
@@ -62,7 +63,9 @@ def pairs_with_split(pictures: Path, split: Split, match: Match = "name") -> lis
     """Pair each picture of a scene's `split` with its counterpart in `pictures`; see `matched`."""
     files = matched(pictures, split.names, match)
     cameras: Sequence[Camera | None] = split.cameras or [None] * len(files)
-    return [Pair(*pair) for pair in zip(files, split.names, split.images, cameras, strict=True)]
+    masks = split.masks or [None] * len(files)
+    pairs = zip(files, split.names, split.images, cameras, masks, strict=True)
+    return [Pair(*pair) for pair in pairs]
 
 
 def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
@@ -186,16 +189,17 @@ def score(
     alphas = 0
     seen, truths = hashlib.sha256(), hashlib.sha256()
     with log.progress("scoring", len(pairs)) as progress:
-        for index, (path, name, true, camera) in enumerate(pairs):
+        for index, (path, name, true, camera, mask) in enumerate(pairs):
             picture, truth = (
                 decode_bytes(contents(x), x) if isinstance(x, Path) else x for x in (path, true)
             )
             _check(path, name, picture, truth, protocol)
             seen.update(picture.numpy().tobytes())
             truths.update(truth.numpy().tobytes())
+            truths.update(b"" if mask is None else mask.numpy().tobytes())
             alphas += picture.shape[2] == 4
             rgb = composite(picture, background)
-            figures = scoring.score(index, rgb, truth, cut=not sequence, camera=camera)
+            figures = scoring.score(index, rgb, truth, cut=not sequence, camera=camera, mask=mask)
             frames.append({"frame": index, "name": name, "phase": STEADY, **figures})
             sizes.append((rgb.shape[1], rgb.shape[0]))
             progress.advance()

@@ -18,6 +18,7 @@ from bench.waits import device_waits
 from bench.weights import locate
 
 CHOICES = {"background": tuple(BACKGROUNDS), "flicker": ("split", "exact")}
+CHOICES |= {"mask": ("scene", "none"), "colour_correction": ("none", "affine", "quadratic")}
 """The values of the protocol's options."""
 
 COLUMNS = ("flip", *video_metrics.NEEDS)  # further metrics that a protocol can name
@@ -37,6 +38,8 @@ class EvaluationProtocol:
     lpips: tuple[str, ...]  # backbones, each with a metric `lpips_<net>`
     lpips_every: int  # scored frames of which the last one has them; they take most time
     background: str  # onto which pictures with an opacity channel are composited
+    mask: str  # "scene": pixels that the scene masks do not count; "none": all do
+    colour_correction: str  # also metrics `cc_*` of pictures with corrected colours, by this fit
     warmup: int  # frames before the timed sequence, spread over the trajectory
     flicker: str
     stages: bool  # whether to time the stages of a frame: a GPU is waited for at each
@@ -65,8 +68,9 @@ class EvaluationProtocol:
     @property
     def metric_names(self) -> tuple[str, ...]:
         """Names of the metrics that `score` returns, in the order of the table."""
-        lpips = (f"lpips_{net}" for net in self.lpips)
-        return ("psnr", "ssim", *lpips, *(["flip"] if "flip" in self.columns else []))
+        plain = ("psnr", "ssim", *(f"lpips_{net}" for net in self.lpips))
+        corrected = [f"cc_{name}" for name in plain if self.colour_correction != "none"]
+        return (*plain, *corrected, *(["flip"] if "flip" in self.columns else []))
 
     def check(self, scene: Scene, trajectory: Trajectory) -> None:
         """Raise SteerbenchError before any training if the frames could not be scored afterwards:
@@ -125,16 +129,29 @@ class EvaluationProtocol:
         return metrics.quantise(rgb.float())
 
     def score(
-        self, rgb: Tensor, truth: Tensor, lpips: Mapping[str, metrics.Lpips]
+        self,
+        rgb: Tensor,
+        truth: Tensor,
+        lpips: Mapping[str, metrics.Lpips],
+        mask: Tensor | None = None,
     ) -> dict[str, float]:
-        """Every metric of a prediction against its ground truth, both [H, W, 3] in [0, 1].
+        """Every metric of a prediction against its ground truth, both [H, W, 3] in [0, 1], and
+        equal where a `mask` bool [H, W] says that pixels do not count.
 
-        A backbone that is missing from `lpips` scores NaN.
+        A backbone that is missing from `lpips` scores NaN, as all does where no pixel counts.
         """
-        image = self.rounded(rgb)
-        scores = {"psnr": metrics.psnr(image, truth), "ssim": metrics.ssim(image, truth)}
-        for net in self.lpips:
-            scores[f"lpips_{net}"] = lpips[net](image, truth) if net in lpips else math.nan
+        if mask is not None and not mask.any():
+            return dict.fromkeys(self.metric_names, math.nan)
+        scores, pictures = dict[str, float](), {"": rgb}
+        if (fit := self.colour_correction) != "none":
+            pictures["cc_"] = metrics.colour_corrected(rgb, truth, mask, fit == "quadratic")
+        for kind, picture in pictures.items():
+            image = self.rounded(picture)
+            scores[f"{kind}psnr"] = metrics.psnr(image, truth, mask)
+            scores[f"{kind}ssim"] = metrics.ssim(image, truth)
+            for net in self.lpips:
+                score = lpips[net](image, truth) if net in lpips else math.nan
+                scores[f"{kind}lpips_{net}"] = score
         if "flip" in self.columns:
-            scores["flip"] = video_metrics.flip(image, truth)
+            scores["flip"] = video_metrics.flip(self.rounded(rgb), truth)
         return scores

@@ -13,9 +13,9 @@ from bench.results import WHOLE
 CONFIDENCE = 0.95
 QUANTILES = (50, 95, 99)
 UNITS = {
-    **dict.fromkeys(("psnr", "psnr_to_first", "tpsnr"), "dB"),
+    **dict.fromkeys(("psnr", "cc_psnr", "psnr_to_first", "tpsnr"), "dB"),
     **dict.fromkeys(("frame_ms", "wall_ms", "stage_ms"), "ms"),
-    **dict.fromkeys(("size_bytes", "peak_bytes"), "B"),
+    **dict.fromkeys(("size_bytes", "peak_bytes", "train_peak_bytes"), "B"),
     **{"jod": "JOD", "fps": "1/s", "work": "1/frame", "train_s": "s"},
 }
 """Units of metrics, by name up to the first dot; other metrics have no unit."""

@@ -81,21 +81,26 @@ class Scoring:
         cut: bool,
         camera: Camera | None = None,
         depth: Tensor | None = None,
+        mask: Tensor | None = None,
     ) -> dict[str, float]:
         """The figures of frame `index`, rendered as `rgb` [H, W, 3].
 
         `truth` is uint8 [H, W, 3 or 4]; that of a frame which is not `scored` serves the path
-        alone. `depth` [H, W] is the method's own. Frames before a `cut`, or of another size, are
-        not compared with.
+        alone. `depth` [H, W] is the method's own, `mask` bool [H, W] says which pixels count.
+        Frames before a `cut`, or of another size, are not compared with.
         """
         figures: dict[str, float] = {}
         true = None if truth is None else composite(truth.to(rgb.device), self._background)
+        shown, mask = rgb, mask if self._protocol.mask == "scene" else None
+        if mask is not None and true is not None:
+            mask = mask.to(rgb.device)
+            rgb = rgb.where(mask[..., None], true)
         if true is not None and scored:
             self._scored += 1
             nets = {} if self._scored % self._protocol.lpips_every else self._lpips
-            figures |= self._protocol.score(rgb, true, nets)
+            figures |= self._protocol.score(rgb, true, nets, mask)
             if index in self._shown:
-                self.images |= _pictures(index, rgb, true)
+                self.images |= _pictures(index, shown, true)
         view = None
         if camera is not None and self._warps:
             depth = depth if self._surface is None else self._surface(camera)

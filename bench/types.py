@@ -99,14 +99,20 @@ class Frame:
 
 @dataclass(frozen=True)
 class Split:
-    """Cameras and their pictures, `images[n]` uint8 [H, W, 3 or 4] (4: straight alpha)."""
+    """Cameras and their pictures, `images[n]` uint8 [H, W, 3 or 4] (4: straight alpha). `masks`,
+    if any, say which pixels count, bool [H, W]; None: all of that picture."""
 
     cameras: Sequence[Camera]
     images: Sequence[Tensor]
     names: Sequence[str]
+    masks: Sequence[Tensor | None] = ()
 
     def __len__(self) -> int:
         return len(self.cameras)
+
+    def mask(self, number: int) -> Tensor | None:
+        """The mask of a picture, None if all of its pixels count."""
+        return self.masks[number] if self.masks else None
 
 
 @dataclass(frozen=True)
@@ -201,7 +207,7 @@ class Method(Protocol):
     """A radiance-field renderer.
 
     `train_s` are the seconds of training, summed over all processes that continued it; `fit` sets
-    them even if it only loads.
+    them even if it only loads, and may so set `train_peak_bytes`, the peak of memory meanwhile.
     """
 
     name: str  # as shown in result rows

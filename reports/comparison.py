@@ -93,7 +93,8 @@ def shown_as(metric: str) -> Metric:
             f"{metric}: no such metric; expected one as `steerbench results` shows them"
         )
     if unit == "B":
-        return Metric(f"{rest or 'peak memory'}, MB", "↓", megabytes)
+        peaks = {"peak_bytes": "peak memory", "train_peak_bytes": "peak memory of training"}
+        return Metric(f"{rest or peaks.get(family, family)}, MB", "↓", megabytes)
     decimals = 0 if family == "work" else 2
     return Metric(f"{rest or family}, {unit}", "↓", partial(decimal, decimals=decimals))
 

@@ -18,6 +18,7 @@ NOT_AVAILABLE = "n/a"
 ABSENT = "–"  # of a figure that the paper does not give or that cannot be measured here
 EMPTY = ("", ABSENT, NOT_AVAILABLE)
 DENSE = ".dense"  # suffix of a work counter for the work of a method that skips nothing
+NETS = ("alex", "vgg", "squeeze")  # of LPIPS
 
 
 @dataclass(frozen=True)
@@ -96,13 +97,14 @@ QUALITY = {
     for metric, (name, better, decimals) in {
         "psnr": ("PSNR, dB", "↑", 2),
         "ssim": ("SSIM", "↑", 4),
-        "lpips_alex": ("LPIPS alex", "↓", 4),
-        "lpips_vgg": ("LPIPS vgg", "↓", 4),
-        "lpips_squeeze": ("LPIPS squeeze", "↓", 4),
+        **{f"lpips_{net}": (f"LPIPS {net}", "↓", 4) for net in NETS},
+        "cc_psnr": ("PSNR of corrected colours, dB", "↑", 2),
+        "cc_ssim": ("SSIM of corrected colours", "↑", 4),
+        **{f"cc_lpips_{net}": (f"LPIPS {net} of corrected colours", "↓", 4) for net in NETS},
         "flip": ("FLIP", "↓", 4),
         "flicker": ("flicker", "↓", 4),
         "tpsnr": ("tPSNR, dB", "↑", 2),
-        **{f"tlpips_{net}": (f"tLPIPS {net}", "↓", 4) for net in ("alex", "vgg", "squeeze")},
+        **{f"tlpips_{net}": (f"tLPIPS {net}", "↓", 4) for net in NETS},
         **{f"warp_{k}": (f"warping error, {k} apart", "↓", 5) for k in (1, 7)},
         **{f"warp_{k}_true": (f"warping error of the truth, {k} apart", "", 5) for k in (1, 7)},
         **{f"warp_{k}_own": (f"warping error, {k} apart, own depth", "↓", 5) for k in (1, 7)},
@@ -197,7 +199,8 @@ def _memory(rows: pd.DataFrame) -> Table:
     sizes = _values(rows, "size_bytes.")
     if sizes:
         sizes["model"] = sizes.pop("total")
-    if math.isfinite(peak := _values(rows).get("peak_bytes", math.nan)):
-        sizes["peak, rendering"] = peak
+    for name, when in (("peak_bytes", "rendering"), ("train_peak_bytes", "training")):
+        if math.isfinite(peak := _values(rows).get(name, math.nan)):
+            sizes[f"peak, {when}"] = peak
     lines = tuple((name, megabytes(size)) for name, size in sizes.items())
     return Table("Memory", ("component", "MB"), lines)

@@ -19,6 +19,7 @@ from bench.cameras import move_camera, project
 from bench.errors import unexpected
 from bench.scenes.files import whole_number
 from bench.scenes.images import Pictures, View, describe
+from bench.scenes.masks import Masks
 from bench.threads import in_parallel, torch_threads
 from bench.types import BACKGROUNDS, Camera, Log, Scene, Split
 
@@ -39,6 +40,9 @@ def describe_splits(
     """The pictures of every split, each file read once; pixels are decoded on demand."""
     whole_number(downscale, "downscale", 1)
     every = [view for split in views.values() for view in split]
+    if masked := sum(view.mask is not None for view in every):
+        unused = "is not learnt from, nor scored unless protocol.mask=none"
+        log.info(f"{masked} of {len(every)} pictures have masks: what they hide {unused}")
     described = in_parallel(lambda view: describe(view, downscale), every, "read pictures", log)
     for turned, how in ((True, "turned"), (False, "not turned, as their cameras are")):
         if names := [of.view.name for of in described if of.turned is turned]:
@@ -79,9 +83,12 @@ def assemble(
             others = [camera.cx, camera.cy, *camera.c2w.flatten().tolist()]
             _check_float32(picture.view.name, [camera.fx, camera.fy], others)
             digest.update(f"{split} {camera.width} {camera.height} {picture.sha256}".encode())
+            digest.update(picture.mask.sha256.encode() if picture.mask else b"")
             cameras.append(camera)
             names.append(picture.view.name)
-        splits[split] = Split(cameras, of_split, names)
+        masked = any(picture.mask for picture in of_split.described)
+        masks = Masks(of_split.described, of_split.log) if masked else ()
+        splits[split] = Split(cameras, of_split, names, masks)
     return Scene(
         name=name,
         splits=splits,
@@ -128,6 +135,7 @@ def _taken(split: Split, indices: Sequence[int]) -> Split:
         [split.cameras[index] for index in indices],
         [images[index] for index in indices],
         [split.names[index] for index in indices],
+        [split.mask(index) for index in indices] if split.masks else (),
     )
 
 

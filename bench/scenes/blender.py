@@ -8,6 +8,7 @@ from bench.scenes.assemble import Box, assemble, cube, describe_splits, hull_box
 from bench.scenes.files import data_folder, focal_length, frames_of, opengl_pose, read_json
 from bench.scenes.images import Pictures, View, image_size
 from bench.scenes.lookup import absent, find_all, report
+from bench.scenes.masks import frame_mask
 from bench.types import Camera, Log, Scene
 
 HALF_EXTENT = 1.5  # the objects of NeRF-Synthetic lie in [-1.5, 1.5]^3
@@ -74,7 +75,8 @@ def read_split(root: Path, split: str, log: Log) -> list[View]:
     for (at, frame), file in zip(frames, files, strict=True):
         pose = opengl_pose(frame, at)
         camera = Camera(pose, focal, focal, width / 2, height / 2, width, height)
-        views.append(View(os.path.relpath(file, root), file, camera))
+        mask = frame_mask(root, frame, file, at)
+        views.append(View(os.path.relpath(file, root), file, camera, None, *mask))
     return views
 
 

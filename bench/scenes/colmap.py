@@ -26,6 +26,7 @@ from bench.scenes.assemble import (
 from bench.scenes.files import data_folder, number, rigid_pose
 from bench.scenes.images import Lens, View, image_size
 from bench.scenes.lookup import absent, bare, find_all, in_any_case, report, tidy
+from bench.scenes.masks import with_masks
 from bench.scenes.sparse import Entry, read_cameras, read_images, read_points
 from bench.scenes.splits import Listed, divide, read_lists
 from bench.types import Camera, Log, Scene
@@ -41,6 +42,7 @@ def load(
     *,
     images: str = "images",
     model: str | None = None,
+    masks: str | None = "auto",
     split: str | None = None,
     split_every: int = 8,
     bounds: str | list = "auto",
@@ -53,9 +55,9 @@ def load(
 
     The pictures may be smaller than those that COLMAP saw; the model is by default the first of
     `MODELS`. `bounds` are those of the box: "auto" or [[x, y, z], [x, y, z]]. "auto" is the box of
-    the points without outliers, or, in all of space, that of the cameras. For `split`,
-    `split_every` and `space` see `transforms.load`, for `downscale` and `background`
-    `blender.load`.
+    the points without outliers, or, in all of space, that of the cameras. For `masks` see
+    `masks.with_masks`, for `split`, `split_every` and `space` `transforms.load`, for `downscale`
+    and `background` `blender.load`.
 
     Lens distortion is undone for every COLMAP camera model that has a focal length, and pictures
     are cropped to what the lens saw. Pictures that COLMAP did not register are ignored. Registered
@@ -67,7 +69,8 @@ def load(
         how = install_command("colmap")
         raise Unavailable(f"{folder}: models of COLMAP need pycolmap: {how}")
     lists = read_lists(root, split, {}, folder)
-    splits = divide(read_views(root, images, folder, log), split_every, lists, folder, log)
+    listed = with_masks(read_views(root, images, folder, log), root, images, masks, log)
+    splits = divide(listed, split_every, lists, folder, log)
     pictures = describe_splits(splits, downscale, log)
     space = space_of(space, pictures)
     if bounds != "auto":

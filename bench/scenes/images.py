@@ -43,6 +43,8 @@ class View:
     path: Path
     camera: Camera  # in the data set's units, in float64: a scene may lie far from the origin
     lens: Lens | None = None  # None: a pinhole
+    mask: Path | None = None  # a picture, black where pixels do not count
+    hides: bool = False  # the mask is white there, as those of instant-ngp are
     stored: bool = False  # whether the camera is of the pixels as stored, whatever EXIF says
 
 
@@ -54,6 +56,7 @@ class ScaledView:
     downscale: int
     camera: Camera
     sha256: str
+    mask: "ScaledView | None" = None  # in full size, with the lens
     turned: bool | None = None  # whether its EXIF orientation is obeyed; None: it is upright
 
 
@@ -65,7 +68,7 @@ class Pictures(Sequence[Tensor]):
     """
 
     def __init__(self, described: Sequence[ScaledView], log: Log) -> None:
-        self.described, self._log = described, log
+        self.described, self.log = described, log
         self._decoded: dict[int, Tensor] = {}
 
     def __len__(self) -> int:
@@ -78,13 +81,16 @@ class Pictures(Sequence[Tensor]):
     def __iter__(self) -> Iterator[Tensor]:
         missing = [index for index in range(len(self)) if index not in self._decoded]
         if missing:
-            in_parallel(self._at, missing, "decode pictures", self._log)
+            in_parallel(self._at, missing, "decode pictures", self.log)
         return iter(self[:])
 
     def _at(self, index: int) -> Tensor:
         if index not in self._decoded:  # two threads may both decode it, with equal results
-            self._decoded[index] = decode(self.described[index])
+            self._decoded[index] = self._read(self.described[index])
         return self._decoded[index]
+
+    def _read(self, picture: ScaledView) -> Any:
+        return decode(picture)
 
 
 @contextmanager
@@ -133,7 +139,8 @@ def describe(view: View, downscale: int) -> ScaledView:
     if view.lens:
         camera = undistorted_camera(camera, view.lens, view.path)
     camera = shrunk_camera(camera, downscale, view.path)
-    return ScaledView(view, downscale, camera, hashlib.sha256(content).hexdigest(), turned)
+    mask = describe(View(view.name, view.mask, view.camera), 1) if view.mask else None
+    return ScaledView(view, downscale, camera, hashlib.sha256(content).hexdigest(), mask, turned)
 
 
 def obeyed(image: Image.Image, view: View) -> bool | None:

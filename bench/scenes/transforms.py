@@ -23,6 +23,7 @@ from bench.scenes.files import (
 )
 from bench.scenes.images import Fisheye, Lens, RadialTangential, View, image_size
 from bench.scenes.lookup import find_all, report, tidy
+from bench.scenes.masks import frame_mask
 from bench.scenes.splits import Listed, divide, read_lists
 from bench.types import Camera, Log, Scene
 
@@ -70,6 +71,7 @@ def load(
 
     Intrinsics of a frame take precedence over those of the file. Lens distortion is undone, and
     pictures are cropped to what the lens saw. Frames without a picture are logged and left out.
+    Masks are those of `mask_path`, or instant-ngp's `dynamic_mask_NAME.png` beside a picture.
     """
     root = data_folder(path)
     record, path = read_json(root, CAMERA_FILE), root / CAMERA_FILE
@@ -95,15 +97,12 @@ def read_views(root: Path, record: dict, log: Log) -> Listed:
         if not file:
             views.append((name, None))
             continue
-        if "mask_path" in frame:
-            expected = "none: masks are not read, but the alpha channel of a picture is"
-            raise unexpected(f"{where}.mask_path", expected, frame["mask_path"])
         settings, pose = ChainMap(frame, record), opengl_pose(frame, where)
         width, height = image_size(file)
         usual = Camera(pose, 0, 0, width / 2, height / 2, width, height)  # without a focal length
         camera = read_camera(settings, pose, usual, where)
-        lens = read_lens(settings, where)
-        views.append((name, View(os.path.relpath(file, root), file, camera, lens)))
+        lens, mask = read_lens(settings, where), frame_mask(root, settings, file, where)
+        views.append((name, View(os.path.relpath(file, root), file, camera, lens, *mask)))
     return views
 
 

@@ -87,10 +87,11 @@ class GaussianSplatting(OnField):
             untrained = Gaussians.at(points, colours, scales, self.fitting.opacity, self.degree)
             return GaussianTraining(untrained, scene, steps, self.fitting, setup)
 
-        tensors, seconds = loop.trained(begin, finished, "gaussians", log)
+        tensors, seconds, peak = loop.trained(begin, finished, "gaussians", setup.device, log)
         with checkpoint.restoring(finished):
             gaussians = Gaussians(**tensors).to(setup.device)
         self.train_s = teacher.train_s + seconds
+        self.train_peak_bytes = max(teacher.train_peak_bytes, peak)
         if not (exported := finished.with_suffix(".ply")).exists():
             ply.write(gaussians, scene, exported)
             log.info(f"Gaussians for other programs: {exported}")

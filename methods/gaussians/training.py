@@ -106,6 +106,8 @@ class GaussianTraining(loop.Training):
         if self.endless:  # no gap may pass for the background: its colour is another one each time
             background = torch.rand(3, generator=self.generator, device=background.device)
         picture = pixels.over(background).values.view_as(target)
+        if self.split.masks:
+            picture, target = loop.as_known(picture, target)
         loss = (1 - options.similarity) * functional.l1_loss(picture, target)
         if options.similarity:
             loss = loss + options.similarity * (1 - ssim(picture, target, backend=self.backend))
@@ -137,7 +139,8 @@ class GaussianTraining(loop.Training):
         return (away / HALF).clamp(min=1)
 
     def _picture(self, half: bool) -> tuple[Camera, Tensor]:
-        """The next training view and its picture [H, W, 3]; a pass uses every view once."""
+        """The next training view and its picture [H, W, 3], NaN where pixels do not count; a pass
+        uses every view once."""
         if not self.views:
             count, generator = len(self.split), self.generator
             order = torch.randperm(count, generator=generator, device=generator.device)
@@ -145,6 +148,8 @@ class GaussianTraining(loop.Training):
         view = self.views.pop()
         camera, device = self.split.cameras[view], self.background.device
         picture = composite(self.split.images[view].to(device, non_blocking=True), self.background)
+        if (mask := self.split.mask(view)) is not None:
+            picture[~mask.to(device)] = math.nan
         if half and min(camera.width, camera.height) > 1:
             camera = scale_camera(camera, camera.width // 2, camera.height // 2)
             planes, size = picture.movedim(-1, 0)[None], (camera.height, camera.width)

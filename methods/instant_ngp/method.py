@@ -43,6 +43,7 @@ class InstantNgp(OnField):
         with torch_threads(budget.threads):
             self.trained = train_field(self.setup, scene, budget, log)
         self.train_s = self.trained.train_s
+        self.train_peak_bytes = self.trained.train_peak_bytes
         self.background = scene.background.to(self.setup.device)
 
     @torch.no_grad()

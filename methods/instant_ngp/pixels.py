@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from bench.errors import unexpected
 from bench.types import Rays, Split
 
 STRIP = 8
@@ -27,8 +28,8 @@ def one_from_each(count: int, generator: torch.Generator, device: torch.device) 
 
 
 class PixelBatches:
-    """Random pixels of the pictures of a split, with their rays. Pixels are numbered picture by
-    picture, strip by strip from left to right, row by row."""
+    """Random pixels of the pictures of a split, with their rays. Pixels that count are numbered
+    picture by picture, strip by strip from left to right, row by row."""
 
     def __init__(self, split: Split, device: torch.device) -> None:
         self._device = device
@@ -42,6 +43,14 @@ class PixelBatches:
         ends = torch.tensor([len(picture) for picture in pictures]).cumsum(0)
         self._ends = ends.to(device)  # of each picture in `_pixels`
         self._starts = functional.pad(ends[:-1], (1, 0)).to(device)
+        self._counted: Tensor | None = None  # numbers of the pixels that count; None: all do
+        if split.masks:
+            pairs = zip(split.images, split.masks, strict=True)
+            whole = [torch.ones(x.shape[:2]).bool() if mask is None else mask for x, mask in pairs]
+            counts = [strip.flatten() for mask in whole for strip in mask.split(STRIP, dim=1)]
+            self._counted = torch.cat(counts).nonzero().squeeze(1).to(device)
+            if not len(self._counted):
+                raise unexpected("masks of the training pictures", "a pixel that counts", "none")
 
         cameras = split.cameras
         self._widths = torch.tensor([c.width for c in cameras], device=device)
@@ -57,7 +66,7 @@ class PixelBatches:
         self._corners, self._centres = (x.float().to(device) for x in (corner, poses[:, :, 3]))
 
     def __len__(self) -> int:
-        return len(self._pixels)
+        return len(self._pixels if self._counted is None else self._counted)
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[Rays, Tensor]:
         """Draw `count` rays through pixel centres, and their colours [count, 3 or 4] in [0, 1]."""
@@ -72,6 +81,8 @@ class PixelBatches:
     def at(self, pixel: Tensor) -> tuple[Rays, Tensor]:
         """The rays through the centres of the pixels with the numbers `pixel` [R], and their
         colours [R, 3 or 4] in [0, 1]."""
+        if self._counted is not None:
+            pixel = self._counted.index_select(0, pixel)
         view = torch.searchsorted(self._ends, pixel, right=True)
         width, height = (sides.index_select(0, view) for sides in (self._widths, self._heights))
         within = pixel - self._starts.index_select(0, view)

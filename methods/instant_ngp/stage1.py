@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, replace
 
 import torch
@@ -114,13 +115,14 @@ class OnField:
 
 @dataclass(frozen=True)
 class TrainedField:
-    """A trained field, the grid of its densities, how its rays are marched, and the seconds that
-    its training took."""
+    """A trained field, the grid of its densities, how its rays are marched, and the seconds and the
+    peak memory that its training took."""
 
     field: HashField
     grid: DensityGrid
     sampling: Sampling
     train_s: float
+    train_peak_bytes: float = math.nan
 
     @property
     def occupancy(self) -> Occupancy:
@@ -144,8 +146,8 @@ def train_field(setup: Setup, scene: Scene, budget: Budget, log: Log) -> Trained
     def begin() -> FieldTraining:
         return FieldTraining(field, scene, budget, setup.training, setup.seed)
 
-    tensors, seconds = loop.trained(begin, finished, "field", log)
+    tensors, *cost = loop.trained(begin, finished, "field", setup.device, log)
     grid, field.gradients = new_grid(scene, setup.device), None
     with checkpoint.restoring(finished):
         restore_field(field, grid, tensors)
-    return TrainedField(field, grid, setup.training.sampling(budget), seconds)
+    return TrainedField(field, grid, setup.training.sampling(budget), *cost)

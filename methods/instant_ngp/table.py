@@ -4,6 +4,7 @@ A table that is too short blurs a scene, one that is too long takes time in ever
 memory.
 """
 
+import math
 from dataclasses import asdict
 
 import torch
@@ -46,12 +47,14 @@ def detail(split: Split) -> float:
     from that of the pixel to the left or above by `CONTRAST` or more in some channel."""
     count = len(split.images)
     chosen = torch.linspace(0, count - 1, min(count, PICTURES)).long().unique()
-    return sum(_detailed(split.images[n]) for n in chosen.tolist()) / len(chosen)
+    return sum(_detailed(split.images[n], split.mask(n)) for n in chosen.tolist()) / len(chosen)
 
 
-def _detailed(picture: Tensor) -> int:
-    """Number of pixels with detail of `picture` uint8 [H, W, 3 or 4]."""
+def _detailed(picture: Tensor, mask: Tensor | None) -> int:
+    """Number of pixels with detail of `picture` uint8 [H, W, 3 or 4], of those that count."""
     rgb = picture[..., :3].float() / 255
+    if mask is not None:
+        rgb[~mask] = math.nan  # which differs from nothing
     shown = torch.ones_like(rgb[..., 0], dtype=torch.bool)
     if picture.shape[-1] == 4:
         alpha = picture[..., 3:].float() / 255

@@ -99,8 +99,9 @@ class SteerNerf(OnField):
         with torch_threads(budget.threads):
             self.trained = train_field(self.setup, scene, budget, log)
             given = self.trained, self.setup, self.stage2, scene, budget, log
-            self.pipeline, trained, seconds = train_stage2(*given)
+            self.pipeline, trained, seconds, peak = train_stage2(*given)
         self.train_s = self.trained.train_s + seconds
+        self.train_peak_bytes = max(self.trained.train_peak_bytes, peak)
         views = TrainingViews(self.pipeline, scene, self.stage2.joint, self.setup.seed, log)
         renderer, device = self.pipeline.renderer, self.setup.device
 

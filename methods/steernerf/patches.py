@@ -5,6 +5,7 @@ ends at the view. The pipeline renders these frames with its present weights, as
 used. After a number of patches they are replaced, by those before another view.
 """
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -46,7 +47,7 @@ class Patch:
 
     example: Example
     view: TwoScales
-    truth: Tensor  # [H, W, 3] the true picture
+    truth: Tensor  # [H, W, 3] the true picture, NaN where pixels do not count
     points: Sequence[Points]  # features of the preceding frames, where `view` shows them
 
 
@@ -55,7 +56,7 @@ class Batch:
     """Patches to learn from."""
 
     observations: Sequence[Observation]  # with a gradient if the field learns
-    truth: Tensor  # [B, H, W, 3] the true pictures
+    truth: Tensor  # [B, H, W, 3] the true pictures, NaN where pixels do not count
     opacity: Tensor  # [R] of all rendered rays
 
 
@@ -78,6 +79,7 @@ class Patches:
         real, self._target = scene.splits["train"], viewing_target(scene)
         self.cameras = [*real.cameras, *distilled.cameras]
         self.pictures = [*real.images, *distilled.images]
+        self.masks = [*(real.masks or [None] * len(real)), *[None] * len(distilled)]
         self._real, self._distilled = len(real), len(distilled)
 
     def draw(self, count: int) -> Batch:
@@ -137,6 +139,8 @@ class Patches:
         columns = slice(left * scale, left * scale + full.width)
         picture = self.pictures[example.number][rows, columns]
         part = composite(picture.to(background.device, non_blocking=True), background)
+        if (mask := self.masks[example.number]) is not None:
+            part[~mask[rows, columns].to(part.device)] = math.nan
         beyond = 0, full.width - part.shape[1], 0, full.height - part.shape[0]
         return functional.pad(part.movedim(-1, 0), beyond, mode="replicate").movedim(0, -1)
 

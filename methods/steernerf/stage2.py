@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from bench.memory import MemoryMeter
 from bench.provenance import digest, libraries
 from bench.types import Budget, Log, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField
@@ -66,33 +67,36 @@ class Stage2:
 
 def train_stage2(
     trained: TrainedField, setup: Setup, stage2: Stage2, scene: Scene, budget: Budget, log: Log
-) -> tuple[Pipeline, dict[str, object], float]:
+) -> tuple[Pipeline, dict[str, object], float, float]:
     """Train `stage2` on the field that `setup` made for `scene`, or load the result of the same
     training. The field is widened to K features and changed in place. Returns the pipeline, the
-    key of its weights, and the seconds of stage 2 spent on them."""
+    key of its weights, and the seconds and the peak memory of stage 2 up to them."""
     model, joint, steps = stage2.model, stage2.joint, budget.renderer_steps
     key = {**setup.key(scene, budget), **stage2.key(budget)}
     folder = log.stage_dir("steernerf", key)
     finished = folder / "steernerf.safetensors"
     count = 0 if finished.exists() else joint.distilled(steps)
     # These show the field of stage 1, which is changed from here on.
-    distilled, distilled_s = distilled_views(setup, trained, scene, budget, count, log)
+    meter = MemoryMeter(str(setup.device))
+    with meter:
+        distilled, distilled_s = distilled_views(setup, trained, scene, budget, count, log)
     trained.field.widen(model.channels, torch.Generator().manual_seed(setup.seed))
 
     renderer, generator = stage2.make(setup), torch.Generator().manual_seed(setup.seed)
     pipeline = Pipeline(trained, scene.background, renderer, model)
     patches = Patches(pipeline, scene, distilled, joint, generator)
     training = JointTraining(renderer, patches, steps, trained if patches.learning else None)
-    training.seconds = distilled_s
+    training.seconds, training.meter = distilled_s, meter
 
     marks = {folder / f"after-{share}.safetensors": math.ceil(share * steps) for share in MARKS}
-    loop.train(training, finished, "training the 2D renderer", log, marks)
+    with meter:
+        loop.train(training, finished, "training the 2D renderer", log, marks)
     if stage2.after < 1:
         loop.load_result(training, folder / f"after-{stage2.after}.safetensors")
         key["after"] = stage2.after
     trained.field.requires_grad_(False).gradients = None
     renderer.requires_grad_(False)
-    return pipeline, key, training.seconds
+    return pipeline, key, training.seconds, training.peak_bytes
 
 
 class JointTraining(loop.Training):
@@ -134,7 +138,10 @@ class JointTraining(loop.Training):
         kind = batch.truth.device.type
         with torch.autocast(kind, torch.bfloat16, enabled=multiplies_bf16(kind)):
             pictures = self.renderer(batch.observations)
-        loss = error = functional.mse_loss(pictures, batch.truth)
+        truth = batch.truth
+        if any(mask is not None for mask in self.patches.masks):
+            pictures, truth = loop.as_known(pictures, truth)
+        loss = error = functional.mse_loss(pictures, truth)
         if self.trained and len(batch.opacity):
             loss = error + self.options.opacity_entropy * opacity_entropy(batch.opacity)
         loss.backward()

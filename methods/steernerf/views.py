@@ -49,17 +49,17 @@ class TrainingViews:
 
     def compare(self, networks: Sequence[Built]) -> list[EngineFigures]:
         """The PSNR of pictures and the time of the 2D renderer with each of the `networks`."""
-        pictures, background = self.scene.splits["train"].images, self.pipeline.background
+        split, background = self.scene.splits["train"], self.pipeline.background
         clocks = [StageClock(str(background.device)) for _ in networks]
         quality = [list[float]() for _ in networks]
         for number, camera, buffer in self._spread(COMPARED, "frames to compare engines in"):
-            truth = composite(pictures[number], self.scene.background)
+            truth = composite(split.images[number], self.scene.background)
             for network, clock, found in zip(networks, clocks, quality, strict=True):
                 self.pipeline.renderer.engine = network
                 self._render(camera, buffer, NullProbe())  # the first of its size takes longer
                 with clock.frame():
                     frame = self._render(camera, buffer, clock)
-                found.append(psnr(frame.rgb.cpu(), truth))
+                found.append(psnr(frame.rgb.cpu(), truth, split.mask(number)))
             self.pipeline.renderer.engine = None  # the network itself draws the frames before
         of_renderer = [[_renderer_ms(frame) for frame in clock.frames] for clock in clocks]
         of_each = zip(map(mean, quality), map(median, of_renderer), strict=True)

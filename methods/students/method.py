@@ -94,10 +94,12 @@ class Student(ABC):
             }
             finished = log.stage_dir(self.kind, key) / f"{self.kind}.safetensors"
             begin = partial(self.begin, teacher, scene, budget)
-            tensors, seconds = loop.trained(begin, finished, self.kind, log)
+            device = self.teacher.device
+            tensors, seconds, peak = loop.trained(begin, finished, self.kind, device, log)
             with checkpoint.restoring(finished):
                 self.restore(tensors)
         self.train_s = teacher.train_s + seconds
+        self.train_peak_bytes = max(teacher.train_peak_bytes, peak)
         self.background = scene.background.to(self.teacher.device)
 
     def reset(self) -> None:  # noqa: B027 (no student has anything to forget)

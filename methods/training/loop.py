@@ -10,6 +10,7 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor
 
+from bench.memory import MemoryMeter
 from bench.sharing import missing
 from bench.types import Log, SteerbenchError
 from methods.training import checkpoint
@@ -31,6 +32,8 @@ class Training(Protocol):
     step: int = 0  # how many are done
     seconds: float = 0.0  # the time they took, over all the processes the training was continued in
     asked: Asked | None = None  # the errors that `look` requested last
+    peak_bytes: float = 0.0  # of the memory that it took, over these processes, in its last file
+    meter: MemoryMeter | None = None  # that measures it
     generator: torch.Generator
 
     def advance(self) -> Mapping[str, float]:
@@ -62,20 +65,21 @@ class Training(Protocol):
 
 
 def trained(
-    begin: Callable[[], Training], finished: Path, label: str, log: Log
-) -> tuple[dict[str, Tensor], float]:
-    """The result of the training that `begin` makes, and its seconds, of making it and of all its
-    steps: read from `finished`, after a `train` if that is missing."""
+    begin: Callable[[], Training], finished: Path, label: str, device: torch.device, log: Log
+) -> tuple[dict[str, Tensor], float, float]:
+    """The result of the training on `device` that `begin` makes, seconds and peak memory, of making
+    it and of all its steps: read from `finished`, after a `train` if that is missing."""
     if finished.exists():
         log.info(f"trained {label} found: {finished}")
     else:
-        begun = time.monotonic()
-        training = begin()
-        training.seconds = time.monotonic() - begun
-        train(training, finished, label, log)
+        begun, meter = time.monotonic(), MemoryMeter(str(device))
+        with meter:
+            training = begin()
+            training.seconds, training.meter = time.monotonic() - begun, meter
+            train(training, finished, label, log)
     tensors, figures = checkpoint.read(finished)
     with checkpoint.restoring(finished):
-        return tensors, figures["seconds"]
+        return tensors, figures["seconds"], figures["peak_bytes"]
 
 
 def train(
@@ -132,7 +136,9 @@ def save(training: Training, path: Path, done: bool = False) -> None:
     `SteerbenchError` and leaves the last good file alone."""
     check_finite(training)
     more, figures = training.state()
-    figures |= {"step": training.step, "seconds": training.seconds}
+    if training.meter:
+        training.peak_bytes = max(training.peak_bytes, training.meter.look())
+    figures |= {name: getattr(training, name) for name in ("step", "seconds", "peak_bytes")}
     checkpoint.write(path, training.result() | ({} if done else more), figures)
 
 
@@ -142,7 +148,7 @@ def load_result(training: Training, path: Path) -> None:
     tensors, figures = checkpoint.read(path)
     with checkpoint.restoring(path):
         training.restore_result(tensors)
-        training.seconds = figures["seconds"]
+        training.seconds, training.peak_bytes = figures["seconds"], figures["peak_bytes"]
 
 
 def resume(training: Training, path: Path) -> None:
@@ -151,6 +157,7 @@ def resume(training: Training, path: Path) -> None:
     with checkpoint.restoring(path):
         training.restore(tensors, figures)
         training.step, training.seconds = int(figures["step"]), figures["seconds"]
+        training.peak_bytes = figures["peak_bytes"]
 
 
 def look(
@@ -195,6 +202,12 @@ def check_finite(training: Training, more: Mapping[str, Tensor] | None = None) -
             f"training stopped at step {training.step}: not finite: {', '.join(bad)}. The last "
             f"good checkpoint was kept. {training.advice}"
         )
+
+
+def as_known(picture: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+    """Both, alike and without a gradient where the truth is NaN: there, pixels do not count."""
+    unknown, shown = truth.isnan(), picture.detach()
+    return shown.where(unknown, picture), shown.where(unknown, truth)
 
 
 def cosine(done: float, final: float, half_waves: int = 1) -> float:

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from bench.metrics import SMALLEST_SIDE, Lpips, flicker, psnr, quantise, ssim
+from bench.metrics import SMALLEST_SIDE, Lpips, colour_corrected, flicker, psnr, quantise, ssim
 from bench.scoring import Scoring
 from bench.types import SteerbenchError, Unavailable
 from tests.conftest import STEERBENCH_1
@@ -53,6 +53,46 @@ def test_flicker_is_the_change_of_the_error_alone(device):
     expected = F.mse_loss(wrong, torch.zeros_like(wrong)).sqrt().item()
     assert flicker(*shown) == pytest.approx(expected, rel=1e-12)
     assert flicker(*shown[2:], *shown[:2]) == flicker(*shown)
+
+
+def plain_correction(image: np.ndarray, truth: np.ndarray, quadratic: bool) -> np.ndarray:
+    """`color_correct` as the evaluation of mip-NeRF 360 defines it, for pixels [P, 3]."""
+
+    def unsaturated(x: np.ndarray) -> np.ndarray:
+        return (x >= 0.5 / 255) & (x <= 1 - 0.5 / 255)
+
+    now, first = image, unsaturated(image) & unsaturated(truth)
+    for _ in range(5):
+        r, g, b = now.T
+        squares = [r * r, r * g, r * b, g * g, g * b, b * b] if quadratic else []
+        terms = np.stack([*squares, r, g, b, np.ones_like(r)], axis=1)
+        used, new = first & unsaturated(now), []
+        for c in range(3):
+            found = np.linalg.lstsq(terms[used[:, c]], truth[used[:, c], c], rcond=None)[0]
+            new.append((terms @ found).clip(0, 1))
+        now = np.stack(new, axis=1)
+    return now
+
+
+# Products of the channels of a grey picture are too alike for a comparison.
+@pytest.mark.parametrize(("quadratic", "grey"), [(True, False), (False, False), (False, True)])
+def test_colours_are_corrected_as_in_mip_nerf_360(quadratic, grey, device):
+    image = noise(20, 30).double()
+    image = image.mean(dim=2, keepdim=True).expand(-1, -1, 3) if grey else image
+    mixed = image @ noise(3, 3, 1)[..., 0].double() / 2 + 0.1 - 0.2 * image.square()
+    truth = (1.6 * mixed + 0.05 * noise(20, 30, 2)).clamp(0, 1).double()  # some are saturated
+    found = colour_corrected(image.to(device), truth.to(device), quadratic=quadratic).cpu()
+    pixels = (x.reshape(-1, 3).numpy() for x in (image, truth))
+    expected = plain_correction(*pixels, quadratic).reshape(20, 30, 3)
+    # The normal equations have the squared condition of the terms, about 1e6 here, in float64.
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert psnr(found, truth) > psnr(image, truth)
+    half = torch.arange(30) < 15
+    spoiled = torch.where(half[:, None], truth, 0.5)
+    mask = half.expand(20, 30)
+    among = colour_corrected(image, spoiled, mask, quadratic)
+    assert torch.equal(among, colour_corrected(image, truth, mask, quadratic))
+    assert torch.equal(colour_corrected(0 * image, truth), 0 * image)  # nothing can be fitted
 
 
 def test_pictures_of_different_size_are_refused():

@@ -64,6 +64,11 @@ def test_names_match_without_their_endings_and_folders(tmp_path, quiet_log):
     found = pictures.score(pictures.pairs_with_split(ours, split), QUICK, {}, FACTS, quiet_log)
     assert found.frames["psnr"].tolist() == [math.inf] * 2
     assert found.frames["name"].tolist() == split.names
+    mask = torch.arange(16)[:, None].expand(16, 20) > 3
+    spoiled = [torch.where(mask[..., None], image, 0) for image in images]
+    masked = pictures.pairs_with_split(ours, replace(split, images=spoiled, masks=[mask, None]))
+    again = pictures.score(masked, QUICK, {}, FACTS, quiet_log)
+    assert again.frames["psnr"].isin([math.inf]).tolist() == [True, False]
 
 
 @pytest.mark.parametrize("folder", ["", "out/"])

@@ -1,13 +1,16 @@
 """A protocol is what its name says, and scores as it says, one frame at a time."""
 
 import hashlib
+import math
 from dataclasses import replace
 
 import pytest
 import torch
+from torch import Tensor
 
 from bench.cameras import scale_camera
 from bench.metrics import psnr, quantise
+from bench.scoring import Scoring
 from bench.trajectories import from_split
 from bench.types import SteerbenchError, composite
 from tests.conftest import QUICK, STEERBENCH_1
@@ -69,3 +72,25 @@ def test_what_cannot_be_scored_is_refused(tiny_scene):
     with pytest.raises(SteerbenchError, match=r"protocol\.flicker=exact: scene .* has no exact"):
         exact.check(tiny_scene, trajectory)
     exact.check(replace(tiny_scene, exact=lambda camera: torch.zeros(0)), trajectory)
+
+
+def test_masked_pixels_are_not_scored_unless_the_protocol_says_so(device):
+    truth = torch.rand(16, 16, 3).mul(255).byte().to(device)
+    mask = torch.arange(16)[:, None].expand(16, 16) < 12
+    wrong = composite(truth, torch.ones(3)) + 0.2 * (~mask[..., None]).to(device)
+    near = quantise(wrong + 8 / 255 * (torch.arange(16, device=device)[:, None, None] < 6))
+
+    def scored(rgb: Tensor, mask: Tensor | None, use: str = "scene") -> dict[str, float]:
+        protocol = replace(QUICK, name="mine", mask=use, colour_correction="affine")
+        return Scoring(protocol, {}, torch.ones(3), ()).score(0, rgb, truth, cut=True, mask=mask)
+
+    right = scored(wrong, mask)
+    assert (right["psnr"], right["ssim"], right["cc_psnr"]) == (math.inf, 1, math.inf)
+    shown = scored(near, mask)
+    above = composite(truth, torch.ones(3))[:12]
+    assert shown["psnr"] == pytest.approx(psnr(near[:12], above), rel=1e-9)
+    filled = torch.cat((near[:12], composite(truth, torch.ones(3))[12:]))
+    assert shown["ssim"] == scored(filled, None)["ssim"]
+    assert scored(near, mask, "none") == scored(near, None) != shown
+    nothing = scored(wrong, torch.zeros_like(mask))
+    assert all(math.isnan(score) for score in nothing.values())

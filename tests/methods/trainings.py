@@ -1,17 +1,20 @@
 """The field that most tests begin with, and what is asked of every method that trains: what it
 learned, and that a kill changes nothing."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 from bench.metrics import psnr
 from bench.types import EMPTY_ALPHA, Budget, Method, NullProbe, Scene, composite
 from methods.instant_ngp.stage1 import Setup
+from methods.instant_ngp.table import detail
 from methods.kernels.encode import HashGrid
 from methods.training import loop
 from tests.methods.usual import field_options
@@ -68,6 +71,27 @@ def goes_on_after_a_kill(new: Callable[[], loop.Training], killed_at: int, folde
     assert found.keys() == expected.keys()
     for name, value in expected.items():
         assert torch.equal(found[name], value), name
+
+
+def does_not_see_what_masks_hide(begin: Callable[[Scene], loop.Training], scene: Scene) -> None:
+    """Assert that what masks hide in the pictures of `scene` changes nothing in eight steps of the
+    training that `begin` makes, and that everything else would."""
+    split = scene.splits["train"]
+    noise = torch.rand(1, 1, 11, 11, generator=torch.Generator().manual_seed(0))
+    mask = torch.nn.functional.interpolate(noise, size=split.images[0].shape[:2])[0, 0] < 0.6
+    spoiled = [torch.where(mask[..., None], image, 255 - image) for image in split.images]
+
+    def learnt(images: Sequence[Tensor], masks: Sequence[Tensor | None]) -> tuple[float, ...]:
+        train = replace(split, images=images, masks=masks)
+        training = begin(replace(scene, splits={"train": train}))
+        for _ in range(8):
+            training.advance()
+        return detail(train), *(x.double().sum().item() for x in training.result().values())
+
+    masks, nothing = [mask] * len(split), [None] * len(split)
+    masked, plain = learnt(split.images, masks), learnt(split.images, ())
+    assert learnt(spoiled, masks) == masked != plain != learnt(spoiled, ())
+    assert learnt(split.images, nothing) == plain
 
 
 @contextmanager

@@ -93,6 +93,35 @@ def test_smaller_pictures_have_smaller_cameras(folder, log):
     assert (second.fx, second.cy) == (first.fx / 2, first.cy / 2)
 
 
+@pytest.mark.parametrize(
+    ("images", "place"),
+    [
+        ("images", "masks/{}.png"),
+        ("images", "masks/{}"),  # NAME.jpg.png may also be NAME.png
+        ("images_2", "masks_2/{}.png"),
+    ],
+)
+def test_masks_lie_beside_the_pictures(folder, log, images, place):
+    root, black = folder(), np.uint8(np.arange(48).reshape(6, 8) % 3)
+    (root / "images").rename(root / images)
+    file = root / place.format("008.png")
+    file.parent.mkdir()
+    Image.fromarray(black).save(file)
+    scene = colmap.load(root, images=images, log=log)
+    assert scene.splits["test"].mask(0) is None is scene.splits["train"].mask(0)
+    assert torch.equal(scene.splits["test"].mask(1), torch.from_numpy(black > 0))
+    assert not colmap.load(root, images=images, masks=None, log=log).splits["test"].masks
+    file.rename(file.with_name("frame_8.png"))
+    log.messages.clear()
+    colmap.load(root, images=images, log=log)
+    assert "no picture has its mask there" in log.messages[0]
+    Image.fromarray(black[::2, ::2]).save(file)
+    with pytest.raises(SteerbenchError, match=r"008\.png.*: expected 8 x 6 pixels, got 4 x 3"):
+        colmap.load(root, images=images, log=log)
+    with pytest.raises(SteerbenchError, match=r"scene\.masks: expected a folder in .* got 'none'"):
+        colmap.load(root, images=images, masks="none", log=log)
+
+
 LENSES = {
     "SIMPLE_RADIAL": (9.0, 4.0, 3.0, 0.05),
     "OPENCV": (9.0, 8.0, 4.0, 3.0, 0.05, -0.02, 0.001, 0.002),

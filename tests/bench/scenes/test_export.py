@@ -41,6 +41,16 @@ def test_pictures_without_alpha_are_opaque_and_a_split_not_named_has_none(
     assert torch.equal(image[..., :3], opaque.images[0])
 
 
+def test_masks_are_written_and_read(moved_scene, quiet_log, tmp_path):
+    train = moved_scene.splits["train"]
+    masks = [image[..., 0] > 99 if n else None for n, image in enumerate(train.images)]
+    scene = replace(moved_scene, splits={"train": replace(train, masks=masks)})
+    write_blender(scene, tmp_path, {"train": "train", "test": "train"}, quiet_log)
+    found = blender.load(tmp_path, bounds="full", log=quiet_log).splits["test"]
+    assert found.mask(0) is None
+    assert all(torch.equal(found.mask(n), masks[n]) for n in range(1, len(masks)))
+
+
 @pytest.mark.parametrize(
     "lens", [{"fy": 61.0}, {"cx": 19.0}, {"fx": 70.0, "fy": 70.0}], ids=["fy", "cx", "one"]
 )

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from PIL import Image
 
 from bench.cameras import pixel_grid
 from bench.scenes import transforms
+from bench.scenes.assemble import hold_out
 from bench.scenes.images import Fisheye, RadialTangential, undistort, undistorted_camera
 from bench.types import Camera, SteerbenchError
 from tests.bench.scenes.conftest import edit_json, picture, pose
@@ -83,6 +85,42 @@ def test_missing_pictures_are_named_once_and_left_out(folder, log):
     assert message.endswith(left_out)
 
 
+BLACK = np.where(np.arange(8) < 3, 0, np.full((6, 8), 9)).astype(np.uint8)  # hides three columns
+
+
+@pytest.mark.parametrize("beside", [False, True], ids=["mask_path", "dynamic_mask"])
+def test_masked_pixels_do_not_count(folder, log, beside):
+    before = transforms.load(folder, log=log)
+    if beside:
+        white = Image.fromarray(np.where(BLACK == 0, 255, 0).astype(np.uint8))
+        white.save(folder / "images" / "dynamic_mask_008.png")
+    else:
+        Image.fromarray(BLACK).save(folder / "m.png")
+        edit_json(folder / "transforms.json", of_picture(8, mask_path="m.png"))
+    scene = transforms.load(folder, log=log)
+    assert scene.splits["test"].mask(0) is None is scene.splits["train"].mask(0)
+    assert torch.equal(scene.splits["test"].mask(1), torch.from_numpy(BLACK > 0))
+    assert scene.digest != before.digest
+    assert [message.split(":")[0] for message in log.messages] == ["1 of 10 pictures have masks"]
+    held_out = hold_out(replace(scene, splits={"train": scene.splits["test"]}), "held", 2)
+    assert torch.equal(held_out.splits["held"].mask(0), scene.splits["test"].mask(1))
+
+
+def test_a_pixel_of_an_undistorted_smaller_picture_counts_if_all_of_it_does(folder, log):
+    spots = np.uint8(255 * (np.random.default_rng(0).random((76, 100)) < 0.02))
+    for k in range(10):
+        Image.fromarray(spots).convert("RGB").save(folder / "images" / f"{k:03}.png")
+        Image.fromarray(spots).save(folder / "images" / f"dynamic_mask_{k:03}.png")
+    record = {"w": 100, "h": 76, "fl_x": 90, "fl_y": 84, "cx": 52.3, "cy": 37.1, "k1": 0.06}
+    edit_json(folder / "transforms.json", lambda r: r.update(record))
+    whole, half = (transforms.load(folder, downscale=k, log=log).splits["test"] for k in (1, 2))
+    touched = whole.images[0][..., 0] > 0
+    assert torch.equal(whole.mask(0), ~touched)
+    height, width = half.images[0].shape[:2]
+    blocks = touched[: 2 * height, : 2 * width].reshape(height, 2, width, 2)
+    assert torch.equal(half.mask(0), ~blocks.any(3).any(1))
+
+
 MAPPED = {"scale": 0.1, "offset": [0.5, 0.7, 0.5]}
 
 
@@ -117,7 +155,8 @@ FAR = [[1, 0, 0, 1e308], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         (every(fl_x=0), r"frames\[0\].fl_x: expected a finite number above 0, got 0"),
         (first(fl_y="9"), r"transforms\.json: frames\[0\].fl_y: .* got '9'"),
         (lambda r: r.pop("fl_x"), r"frames\[0\].fl_x: expected a focal length, or camera_angle_x"),
-        (first(mask_path="m.png"), r"frames\[0\].mask_path: expected none: masks are not read"),
+        (first(mask_path=5), r"frames\[0\].mask_path: expected a path, got 5"),
+        (first(mask_path="m.png"), r"m\.png: expected a readable picture"),
         (first(cx=9), r"frames\[0\].cx: .* below 8, got 9"),
         (first(w=0), r"frames\[0\].w: expected a whole number from 1 on"),
         (first(k1=None), r"frames\[0\].k1: expected a finite number, got nothing"),

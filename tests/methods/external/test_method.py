@@ -136,13 +136,15 @@ def test_what_it_stores_is_loaded_and_a_knob_needs_no_training(
     worker, external, tiny_scene, quiet_log, tmp_path
 ):
     path = worker(STORES, after="serve(Stores)\n")
-    seconds = []
+    seconds, peaks = [], []
     for options, shown in (({}, 0.25), ({"shade": 0.5}, 0.125), ({"level": 0.75}, 0.75)):
         method = external(path, options=options)
         method.fit(tiny_scene, BUDGET, quiet_log)
         seconds.append(method.train_s)
+        peaks.append(method.train_peak_bytes)
         assert level(method, tiny_scene) == shown
     assert seconds[0] == seconds[1] > 0
+    assert peaks[0] == peaks[1] > 1e6
     assert len(list(tmp_path.glob("outputs/stages/external-*"))) == 2
     assert method.sizes() == {"model": 4}
     assert (method.name, method.memory) == ("Stores", 2)

@@ -29,6 +29,7 @@ def test_a_training_is_found_again_and_left_for_others(ball_scene, quiet_log, tm
     first = fitted(ball_scene, quiet_log, budget)
     again = fitted(ball_scene, quiet_log, budget)
     assert again.train_s == first.train_s > 0
+    assert again.train_peak_bytes == first.train_peak_bytes > 0
     (exported,) = (tmp_path / "outputs").rglob("gaussians.ply")
     shown = fitted(ball_scene, quiet_log, budget, checkpoint=str(exported))
     camera = ball_scene.splits["test"].cameras[0]

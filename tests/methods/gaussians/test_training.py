@@ -2,13 +2,14 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
-from bench.types import Rays
+from bench.types import Rays, Scene
 from methods.gaussians import training
 from methods.gaussians.model import Gaussians
 from methods.gaussians.training import (
@@ -22,7 +23,7 @@ from methods.gaussians.training import (
     spacing,
 )
 from methods.kernels.types import Pixels
-from tests.methods.trainings import TEACHER, goes_on_after_a_kill
+from tests.methods.trainings import TEACHER, does_not_see_what_masks_hide, goes_on_after_a_kill
 from tests.methods.usual import usual
 
 
@@ -62,15 +63,19 @@ def test_spacing_is_the_distance_of_neighbours(ball_scene):
     assert ((points >= 0.1) & (points <= 0.9)).all()
 
 
-def test_a_killed_training_goes_on_as_if_it_had_not_been(ball_scene, tmp_path):
-    def new() -> GaussianTraining:
-        points, colours = anywhere(ball_scene, 200, torch.Generator().manual_seed(0))
-        gaussians = Gaussians.at(points, colours, 0.5 * spacing(points), 0.5, degree=3)
-        return GaussianTraining(
-            gaussians, ball_scene, 40, usual("method/gaussians", "fitting", every=10), TEACHER
-        )
+def new_training(scene: Scene, steps: int = 40, **options: Any) -> GaussianTraining:
+    points, colours = anywhere(scene, 200, torch.Generator().manual_seed(0))
+    gaussians = Gaussians.at(points, colours, 0.5 * spacing(points), 0.5, degree=3)
+    fitting = usual("method/gaussians", "fitting", **{"every": 10, **options})
+    return GaussianTraining(gaussians, scene, steps, fitting, TEACHER)
 
-    goes_on_after_a_kill(new, 23, tmp_path)
+
+def test_a_killed_training_goes_on_as_if_it_had_not_been(ball_scene, tmp_path):
+    goes_on_after_a_kill(partial(new_training, ball_scene), 23, tmp_path)
+
+
+def test_masked_pixels_are_not_learnt_from_in_either_size(ball_scene):
+    does_not_see_what_masks_hide(partial(new_training, steps=8, half=0.5), ball_scene)
 
 
 def some(opacities: list[float]) -> tuple[Gaussians, torch.optim.Adam]:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from bench.cameras import cast
-from bench.types import Split
+from bench.types import Split, SteerbenchError
 from methods.instant_ngp.pixels import RUN, STRIP, UNSEEN, ErrorMap, PixelBatches
 
 CPU = torch.device("cpu")
@@ -84,3 +84,19 @@ def test_a_new_error_counts_as_much_as_the_estimate():
     assert chances.errors.tolist() == pytest.approx([first, UNSEEN])
     chances.learn(torch.tensor([1, RUN]), torch.tensor([0.4, 0.0]))
     assert chances.errors.tolist() == pytest.approx([(first + 0.4) / 2, UNSEEN / 2])
+
+
+def test_masked_pixels_have_no_number(ball_scene):
+    split = ball_scene.splits["train"]
+    pair = Split(split.cameras[:2], split.images[:2], split.names[:2])
+    mask = torch.rand(32, 32, generator=torch.Generator().manual_seed(0)) < 0.5
+    (whole, every), (some, fewer) = (
+        batches.at(torch.arange(len(batches)))
+        for batches in (PixelBatches(x, CPU) for x in (pair, replace(pair, masks=[mask, None])))
+    )
+    strips = torch.cat([strip.flatten() for strip in mask.split(STRIP, dim=1)])
+    kept = torch.cat((strips, torch.ones_like(strips)))
+    assert torch.equal(fewer, every[kept])
+    assert torch.equal(some.directions, whole.directions[kept])
+    with pytest.raises(SteerbenchError, match="masks of the training pictures: expected a pixel"):
+        PixelBatches(replace(pair, masks=[torch.zeros_like(mask)] * 2), CPU)

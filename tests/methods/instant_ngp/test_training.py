@@ -18,7 +18,13 @@ from methods.instant_ngp.training import MIN_RAYS, FieldTraining, PixelTraining
 from methods.kernels.types import Pixels
 from methods.rendering.occupancy import RESOLUTION, STEP
 from methods.training import checkpoint, loop
-from tests.methods.trainings import GRID, QUICK, TEACHER, killed
+from tests.methods.trainings import (
+    GRID,
+    QUICK,
+    TEACHER,
+    does_not_see_what_masks_hide,
+    killed,
+)
 from tests.methods.usual import field_options
 
 BUDGET = Budget("test", steps=40, samples=1024)
@@ -52,6 +58,10 @@ def unlit(ball_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> FieldTraining:
     monkeypatch.setattr(training, "_render", render)
     monkeypatch.setattr(training, "_update", lambda: None)
     return training
+
+
+def test_masked_pixels_are_not_learnt_from(ball_scene):
+    does_not_see_what_masks_hide(new_training, ball_scene)
 
 
 def test_the_error_shown_is_that_of_pixels_drawn_alike(unlit):

@@ -28,7 +28,8 @@ def test_points_in_the_box_stay_and_all_others_go_to_the_rest_of_the_cube():
     places = contract(points)
     torch.testing.assert_close(places[inside], points[inside], rtol=0, atol=1e-7)
     size = (places - 0.5).abs().amax(dim=1)
-    assert (size[~inside] >= HALF).all() and (size <= 0.5).all()
+    assert (size[~inside] >= HALF).all()
+    assert (size <= 0.5).all()
     # At n half sides, 2 - 1/n: at 2, 3/2; at 4, 7/4; with the other components in proportion.
     given = torch.tensor([[1.0, 0.5, 0.5], [0.5, -0.5, 0.0]])
     want = torch.tensor([[0.875, 0.5, 0.5], [0.5, 0.5 - 7 / 16, 0.5 - 7 / 32]])
@@ -54,7 +55,8 @@ def test_a_ray_goes_to_infinity_in_few_steps_whose_lengths_add_up(backend):
     samples = march(rays, FULL, STEP, backend=backend)
     counts = samples.offsets.diff()
     assert (counts <= 1 / STEP).all()
-    assert (samples.positions >= 0).all() and (samples.positions <= 1).all()
+    assert (samples.positions >= 0).all()
+    assert (samples.positions <= 1).all()
     lengths = rays.directions.norm(dim=1)
     for ray, (first, end) in enumerate(zip(samples.offsets, samples.offsets[1:], strict=False)):
         t, delta = samples.t[first:end], samples.delta[first:end].double()

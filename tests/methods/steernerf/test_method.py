@@ -69,6 +69,7 @@ def test_what_was_trained_is_found_again_and_renders_the_same(
     assert "training the 2D renderer: found in" in capsys.readouterr().err
     assert stages(tmp_path) == ["distilled", "field", "steernerf"]
     assert second.train_s == first.train_s > 0
+    assert second.train_peak_bytes == first.train_peak_bytes >= first.trained.train_peak_bytes > 0
     for camera in ball_scene.splits["test"].cameras:
         frames = [method.render(camera, NullProbe()).rgb for method in (first, second)]
         assert torch.equal(*frames)

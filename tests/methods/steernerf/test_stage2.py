@@ -16,7 +16,7 @@ from methods.steernerf.stage2 import JointTraining
 from methods.steernerf.unet import UNet
 from methods.training import loop
 from tests.methods.models import misty_field, small_joint, small_model, small_motion, trained_field
-from tests.methods.trainings import goes_on_after_a_kill
+from tests.methods.trainings import does_not_see_what_masks_hide, goes_on_after_a_kill
 
 MOTION = small_motion(pool=3, uses=4)
 OPTIONS = small_joint(patch=4, batch=2, motion=MOTION)
@@ -37,6 +37,10 @@ def new_training(
     generator = torch.Generator().manual_seed(1)
     patches = Patches(pipeline, scene, Split([], [], []), options, generator)
     return JointTraining(renderer, patches, steps, trained if patches.learning else None)
+
+
+def test_masked_pixels_are_not_learnt_from(ball_scene):
+    does_not_see_what_masks_hide(new_training, ball_scene)
 
 
 def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(ball_scene, monkeypatch):

@@ -63,6 +63,7 @@ def test_a_training_is_found_again(name: str, ball_scene: Scene, shared_log: Log
     again = fitted(name, ball_scene, shared_log)
     other = fitted(name, ball_scene, shared_log, stop=0.5)  # is chosen after a training
     assert first.train_s == again.train_s == other.train_s > 0
+    assert first.train_peak_bytes == again.train_peak_bytes > 0
     camera = ball_scene.splits["test"].cameras[0]
     pictures = [method.render(camera, NullProbe()).rgb for method in (first, again)]
     assert torch.equal(*pictures)
