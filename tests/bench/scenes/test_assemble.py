@@ -1,14 +1,17 @@
 """Boxes that never cut what is seen and fill the unit cube; pictures that are held out."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch import Tensor
 
+from bench.cameras import look_at
 from bench.scenes import assemble
-from bench.scenes.assemble import Box, cube, hold_out, hull_box
+from bench.scenes.assemble import Box, box_of_cameras, cube, hold_out, hull_box
 from bench.scenes.embedded import picture, pose_on_sphere, train_poses
 from bench.scenes.embedded.raytrace import Part, Solids
 from bench.scenes.embedded.solids import Ellipsoid
@@ -122,3 +125,23 @@ def test_no_hull_without_a_mask(alpha):
     image = torch.full((SIZE, SIZE, 4), alpha, dtype=torch.uint8)
     assert hull_box(cameras, [image] * 40, cube(1.2)) is None
     assert hull_box(cameras, [image[..., :3]] * 40, cube(1.2)) is None
+
+
+def looking(*poses: tuple[Tensor, Tensor]) -> list[Camera]:
+    """Cameras at the first of each pair, that look at the second."""
+    up = torch.tensor([0.0, 0.0, 1.0])
+    return [Camera(look_at(eye, at, up), 9.0, 9.0, 4.0, 4.0, 8, 8) for eye, at in poses]
+
+
+def test_the_box_of_cameras_is_around_what_they_look_at_with_all_of_them_inside():
+    middle = torch.tensor([10.0, -20.0, 5.0])
+    away = [torch.tensor([math.cos(a), math.sin(a), 0.2]) * 3 for a in range(6)]
+    box = box_of_cameras(looking(*((middle + x, middle) for x in away)))
+    torch.testing.assert_close((box.lower + box.upper) / 2, middle.double(), rtol=0, atol=0.02)
+    assert box.side == pytest.approx(6, rel=0.02)  # the farthest is at (3, 0, 0.6)
+    # Parallel axes meet nowhere: the cameras themselves are what is known.
+    row = [torch.tensor([float(x), 0.0, 0.0]) for x in range(-2, 3)]
+    box = box_of_cameras(looking(*((eye, eye + torch.tensor([0.0, 1.0, 0.0])) for eye in row)))
+    torch.testing.assert_close(box.lower, torch.full((3,), -2.0).double())
+    torch.testing.assert_close(box.upper, torch.full((3,), 2.0).double())
+    assert box_of_cameras(looking((row[0], row[1]))).side == 2  # of one: something

@@ -138,6 +138,27 @@ def test_the_cube_is_that_of_instant_ngp(folder, log, given, override, side, y):
     torch.testing.assert_close(scene.splits["test"].cameras[0].c2w[:, 3], expected)
 
 
+def test_in_all_of_space_the_box_is_the_middle_half_of_the_cube(folder, log):
+    boxed = transforms.load(folder, aabb_scale=1, space="box", log=log)
+    endless = transforms.load(folder, aabb_scale=1, log=log)
+    assert endless.bounds.tolist() == [[0.25] * 3, [0.75] * 3]
+    assert endless.cells.tolist() == [[0.0] * 3, [1.0] * 3]
+    assert endless.unit_length == 2 * boxed.unit_length
+    assert endless.digest != boxed.digest
+    first, second = (scene.splits["train"].cameras[0].c2w[:, 3] for scene in (boxed, endless))
+    torch.testing.assert_close((first - 0.5) / 2, second - 0.5)
+    # Without a box that is asked for, that of the cameras: 4 units away, they look at the origin.
+    assert transforms.load(folder, log=log).unit_length == pytest.approx(2 * 8, rel=1e-3)
+
+
+def test_a_background_is_what_pictures_without_transparency_have(folder, log):
+    assert transforms.load(folder, log=log).space == "all"
+    Image.fromarray(picture(1)).save(folder / "images" / "001.png")
+    assert transforms.load(folder, log=log).space == "box"
+    with pytest.raises(SteerbenchError, match=r"scene.space: expected auto or box or all, got 'no'"):
+        transforms.load(folder, space="no", log=log)
+
+
 def every(**settings: object) -> Callable[[dict], object]:
     return lambda record: record.update(settings)
 

@@ -228,6 +228,14 @@ def test_a_random_background_is_one_colour_for_a_ray_and_its_truth(ball_scene):
     assert torch.equal(target, clear[:, :3])
 
 
+def test_where_space_has_no_end_opaque_pictures_hide_a_random_background(ball_scene):
+    training = new_training(replace(ball_scene, space="all"))
+    colours = torch.rand(9, 3)
+    target, background = training._target(colours)
+    assert torch.equal(target, colours)
+    assert len(set(map(tuple, background.tolist()))) == 9
+
+
 STRESS = [case for case in cases() if case.subject == "training"]
 
 

@@ -139,3 +139,23 @@ def test_the_entropy_of_opacities_is_smallest_where_rays_are_opaque_or_empty():
     opacity = torch.tensor([0.2, 0.6], requires_grad=True)  # on both sides of the largest, 1 / e
     opacity_entropy(opacity).backward()
     assert opacity.grad[0] > 0 > opacity.grad[1]
+
+
+def test_where_space_has_no_end_gradients_grow_with_the_squared_distance(cloud, device):
+    field, occupancy = cloud
+    occupancy, rays = Occupancy(occupancy.cells, contracted=True), rays_on(device)
+    rays = Rays(0.5 + 0.2 * (rays.origins - 0.5), rays.directions)  # the nearest samples are near
+    samples = march(rays, occupancy, STEP)
+    away = samples.t * rays.directions.norm(dim=1)[samples.ray]
+    share = (away / 0.25).square().clamp(max=1)
+    assert share.min() < 0.3
+    assert share.max() == 1
+    sigma, geometry = field.density(samples.positions)
+    values = field.features(geometry, field.encode_directions(rays.directions)[samples.ray])
+    sigma.register_hook(lambda gradient: gradient * share)
+    values.register_hook(lambda gradient: gradient * share[:, None])
+    want = learned(composite(sigma, values, samples), field)
+    pixels, _ = render_batch(field, rays, occupancy, Sampling())
+    for some, other in zip(learned(pixels, field), want, strict=True):
+        atol = 1e-4 * other.abs().max().item()
+        torch.testing.assert_close(some, other, rtol=1e-3, atol=atol)
