@@ -155,7 +155,9 @@ def test_a_background_is_what_pictures_without_transparency_have(folder, log):
     assert transforms.load(folder, log=log).space == "all"
     Image.fromarray(picture(1)).save(folder / "images" / "001.png")
     assert transforms.load(folder, log=log).space == "box"
-    with pytest.raises(SteerbenchError, match=r"scene.space: expected auto or box or all, got 'no'"):
+    with pytest.raises(
+        SteerbenchError, match=r"scene.space: expected auto or box or all, got 'no'"
+    ):
         transforms.load(folder, space="no", log=log)
 
 
@@ -177,7 +179,7 @@ FAR = [[1, 0, 0, 1e308], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         (first(fl_y="9"), r"transforms\.json: frames\[0\].fl_y: .* got '9'"),
         (lambda r: r.pop("fl_x"), r"frames\[0\].fl_x: expected a focal length, or camera_angle_x"),
         (first(mask_path=5), r"frames\[0\].mask_path: expected a path, got 5"),
-        (first(mask_path="m.png"), r"m\.png: expected a readable picture"),
+        (first(mask_path="m.png"), r"mask_path: expected a picture, got no .m\.png. in"),
         (first(cx=9), r"frames\[0\].cx: .* below 8, got 9"),
         (first(w=0), r"frames\[0\].w: expected a whole number from 1 on"),
         (first(k1=None), r"frames\[0\].k1: expected a finite number, got nothing"),
