@@ -94,10 +94,11 @@ def _colmap(scene: Scene, folder: Path, log: Log) -> None:
             camera = data_camera(scene, seen)
             lens = camera.fx, camera.fy, camera.cx, camera.cy
             cameras.append(_line(number, "PINHOLE", camera.width, camera.height, *lens))
-            rotation, centre = camera.c2w[:, :3].T, camera.c2w[:, 3]
-            turn = Rotation.from_matrix(rotation.numpy()).as_quat(scalar_first=True).tolist()
-            shift = (-rotation @ centre).tolist()  # world to camera
-            images.append(_line(number, *turn, *shift, number, f"{number:04}.png") + "\n")
+            pose = camera.c2w.numpy()
+            turn = Rotation.from_matrix(pose[:, :3].T)  # world to camera, exactly a rotation
+            shift = turn.apply(-pose[:, 3])
+            turned = turn.as_quat(scalar_first=True)
+            images.append(_line(number, *turned, *shift, number, f"{number:04}.png") + "\n")
         (model / "cameras.txt").write_text("".join(cameras))
         (model / "images.txt").write_text("".join(images))
         lines = (_line(n, *point, 128, 128, 128, 0) for n, point in enumerate(points, 1))

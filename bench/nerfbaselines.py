@@ -77,7 +77,7 @@ def write_results(
             camera = frame.camera
             np.savez(
                 file,
-                poses=camera.c2w.numpy().astype(np.float32),
+                poses=camera.c2w.numpy(),  # float64: they may lie far from the origin
                 intrinsics=np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32),
                 camera_models=np.array(PINHOLE, np.int32),
                 distortion_parameters=np.zeros(0, np.float32),

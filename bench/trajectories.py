@@ -28,9 +28,10 @@ from bench.motion import (
     shift_of,
     viewing_target,
 )
-from bench.paths import read_path
+from bench.paths import MODEL, read_path
 from bench.provenance import sha256
 from bench.scenes.files import whole_number
+from bench.scenes.remarks import Remarks
 from bench.types import Camera, Scene, SteerbenchError
 
 MIXED = "mixed"  # the resolution of a trajectory whose frames differ in size
@@ -56,6 +57,7 @@ class Trajectory:
     split: str  # the split of the scene that `Step.truth` indexes
     steps: tuple[Step, ...]  # at least one
     reads: tuple[Path, ...] = ()  # the files that the trajectory was read from
+    notes: tuple[str, ...] = ()  # what a user should know of how they were read
 
     @property
     def resolution(self) -> str:
@@ -221,17 +223,22 @@ def _check(holds: bool, option: str, expected: str, got: object) -> None:
         raise unexpected(f"trajectory.{option}", expected, got)
 
 
-def follow(scene: Scene, path: str, limit: int = 0) -> Trajectory:
+def follow(scene: Scene, path: str, limit: int = 0, transforms: str | None = None) -> Trajectory:
     """The first `limit` cameras of a file (0: all), in order and without ground truth.
 
-    Raises SteerbenchError as `read_path` does.
+    `transforms` says how a model of nerfstudio moved the data set, by default the file of that name
+    beside the path. Raises SteerbenchError as `read_path` does.
     """
     file = Path(path).expanduser().resolve()
-    cameras = read_path(file, scene)
+    model = Path(transforms).expanduser().resolve() if transforms else None
+    reads = [f for f in (file, model or file.with_name(MODEL)) if f.is_file()]
+    remarks, notes = Remarks(), list[str]()
+    cameras = read_path(file, scene, remarks, model)
+    remarks.tell(notes.append)
     whole_number(limit, "trajectory.limit", 0)
     steps = tuple(Step(camera, truth=None) for camera in cameras[: limit or None])
     name = f"{file.stem}-{sha256(file)[:6]}"  # many files are called path.json
-    return Trajectory(name, "test", steps, reads=(file,))
+    return Trajectory(name, "test", steps, tuple(reads), tuple(notes))
 
 
 def spline(
@@ -253,7 +260,7 @@ def spline(
     for key, piece in zip(others, pieces, strict=True):
         steps += [*(Step(camera, truth=None) for camera in piece[:-1]), replace(key, cut=False)]
     name = f"{through.name}-spline{degrees:g}deg"
-    return Trajectory(name, through.split, tuple(steps), through.reads)
+    return Trajectory(name, through.split, tuple(steps), through.reads, through.notes)
 
 
 def leading(keys: Sequence[Camera], target: Tensor, degrees: float) -> list[list[Camera]]:

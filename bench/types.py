@@ -123,7 +123,9 @@ class Scene:
     "box" if there is nothing outside the unit cube, or "all": what is seen goes on to infinity, and
     the middle half of the cube is the part that deserves most detail. `exact`
     renders the true picture of any camera as in a split, `surface` its z-depth [H, W] at the centres
-    of pixels, +inf where empty; None if the scene cannot, or has no opaque surface.
+    of pixels, +inf where empty; None if the scene cannot, or has no opaque surface. `maps` are
+    similarities [4, 4] float64 from the coordinates that another program, of that name, shows to
+    those of the data set.
     """
 
     name: str  # as shown in result rows
@@ -132,10 +134,11 @@ class Scene:
     bounds: Tensor  # [2, 3] lower and upper corner of the content, inside the unit cube
     unit_length: float  # of one scene unit, in the data set's own unit
     digest: str  # content hash of cameras, pictures and normalisation
-    origin: Tensor = field(default_factory=lambda: torch.zeros(3))
+    origin: Tensor = field(default_factory=lambda: torch.zeros(3).double())  # float64
     space: str = "box"
     exact: Callable[[Camera], Tensor] | None = None
     surface: Callable[[Camera], Tensor] | None = None
+    maps: Mapping[str, Tensor] = field(default_factory=dict)
 
     @property
     def cells(self) -> Tensor:

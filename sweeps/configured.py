@@ -24,6 +24,7 @@ from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable, unexpected, unknown
 from bench.protocol import EvaluationProtocol
 from bench.scenes.assemble import hold_out
+from bench.trajectories import Trajectory
 from bench.types import DEVICE, Log, Method, Scene
 from reports.trackers import tracker
 from sweeps.overrides import CONFIGS, VALIDATION, target_of
@@ -132,6 +133,14 @@ def scene_of(config: DictConfig) -> Scene:
     training split, so that a model is never scored on pictures that it was trained on.
     """
     return _scene(*_contents(config))
+
+
+def trajectory_of(config: DictConfig, scene: Scene, log: Log) -> Trajectory:
+    """The trajectory that `config` describes; says what a user should know of its file."""
+    trajectory = build(config, "trajectory", scene)
+    for note in trajectory.notes:
+        log.info(note)
+    return trajectory
 
 
 def scene_digest(config: DictConfig) -> str:

@@ -31,6 +31,7 @@ from sweeps.configured import (
     scene_folder,
     scene_of,
     training_threads,
+    trajectory_of,
     use_threads,
 )
 from sweeps.experiments import axes
@@ -230,7 +231,7 @@ def _prepared(job: Job, log: Log) -> _Ready:
     method, budget = (build(config, name) for name in ("method", "budget"))
     protocol = protocol_of(config)
     scene = scene_of(config)
-    trajectory = build(config, "trajectory", scene)
+    trajectory = trajectory_of(config, scene, log)
     if settings.frame_size:
         trajectory = resized(trajectory, *settings.frame_size)
     weights = Path(settings.weights_dir) if settings.weights_dir else None

@@ -20,6 +20,7 @@ from bench.errors import unexpected
 from bench.scenes.files import whole_number
 from bench.scenes.images import Pictures, View, describe
 from bench.scenes.masks import Masks
+from bench.scenes.remarks import Remarks
 from bench.threads import in_parallel, torch_threads
 from bench.types import BACKGROUNDS, Camera, Log, Scene, Split
 
@@ -47,7 +48,9 @@ def describe_splits(
     for turned, how in ((True, "turned"), (False, "not turned, as their cameras are")):
         if names := [of.view.name for of in described if of.turned is turned]:
             log.info(f"EXIF orientation: {len(names)} pictures are {how}, {names[0]} is the first")
-    rest = iter(described)
+    remarks, rest = Remarks(), iter(described)
+    remarks.add_doubts(described)
+    remarks.tell(log.info)
     return {name: Pictures([next(rest) for _ in split], log) for name, split in views.items()}
 
 
@@ -96,7 +99,7 @@ def assemble(
         bounds=outer.place_of(box),
         unit_length=outer.side,
         digest=digest.hexdigest(),
-        origin=outer.origin.float(),
+        origin=outer.origin,
         space=space,
     )
 

@@ -1,15 +1,16 @@
 """Loads NeRF-Synthetic: `transforms_{train,val,test}.json` beside RGBA pictures."""
 
-import os
+from collections import ChainMap
 from pathlib import Path
 
 from bench.errors import unexpected
 from bench.scenes.assemble import Box, assemble, cube, describe_splits, hull_box, parse_box
-from bench.scenes.files import data_folder, focal_length, frames_of, opengl_pose, read_json
+from bench.scenes.files import data_folder, frames_of, read_json
 from bench.scenes.images import Pictures, View, image_size
 from bench.scenes.lookup import absent, find_all, report
-from bench.scenes.masks import frame_mask
-from bench.types import Camera, Log, Scene
+from bench.scenes.remarks import Remarks
+from bench.scenes.transforms import KNOWN, read_view
+from bench.types import Log, Scene
 
 HALF_EXTENT = 1.5  # the objects of NeRF-Synthetic lie in [-1.5, 1.5]^3
 
@@ -40,10 +41,6 @@ def load(
     return assemble(name or root.name, pictures, box, background=background, camera_files=files)
 
 
-LENS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
-"""What other programs write of a lens; here `camera_angle_x` describes it."""
-
-
 def camera_file(split: str) -> str:
     return f"transforms_{split}.json"
 
@@ -66,17 +63,12 @@ def read_split(root: Path, split: str, log: Log) -> list[View]:
         first = found.index(None)
         raise unexpected(f"{frames[first][0]}.file_path", "a picture", absent(root, names[first]))
     report(root, names, found, path.name, log)
-    frame = frames[0][1] if frames else {}
-    if unread := [name for name in LENS if name in record or name in frame]:
-        log.info(f"{path.name}: {', '.join(unread)} are not read; scene=transforms reads them")
-    width, height = image_size(files[0])
-    focal = focal_length(record.get("camera_angle_x"), width, f"{path}: camera_angle_x")
-    views = []
+    size, remarks, views = image_size(files[0]), Remarks(), []
+    remarks.add_unread(path, [record, *(frame for _, frame in frames)], KNOWN)
     for (at, frame), file in zip(frames, files, strict=True):
-        pose = opengl_pose(frame, at)
-        camera = Camera(pose, focal, focal, width / 2, height / 2, width, height)
-        mask = frame_mask(root, frame, file, at)
-        views.append(View(os.path.relpath(file, root), file, camera, None, *mask))
+        settings = ChainMap(frame, record, dict(zip("wh", size, strict=True)))
+        views.append(read_view(root, file, settings, at, remarks))
+    remarks.tell(log.info)
     return views
 
 

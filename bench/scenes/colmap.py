@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bench.cameras import scale_camera
 from bench.errors import Unavailable, install_command, unexpected
 from bench.scenes.assemble import (
     Box,
@@ -24,9 +23,10 @@ from bench.scenes.assemble import (
     space_of,
 )
 from bench.scenes.files import data_folder, number, rigid_pose
-from bench.scenes.images import Lens, View, image_size
+from bench.scenes.images import Lens, View, fitted_camera
 from bench.scenes.lookup import absent, bare, find_all, in_any_case, report, tidy
 from bench.scenes.masks import with_masks
+from bench.scenes.remarks import Remarks
 from bench.scenes.sparse import Entry, read_cameras, read_images, read_points
 from bench.scenes.splits import Listed, divide, read_lists
 from bench.types import Camera, Log, Scene
@@ -34,7 +34,6 @@ from bench.types import Camera, Log, Scene
 MODELS = ("sparse/0", "colmap/sparse/0", "sparse", ".")  # where a model may be, in this order
 
 STRAY = 0.01  # share of the points, at either end of an axis, that the box may exclude
-ASPECT = 0.01  # largest relative difference of the aspect ratios of a picture and its camera
 
 
 def load(
@@ -170,16 +169,12 @@ def read_camera(
         raise unexpected(where, "a camera model with a focal length", of_image.model_name)
     qw, qx, qy, qz, *shift = (number(float(word), where) for word in pose)
     from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array((qx, qy, qz, qw))), np.array(shift))
-    c2w = rigid_pose(from_world.inverse().matrix().tolist(), where)
+    c2w = rigid_pose(from_world.inverse().matrix().tolist(), where, Remarks())
     (fx, _, cx), (_, fy, cy), _ = of_image.calibration_matrix().tolist()
     camera = Camera(c2w, fx, fy, cx, cy, of_image.width, of_image.height)
-    width, height = image_size(file, (camera.width, camera.height))
-    if abs((width / camera.width) / (height / camera.height) - 1) > ASPECT:
-        expected = f"{camera.width} x {camera.height} pixels, or as wide for its height"
-        raise unexpected(file, f"a picture of {expected}", f"{width} x {height}")
     pinhole = of_image.is_perspective_pinhole() and of_image.is_undistorted()
     lens = None if pinhole else ColmapLens(of_image.model_name, tuple(of_image.params))
-    return scale_camera(camera, width, height), lens
+    return fitted_camera(camera, file), lens
 
 
 def camera_of(cameras: Mapping[str, Entry], camera_id: str, image: str) -> Any:

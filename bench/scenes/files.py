@@ -15,9 +15,11 @@ from torch import Tensor
 
 from bench.errors import unexpected
 from bench.scenes.lookup import absent
+from bench.scenes.remarks import Remarks
 
 SMALLEST_ANGLE = 1e-9  # of view in radians: below any telescope's, but its tangent is not 0
 ORTHONORMAL_TOLERANCE = 1e-3  # largest entry of R^T R - I; poses have at least three digits
+ROUNDED_TOLERANCE = 0.02  # the same of rotations with two digits, put right if a line says so
 
 
 def data_folder(path: str | Path) -> Path:
@@ -38,7 +40,8 @@ def read_text(root: Path, relative: str) -> str:
         raise unexpected(path, "a readable text file", error) from error
 
 
-def read_json(root: Path, relative: str) -> dict:
+def read_json(root: Path, relative: str, listed: str = "") -> dict:
+    """The object in a file; a list is one whose field `listed` it is, where that is given."""
     path = root / relative
     try:
         value = json.loads(read_text(root, relative))
@@ -47,6 +50,8 @@ def read_json(root: Path, relative: str) -> dict:
         raise unexpected(at, "JSON", error.msg) from error
     except (RecursionError, ValueError) as error:
         raise unexpected(path, "JSON", error) from error
+    if listed and isinstance(value, list):
+        return {listed: value}
     if not isinstance(value, dict):
         raise unexpected(path, "a JSON object", type(value).__name__)
     return value
@@ -92,7 +97,7 @@ def focal_length(angle: object, size: float, where: str) -> float:
 def whole_number(value: Any, where: str, low: int) -> int:
     """A whole number, at least `low`; 3.0 is one, too."""
     real = isinstance(value, int | float) and not isinstance(value, bool)
-    if real and low <= value < math.inf and value == int(value):
+    if real and low <= value <= sys.maxsize and value == int(value):
         return int(value)
     raise unexpected(where, f"a whole number from {low} on", describe(value))
 
@@ -106,27 +111,51 @@ def numbers(text: str, where: str | Path) -> list[list[float]]:
         raise unexpected(where, "numbers", error) from error
 
 
-def rigid_pose(value: object, where: str) -> Tensor:
-    """A rigid, right-handed camera-to-world matrix [3, 4] float64 from nested lists, 4x4 or 3x4."""
+def matrix(value: object, where: str) -> Tensor:
+    """A matrix [3, 4] float64 from a list of 4x4 or 3x4 numbers, nested or not."""
     rows = value if isinstance(value, list) else []
+    if len(rows) in (12, 16):
+        rows = [rows[start : start + 4] for start in range(0, len(rows), 4)]
     if len(rows) not in (3, 4) or any(not isinstance(r, list) or len(r) != 4 for r in rows):
         raise unexpected(where, "a 4x4 matrix", describe(value))
     cells = [[number(x, f"{where}[{i}][{j}]") for j, x in enumerate(r)] for i, r in enumerate(rows)]
     if len(cells) == 4 and cells[3] != [0, 0, 0, 1]:
         raise unexpected(f"{where}[3]", "[0, 0, 0, 1]", cells[3])
-    matrix = torch.tensor(cells[:3], dtype=torch.float64)
-    rotation = matrix[:, :3]
-    error = (rotation.T @ rotation - torch.eye(3, dtype=torch.float64)).abs().max().item()
-    if error > ORTHONORMAL_TOLERANCE:
+    return torch.tensor(cells[:3], dtype=torch.float64)
+
+
+def rigid_pose(value: object, where: str, remarks: Remarks) -> Tensor:
+    """A `matrix` that is a rigid, right-handed camera-to-world pose.
+
+    A uniform scale of its rotation is left out, as by readers that normalise rays; of a rotation
+    with two digits, the nearest is taken.
+    """
+    pose = matrix(value, where)
+    rotation = pose[:, :3]
+    error, scale = _off(rotation), rotation.norm().item() / math.sqrt(3)
+    rest = min(error, _off(rotation / scale))
+    if not rest <= ROUNDED_TOLERANCE:  # nor NaN
         raise unexpected(where, "an orthonormal rotation", f"one that is off by {error:.2g}")
     if torch.linalg.det(rotation) < 0:
         raise unexpected(where, "a right-handed rotation", "a mirrored one")
-    return matrix
+    if error <= ORTHONORMAL_TOLERANCE:
+        return pose
+    if rest > ORTHONORMAL_TOLERANCE:
+        remarks.add(where, "rounded rotation, taking the nearest; it is off by", f"{rest:.2g}")
+    if rest <= ORTHONORMAL_TOLERANCE or abs(scale - 1) > ROUNDED_TOLERANCE:
+        remarks.add(where, "scaled rotation, leaving out its scale", f"{scale:.4g}")
+    left, _, right = torch.linalg.svd(rotation / scale)
+    return torch.cat((left @ right, pose[:, 3:]), dim=1)
 
 
-def opengl_pose(frame: Mapping, where: str) -> Tensor:
-    """The pose in a frame of a `transforms*.json`, as from `rigid_pose` but with OpenCV axes."""
-    return opengl_to_opencv(rigid_pose(frame.get("transform_matrix"), f"{where}.transform_matrix"))
+def _off(rotation: Tensor) -> float:
+    """By how much a matrix [3, 3] is not orthonormal."""
+    return (rotation.T @ rotation - torch.eye(3, dtype=torch.float64)).abs().max().item()
+
+
+def opengl_pose(frame: Mapping, name: str, where: str, remarks: Remarks) -> Tensor:
+    """The pose in the field `name` of a frame, as from `rigid_pose` but with OpenCV axes."""
+    return opengl_to_opencv(rigid_pose(frame.get(name), f"{where}.{name}", remarks))
 
 
 def opengl_to_opencv(pose: Tensor) -> Tensor:

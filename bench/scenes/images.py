@@ -30,6 +30,8 @@ from bench.types import Camera, Log
 
 Lens = Callable[[Tensor], Tensor]
 
+ASPECT = 100  # the aspect ratios of a picture and its camera differ by at most one part in so many
+
 MOST_PIXELS = 1 << 26
 """Upper limit for a picture: decoding takes 12 bytes per pixel, and a header of a few bytes can
 announce more than any machine can hold."""
@@ -58,6 +60,7 @@ class ScaledView:
     sha256: str
     mask: "ScaledView | None" = None  # in full size, with the lens
     turned: bool | None = None  # whether its EXIF orientation is obeyed; None: it is upright
+    seen: tuple[int, int] | None = None  # the size of what of it is left without its lens
 
 
 class Pictures(Sequence[Tensor]):
@@ -126,6 +129,15 @@ def image_size(path: Path, like: tuple[int, int] | None = None) -> tuple[int, in
         return min(image.size, shown, key=lambda x: abs(x[0] / x[1] - shape)) if like else shown
 
 
+def fitted_camera(camera: Camera, path: Path) -> Camera:
+    """The same view at the size of the picture in `path`, which may be a reduced one."""
+    width, height = image_size(path, (camera.width, camera.height))
+    if ASPECT * abs(width * camera.height - height * camera.width) > height * camera.width:
+        expected = f"{camera.width} x {camera.height} pixels, or as wide for its height"
+        raise unexpected(path, f"a picture of {expected}", f"{width} x {height}")
+    return scale_camera(camera, width, height)
+
+
 def describe(view: View, downscale: int) -> ScaledView:
     """Describe a view as a `ScaledView`; raises if it is none, of another size, or too small."""
     content, camera = contents(view.path), view.camera
@@ -136,11 +148,16 @@ def describe(view: View, downscale: int) -> ScaledView:
         if size != (camera.width, camera.height):
             expected = f"{camera.width} x {camera.height} pixels"
             raise unexpected(view.path, expected, "{} x {}".format(*size))
+    seen = None
     if view.lens:
         camera = undistorted_camera(camera, view.lens, view.path)
+        source, _, _ = _window(view.camera, view.lens)
+        width, height = (source.amax((0, 1)) - source.amin((0, 1))).round().long().tolist()
+        seen = width + 1, height + 1
     camera = shrunk_camera(camera, downscale, view.path)
     mask = describe(View(view.name, view.mask, view.camera), 1) if view.mask else None
-    return ScaledView(view, downscale, camera, hashlib.sha256(content).hexdigest(), mask, turned)
+    sha256 = hashlib.sha256(content).hexdigest()
+    return ScaledView(view, downscale, camera, sha256, mask, turned, seen)
 
 
 def obeyed(image: Image.Image, view: View) -> bool | None:

@@ -2,15 +2,17 @@
 
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from bench.errors import unexpected
 from bench.scenes.assemble import MARGIN, Box, assemble, describe_splits
-from bench.scenes.files import data_folder, number, numbers, read_text, rigid_pose
-from bench.scenes.images import View, image_size
+from bench.scenes.files import data_folder, number, numbers, read_text, rigid_pose, whole_number
+from bench.scenes.images import View, fitted_camera, image_size
 from bench.scenes.lookup import absent, in_any_case
+from bench.scenes.remarks import Remarks
 from bench.types import Camera, Log, Scene
 
 SPLITS = {"0": "train", "1": "val", "2": "test"}  # by the first character of a picture's name
@@ -32,15 +34,15 @@ def load(path: str | Path, *, downscale: int = 1, background: str = "white", log
     root = data_folder(path)
     box = read_box(root)
     files = picture_files(root)
-    inner = (*read_intrinsics(root), *image_size(files[0]))
+    remarks, of_all = Remarks(), read_intrinsics(root, files[0])
     views: dict[str, list[View]] = {}
     camera_files = [root / "bbox.txt", root / "intrinsics.txt"]
     for file in files:
         where = root / "pose" / f"{file.stem}.txt"
         where = in_any_case(where) or where
         camera_files.append(where)
-        rows = numbers(read_text(where.parent, where.name), where)
-        camera = Camera(rigid_pose(rows, str(where)), *inner)
+        rows, _ = read_matrix(where.parent, where.name)
+        camera = replace(of_all, c2w=rigid_pose(rows, str(where), remarks))
         view = View(f"rgb/{file.name}", file, camera)
         views.setdefault(SPLITS[file.name[0]], []).append(view)
     if "test" not in views and "val" in views:
@@ -49,6 +51,7 @@ def load(path: str | Path, *, downscale: int = 1, background: str = "white", log
     for split, names in (("train", "0_*"), ("test", "2_* or 1_*")):
         if split not in views:
             raise unexpected(root / "rgb", f"pictures {names}", "none")
+    remarks.tell(log.info)
     pictures = describe_splits(views, downscale, log)
     return assemble(root.name, pictures, box, background=background, camera_files=camera_files)
 
@@ -67,20 +70,39 @@ def read_box(root: Path) -> Box:
     return Box(lower, upper).grown((1 + MARGIN) * FURTHER.get(root.name, 1) - 1)
 
 
-def read_intrinsics(root: Path) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy from a 4x4 or 3x3 matrix, or a first line "f cx cy 0" above other data."""
+def read_intrinsics(root: Path, picture: Path) -> Camera:
+    """The camera of `intrinsics.txt`, without a pose, at the size of a picture.
+
+    In the file: a matrix of 3x3, 3x4 or 4x4; or a line "f cx cy 0", "f cx cy" or "fx fy cx cy",
+    above data that are not used. If it has a height and width, that is the size that it holds for.
+    """
     path = root / "intrinsics.txt"
-    rows = numbers(read_text(root, path.name), path)
-    if [len(row) for row in rows] in ([4] * 4, [3] * 3):
-        (fx, _, cx, *_), (_, fy, cy, *_) = rows[:2]
-    elif rows and len(rows[0]) == 4:
-        fx, cx, cy, _ = rows[0]
-        fy = fx
+    rows, size = read_matrix(root, path.name)
+    first, *others = rows or [[]]
+    if [len(row) for row in rows] in ([3] * 3, [4] * 3, [4] * 4):
+        (fx, skew, cx, *_), (low, fy, cy, *_), last, *_ = rows
+        if [skew, low, *last[:3]] != [0, 0, 0, 0, 1]:
+            raise unexpected(path, "rows fx 0 cx, 0 fy cy and 0 0 1", rows)
+    elif len(first) in (3, 4) and all(len(row) <= 3 for row in others):
+        fx, fy, cx, cy = first if any(first[3:]) else (first[0], *first[:3])
     else:
-        got = f"lines of {[len(row) for row in rows]} numbers"
-        raise unexpected(path, 'a 4x4 or 3x3 matrix or a first line "f cx cy 0"', got)
+        forms = 'a 4x4, 3x4 or 3x3 matrix, or a first line "f cx cy 0" or "fx fy cx cy"'
+        raise unexpected(path, forms, f"lines of {[len(row) for row in rows]} numbers")
     fx, fy = number(fx, f"{path}: fx", 0), number(fy, f"{path}: fy", 0)
-    return fx, fy, number(cx, f"{path}: cx"), number(cy, f"{path}: cy")
+    cx, cy = number(cx, f"{path}: cx"), number(cy, f"{path}: cy")
+    height, width = (whole_number(x, f"{path}: size", 1) for x in size or image_size(picture)[::-1])
+    return fitted_camera(Camera(torch.empty(0), fx, fy, cx, cy, width, height), picture)
+
+
+def read_matrix(root: Path, relative: str) -> tuple[list[list[float]], list[float]]:
+    """The rows of numbers in a file, a matrix in one line as 3 or 4 of them; and, which NSVF skips,
+    a line of two numbers."""
+    rows = numbers(read_text(root, relative), root / relative)
+    sizes = [row for row in rows if len(row) == 2]
+    rows = [row for row in rows if len(row) != 2]
+    if len(rows) == 1 and (count := {9: 3, 12: 4, 16: 4}.get(len(rows[0]))):
+        rows = [rows[0][start : start + count] for start in range(0, len(rows[0]), count)]
+    return rows, sizes[-1] if sizes else []
 
 
 def picture_files(root: Path) -> list[Path]:

@@ -34,15 +34,22 @@ PACKED = (".spz", ".splat", ".ksplat", ".sog", ".lcc")
 MODE = re.compile(r"SplatRenderMode:?\s*(\w+)|\bantialiased\s+([01])", re.IGNORECASE)
 """How a comment of Brush or Postshot says for which renderer the file was trained."""
 
+FAR = 1000  # units of a scene from the origin, float32 leaves 14 bits for a unit
+
 ODD = torch.tensor([(m % 2) == 1 for degree in range(4) for m in range(-degree, degree + 1)])
 """Which harmonics, in our order, have an odd m."""
 
 
 def write(gaussians: Gaussians, scene: Scene, path: Path) -> None:
-    """Write all Gaussians, in the coordinates of the data set of `scene`."""
+    """Write all Gaussians, in the coordinates of the data set of `scene`.
+
+    Positions are doubles where the data set is so far from its origin that float32 would move them.
+    """
     view = _flipped(gaussians.view.detach()).transpose(1, 2).flatten(1)
+    far = scene.origin.abs().max() > FAR * scene.unit_length
+    origin = scene.origin.to(view.device, torch.float64 if far else view.dtype)
     columns: dict[tuple[str, ...], Tensor] = {
-        POSITION: scene.origin.to(view) + scene.unit_length * gaussians.means.detach(),
+        POSITION: origin + scene.unit_length * gaussians.means.detach().to(origin),
         NORMAL: torch.zeros_like(gaussians.means),
         BASE: gaussians.base.detach()[:, 0],
         tuple(f"f_rest_{i}" for i in range(view.shape[1])): view,
@@ -50,9 +57,11 @@ def write(gaussians: Gaussians, scene: Scene, path: Path) -> None:
         SCALE: gaussians.log_scales.detach() + math.log(scene.unit_length),
         ROTATION: gaussians.rotations.detach(),
     }
-    names = [name for group in columns for name in group]
-    table = torch.cat(list(columns.values()), dim=1).cpu().contiguous().numpy()
-    rows = table.view([(name, "f4") for name in names])[:, 0]
+    tables = {group: x.cpu().numpy() for group, x in columns.items()}
+    rows = np.empty(len(view), [(n, x.dtype) for group, x in tables.items() for n in group])
+    for group, x in tables.items():
+        for name, column in zip(group, x.T, strict=True):
+            rows[name] = column
     with whole(path) as new:
         PlyData([PlyElement.describe(rows, "vertex")]).write(new)
 

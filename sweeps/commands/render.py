@@ -23,7 +23,7 @@ from bench.results import existing_store
 from bench.scoring import check_frame
 from bench.trajectories import MIXED
 from bench.types import BACKGROUNDS, Camera, Method, NullProbe, Scene
-from sweeps.configured import build, scene_of, trained
+from sweeps.configured import build, scene_of, trained, trajectory_of
 from sweeps.overrides import beside, composed, setting
 
 QUALITY = "18"  # H.264's constant rate factor: the video hardly differs from the original
@@ -33,14 +33,15 @@ def main(options: argparse.Namespace) -> int:
     """Render; write `0000.png` and so on, the path and the video; print where they are."""
     words = [*words_of_run(options.run, options.overrides), *options.overrides]
     if options.path:
-        words = [word for word in words if not re.match(r"[+~]*(trajectory\b|split=)", word)]
+        replaced = re.compile(r"[+~]*(trajectory(?!\.transforms=)\b|split=)")
+        words = [word for word in words if not replaced.match(word)]
         place = setting("trajectory.path", str(options.path.resolve()))
         words = [*words, "trajectory=path", place]
     config = composed(words)
     others = [composed(beside(name, words)) for name in options.beside]
     log = ConsoleLog(Path(config.outputs))
     scene = seen(options.path, words, [config, *others]) or scene_of(config)
-    trajectory = build(config, "trajectory", scene)
+    trajectory = trajectory_of(config, scene, log)
     if options.video:
         if trajectory.resolution == MIXED:
             raise SteerbenchError("--video: expected frames of one size, the path has several")

@@ -11,10 +11,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.cameras import move_camera
 from bench.layouts import LAYOUTS, POINTS, export
 from bench.metrics import as_bytes
 from bench.scenes import blender, colmap, embedded
+from bench.scenes.export import data_camera
 from bench.trajectories import Trajectory, follow, orbit, smooth
 from bench.types import Camera, Scene, SteerbenchError, composite
 
@@ -32,8 +32,7 @@ def path(scene) -> Trajectory:
 
 def same_cameras(scene: Scene, found: Scene, split: str, wanted: Sequence[Camera]) -> None:
     for read, given in zip(found.splits[split].cameras, wanted, strict=True):
-        camera = move_camera(read, found.unit_length, found.origin)
-        other = move_camera(given, scene.unit_length, scene.origin)
+        camera, other = data_camera(found, read), data_camera(scene, given)
         torch.testing.assert_close(camera.c2w, other.c2w, atol=4e-6, rtol=0)  # float32, at 4.3
         lens, expected = ((x.fx, x.fy, x.cx, x.cy, x.width, x.height) for x in (camera, other))
         assert lens == pytest.approx(expected, rel=1e-9)
@@ -61,13 +60,17 @@ def test_the_layout_of_nerfbaselines_comes_back_with_its_path(scene, path, tmp_p
         torch.testing.assert_close(step.camera.c2w, other.camera.c2w, atol=2e-6, rtol=0)
 
 
+@pytest.mark.parametrize("far", [0.0, 5e6])
 def test_a_colmap_model_comes_back_and_no_frame_of_the_path_is_in_it(
-    scene, path, tmp_path, quiet_log
+    scene, path, tmp_path, quiet_log, far
 ):
     pytest.importorskip("pycolmap")
+    scene = replace(scene, origin=scene.origin + far)
     export(scene, path, tmp_path / "out", "colmap", quiet_log)
     # Every view is a test view in one of two loads: by default every eighth is.
-    load = partial(colmap.load, split_every=2, bounds=[[-1.5] * 3, [1.5] * 3], log=quiet_log)
+    load = partial(
+        colmap.load, split_every=2, bounds=[[far - 1.5] * 3, [far + 1.5] * 3], log=quiet_log
+    )
     wanted = {"": scene.splits["train"].cameras, "test": [step.camera for step in path.steps]}
     pictures = {"": scene.splits["train"].images, "test": truths(scene, path)}
     for place, cameras in wanted.items():
@@ -81,7 +84,7 @@ def test_a_colmap_model_comes_back_and_no_frame_of_the_path_is_in_it(
 def test_the_points_of_a_colmap_model_fill_the_bounds(scene, path, tmp_path, quiet_log):
     export(scene, path, tmp_path / "out", "colmap", quiet_log)
     lines = (tmp_path / "out/sparse/0/points3D.txt").read_text().splitlines()
-    points = torch.tensor([[float(word) for word in line.split()[1:4]] for line in lines])
+    points = torch.tensor([[float(x) for x in line.split()[1:4]] for line in lines]).double()
     corners = scene.origin + scene.unit_length * scene.bounds
     assert len(points) == POINTS
     torch.testing.assert_close(

@@ -84,11 +84,13 @@ def load(
         log=log,
     )
 
+    corner = scene.origin.float()  # rounded as in all figures that are stored
+
     def exact(camera: Camera) -> Tensor:
-        return picture(model, move_camera(camera, scene.unit_length, scene.origin))
+        return picture(model, move_camera(camera, scene.unit_length, corner))
 
     def surface(camera: Camera) -> Tensor:
-        moved = move_camera(camera, scene.unit_length, scene.origin)
+        moved = move_camera(camera, scene.unit_length, corner)
         with torch.no_grad():
             return render(model, moved, samples=1).depth / scene.unit_length
 

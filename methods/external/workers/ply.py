@@ -40,15 +40,19 @@ class Ply:
     def load(self, job: Any) -> None:
         everywhere = torch.tensor([[-torch.inf] * 3, [torch.inf] * 3])
         self.background = torch.tensor(job.background).to(self.device)
-        scene = Scene("", {}, self.background, everywhere, unit_length=1.0, digest="")
+        low, high = corners = torch.tensor(job.bounds, dtype=torch.float64)
+        far = corners.abs().max() > ply.FAR * (high - low).max()
+        self.origin = low if far else torch.zeros_like(low)  # float32 has few digits far from it
+        scene = Scene("", {}, self.background, everywhere, 1.0, digest="", origin=self.origin)
         gaussians = ply.read(Path(self.files[0]), scene, self.notes.append)
         self.gaussians = gaussians.to(self.device)
 
     @torch.no_grad()
     def render(self, camera: Camera) -> dict[str, torch.Tensor]:
-        pose = torch.from_numpy(camera.c2w).float()
+        pose = torch.from_numpy(camera.c2w).clone()
+        pose[:, 3] -= self.origin
         lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
-        seen = place_camera(Camera(pose, *lens), self.device)
+        seen = place_camera(Camera(pose.float(), *lens), self.device)
         pixels = self.gaussians.render(seen, self.stop, Stages())
         with stage("finish"):
             frame = FeatureFrame.of(seen, pixels, self.background).picture()

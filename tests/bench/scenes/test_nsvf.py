@@ -75,7 +75,13 @@ def test_boxes_that_are_too_small_are_enlarged_further(folder, log, name, furthe
     [
         (MATRIX, (9, 8, 4.5, 2.5)),
         ("9 0 4.5\n0 8 2.5\n0 0 1\n", (9, 8, 4.5, 2.5)),
+        ("9 0 4.5 0\n0 8 2.5 0\n0 0 1 0\n", (9, 8, 4.5, 2.5)),
+        (MATRIX.replace("\n", " "), (9, 8, 4.5, 2.5)),
         ("9. 4.5 2.5 0.\n0. 0. 0.\n0.\n1.\n6 8\n", (9, 9, 4.5, 2.5)),
+        ("9 4.5 2.5", (9, 9, 4.5, 2.5)),
+        ("9 8 4.5 2.5", (9, 8, 4.5, 2.5)),
+        (MATRIX + "12 16", (4.5, 4, 2.25, 1.25)),  # of pictures twice as large
+        ("12 16\n9 4.5 2.5 0", (4.5, 4.5, 2.25, 1.25)),
     ],
 )
 def test_every_form_of_intrinsics(folder, log, text, expected):
@@ -91,7 +97,9 @@ def test_every_form_of_intrinsics(folder, log, text, expected):
         ("bbox.txt", "-1 -1 -1 1 -2 1 .4", r"bbox.txt: expected each upper bound above"),
         ("bbox.txt", "-1 -1 nan 1 1 1 .4", r"bbox.txt: number 3: expected a finite number"),
         ("bbox.txt", "a b c", r"bbox.txt: expected numbers, got"),
-        ("intrinsics.txt", "9 9\n1 1\n", r"intrinsics.txt: expected a 4x4 or 3x3 matrix"),
+        ("intrinsics.txt", "9 9\n1 1\n", r"intrinsics.txt: expected a 4x4, 3x4 or 3x3 matrix"),
+        ("intrinsics.txt", "9 0 0\n0 8 0\n4 2 1", r"expected rows fx 0 cx, 0 fy cy and 0 0 1"),
+        ("intrinsics.txt", MATRIX + "6 6", r"0_000.png: expected a picture of 6 x 6 pixels, or as"),
         ("intrinsics.txt", MATRIX.replace("9", "-9"), r"intrinsics.txt: fx: .* above 0, got -9"),
         ("intrinsics.txt", MATRIX.replace("8", "0"), r"intrinsics.txt: fy: .* above 0, got 0"),
         ("pose/0_001.txt", "1 0 0 0\n0 1 0 0\n", r"0_001.txt: expected a 4x4 matrix"),

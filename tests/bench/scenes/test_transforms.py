@@ -1,6 +1,7 @@
 """Captures: intrinsics by frame, missing pictures, lens distortion, and what is refused."""
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 import torch
 from kornia.geometry.calibration import undistort_points
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from bench.cameras import pixel_grid
 from bench.scenes import transforms
@@ -53,6 +55,55 @@ def test_intrinsics_of_a_frame_go_first(folder, log, focal, fx):
     first, second = transforms.load(folder, log=log).splits["test"].cameras
     assert (first.fx, first.fy, first.cx, first.cy) == (9, 8, 4.5, 2.5)
     assert (second.fx, second.fy, second.cx, second.cy) == pytest.approx((fx, 8, 4, 2.5))
+
+
+def every(**settings: object) -> Callable[[dict], object]:
+    return lambda record: record.update(settings)
+
+
+def turned(scale: float, digits: int, *flip: int) -> Callable[[dict], object]:
+    """Turn the rotation of every pose by 0.3 radians, scale, round and flip its axes."""
+
+    def change(record: dict) -> None:
+        for frame in record["frames"]:
+            matrix = np.array(frame["transform_matrix"])
+            turn = matrix[:3, :3] @ Rotation.from_euler("z", 0.3).as_matrix()
+            matrix[:3, :3] = (scale * turn).round(digits) * (flip or 1)
+            frame["transform_matrix"] = matrix.tolist()
+
+    return change
+
+
+GIVEN = (9, 8, 4.5, 2.5)
+FISHEYE = {"is_fisheye": True, "fl_x": 2.6, "fl_y": 2.6, "cx": 4, "cy": 3}  # of 176 degrees
+
+
+@pytest.mark.parametrize(
+    ("change", "lens", "said"),
+    [
+        (every(cx=-4, cy=7.5), (9, 8, -4, 7.5), r"001.png: .* far from .*: \(-4, 7.5\) of 8 x 6 "),
+        (every(w=16, h=12, cx=9, cy=5), (4.5, 4, 4.5, 2.5), None),
+        (
+            every(x_fov=50),
+            (8.578, 8, 4.5, 2.5),
+            r"\[0\].x_fov: is taken, not fl_x, .*: 9.0 \(and 9",
+        ),
+        (every(camera_angle_x=2), GIVEN, r"fl_x: is taken, not camera_angle_x, .*: 2 \(and 9"),
+        (every(fl_x=4), (4, 8, 4.5, 2.5), "001.png: pixels far from square: fx 4, fy 8"),
+        (lambda r: r.pop("fl_x"), (8, 8, 4.5, 2.5), None),
+        (every(aabb=[[0, 0], [0, 1]], sharpen=0.0), GIVEN, "not read: aabb$"),
+        (turned(0.25, 15), GIVEN, r"matrix: scaled rotation, .*: 0.25 \(and 9 more\)$"),
+        (turned(1, 2), GIVEN, r"frames\[0\].transform_matrix: rounded rotation, taking"),
+        (turned(1, 15, 1, -1, -1), GIVEN, "poses: all cameras look away from their middle"),
+        (every(**FISHEYE), (2.6, 2.6, 4, 3), "001.png: without its lens, .*: . x . of 8 x 6"),
+    ],
+)
+def test_what_is_put_right_or_doubted_is_said_once(folder, log, change, lens, said):
+    edit_json(folder / "transforms.json", change)
+    camera = transforms.load(folder, log=log).splits["test"].cameras[0]
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx(lens, abs=1e-3)
+    torch.testing.assert_close(camera.c2w[:, :3].T @ camera.c2w[:, :3], torch.eye(3))
+    assert [bool(re.search(str(said), line)) for line in log.messages] == [True] * bool(said)
 
 
 def test_pictures_of_several_sizes(folder, log):
@@ -161,10 +212,6 @@ def test_a_background_is_what_pictures_without_transparency_have(folder, log):
         transforms.load(folder, space="no", log=log)
 
 
-def every(**settings: object) -> Callable[[dict], object]:
-    return lambda record: record.update(settings)
-
-
 def first(**settings: object) -> Callable[[dict], object]:
     return of_picture(9, **settings)
 
@@ -177,10 +224,14 @@ FAR = [[1, 0, 0, 1e308], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     [
         (every(fl_x=0), r"frames\[0\].fl_x: expected a finite number above 0, got 0"),
         (first(fl_y="9"), r"transforms\.json: frames\[0\].fl_y: .* got '9'"),
-        (lambda r: r.pop("fl_x"), r"frames\[0\].fl_x: expected a focal length, or camera_angle_x"),
+        (
+            lambda r: (r.pop("fl_x"), r.pop("fl_y")),
+            r"frames\[0\].fl_x: expected a focal length, or",
+        ),
         (first(mask_path=5), r"frames\[0\].mask_path: expected a path, got 5"),
         (first(mask_path="m.png"), r"mask_path: expected a picture, got no .m\.png. in"),
-        (first(cx=9), r"frames\[0\].cx: .* below 8, got 9"),
+        (first(cx=[9]), r"frames\[0\].cx: expected a finite number, got list of 1"),
+        (every(w=10), r"images/009.png: expected a picture of 10 x 6 pixels, or as wide"),
         (first(w=0), r"frames\[0\].w: expected a whole number from 1 on"),
         (first(k1=None), r"frames\[0\].k1: expected a finite number, got nothing"),
         (every(k4=0.1), r"frames\[0\].k4: expected a lens of k1 k2 p1 p2 k3"),

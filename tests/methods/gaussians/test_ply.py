@@ -59,6 +59,15 @@ def test_what_is_written_is_read_and_holds_the_coordinates_of_the_data_set(
     assert vertex["scale_1"] == pytest.approx(given.log_scales[0, 1].item() + math.log(3))
 
 
+def test_positions_far_from_the_origin_keep_their_digits(moved_scene, tmp_path):
+    far = torch.tensor([500_000.0, 5_000_000.0, 0.0], dtype=torch.float64)
+    scene, given = replace(moved_scene, origin=far), some()
+    ply.write(given, scene, tmp_path / "a.ply")
+    assert PlyData.read(tmp_path / "a.ply")["vertex"]["y"].max() > 5e6
+    found = ply.read(tmp_path / "a.ply", scene, print)
+    torch.testing.assert_close(found.means, given.means, rtol=0, atol=1e-6)  # float32: 0.2
+
+
 def test_harmonics_of_a_file_have_the_condon_shortley_phase(moved_scene, tmp_path):
     """Colours by the polynomials of degree 2 as the release of 3D Gaussians has them."""
     path = tmp_path / "a.ply"
