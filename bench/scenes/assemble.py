@@ -30,6 +30,7 @@ SPACES = ("auto", "box", "all")
 PULL = 1e-3  # of the centres of cameras on the point that they look at, of that of their axes
 
 CELLS = 64  # along each side of the cube that is searched for the visual hull
+HALVINGS = 8  # of a box that may be much larger than what it holds
 BLOCK, GLANCES = 4, 16
 """Before single cells, blocks of BLOCK^3 cells are tested against the first GLANCES pictures: a
 dropped block drops all its cells."""
@@ -182,8 +183,8 @@ def space_of(space: str, pictures: Mapping[str, Pictures]) -> str:
     if space != "auto":
         return space
     train = pictures["train"]
-    masked = any(picture.shape[2] == 4 and (picture[..., 3] < 255).any() for picture in train)
-    return "box" if masked else "all"
+    clear = (train[n] for n, picture in enumerate(train.described) if picture.clear)
+    return "box" if any((picture[..., 3] < 255).any() for picture in clear) else "all"
 
 
 def box_of_cameras(cameras: Sequence[Camera]) -> Box:
@@ -236,6 +237,19 @@ def hull_box(cameras: Sequence[Camera], images: Sequence[Tensor], space: Box) ->
     lower = space.lower + size * cells.amin(0)
     upper = space.lower + size * (cells.amax(0) + 1)
     return Box(lower, upper).grown()
+
+
+def tight(space: Box, train: Pictures) -> Box:
+    """The box of the visual hull of the training masks, searched for in the middle of `space`: in a
+    part that is halved as long as it holds the whole hull. `space` itself without one."""
+    cameras = [picture.camera for picture in train.described]
+    found, part, middle = space, space, (space.lower + space.upper) / 2
+    for _ in range(HALVINGS):
+        hull = hull_box(cameras, train, part)
+        if hull and (hull.lower > part.lower).all() and (hull.upper < part.upper).all():
+            found = hull
+        part = Box((part.lower + middle) / 2, (part.upper + middle) / 2)
+    return found
 
 
 def _grid(side: int) -> Tensor:

@@ -58,6 +58,7 @@ class ScaledView:
     downscale: int
     camera: Camera
     sha256: str
+    clear: bool  # whether it says how transparent its pixels are
     mask: "ScaledView | None" = None  # in full size, with the lens
     turned: bool | None = None  # whether its EXIF orientation is obeyed; None: it is upright
     seen: tuple[int, int] | None = None  # the size of what of it is left without its lens
@@ -143,7 +144,7 @@ def describe(view: View, downscale: int) -> ScaledView:
     content, camera = contents(view.path), view.camera
     with opened(io.BytesIO(content), view.path) as image:
         check_mode(image, view.path)
-        turned = obeyed(image, view)
+        turned, clear = obeyed(image, view), image.has_transparency_data
         size = image.size[::-1] if turned and orientation(image) > 4 else image.size
         if size != (camera.width, camera.height):
             expected = f"{camera.width} x {camera.height} pixels"
@@ -157,7 +158,7 @@ def describe(view: View, downscale: int) -> ScaledView:
     camera = shrunk_camera(camera, downscale, view.path)
     mask = describe(View(view.name, view.mask, view.camera), 1) if view.mask else None
     sha256 = hashlib.sha256(content).hexdigest()
-    return ScaledView(view, downscale, camera, sha256, mask, turned, seen)
+    return ScaledView(view, downscale, camera, sha256, clear, mask, turned, seen)
 
 
 def obeyed(image: Image.Image, view: View) -> bool | None:

@@ -12,7 +12,14 @@ from torch import Tensor
 
 from bench.cameras import scale_camera
 from bench.errors import unexpected
-from bench.scenes.assemble import Box, assemble, box_of_cameras, describe_splits, space_of
+from bench.scenes.assemble import (
+    Box,
+    assemble,
+    box_of_cameras,
+    describe_splits,
+    space_of,
+    tight,
+)
 from bench.scenes.files import (
     data_folder,
     describe,
@@ -83,7 +90,8 @@ def load(
     split_every, 2 * split_every ..., in the order of their names, are the test split, all others
     the training split. `aabb_scale` is the side of the box relative to that of
     instant-ngp, x * 0.33 + 0.5; by default the value in the file, or 1. `scale` and `offset` in the
-    file replace 0.33 and 0.5. In all of space, the file's box is not needed.
+    file replace 0.33 and 0.5. In all of space, the file's box is not needed; of a larger one than
+    instant-ngp's, the box of the visual hull of the training masks is taken.
 
     Intrinsics of a frame take precedence over those of the file. Lens distortion is undone, and
     pictures are cropped to what the lens saw. Frames without a picture are logged and left out.
@@ -97,6 +105,8 @@ def load(
     space, cameras = space_of(space, pictures), [view.camera for view in splits["train"]]
     around = space == "all" and aabb_scale is None
     box = box_of_cameras(cameras) if around else capture_box(path, record, aabb_scale)
+    if space == "box" and aabb_scale is None and record.get("aabb_scale", 1) > 1:
+        box = tight(box, pictures["train"])
     scene = assemble(
         root.name, pictures, box, background=background, space=space, camera_files=[path]
     )

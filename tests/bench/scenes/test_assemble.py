@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from bench.cameras import look_at
 from bench.scenes import assemble
-from bench.scenes.assemble import Box, box_of_cameras, cube, hold_out, hull_box
+from bench.scenes.assemble import CELLS, Box, box_of_cameras, cube, hold_out, hull_box, tight
 from bench.scenes.embedded import picture, pose_on_sphere, train_poses
 from bench.scenes.embedded.raytrace import Part, Solids
 from bench.scenes.embedded.solids import Ellipsoid
@@ -125,6 +126,17 @@ def test_no_hull_without_a_mask(alpha):
     image = torch.full((SIZE, SIZE, 4), alpha, dtype=torch.uint8)
     assert hull_box(cameras, [image] * 40, cube(1.2)) is None
     assert hull_box(cameras, [image[..., :3]] * 40, cube(1.2)) is None
+
+
+def test_a_much_larger_box_than_what_it_holds_is_made_tight():
+    part = Part(Ellipsoid((0.2, 0.5, 0.1)), RED, (0.3, -0.2, 0.1))
+    cameras = [camera(pose) for pose in train_poses(20, 3)]
+    taken = MagicMock(described=[MagicMock(camera=c) for c in cameras])
+    images = [picture(Solids([part]), c) for c in cameras]
+    taken.__iter__.side_effect = lambda: iter(images)
+    box, large = hull_box(cameras, images, cube(1.5)), tight(cube(48.0), taken)
+    torch.testing.assert_close(large.lower, box.lower, rtol=0, atol=3 / CELLS)
+    torch.testing.assert_close(large.upper, box.upper, rtol=0, atol=3 / CELLS)
 
 
 def looking(*poses: tuple[Tensor, Tensor]) -> list[Camera]:
