@@ -126,7 +126,11 @@ def read_views(root: Path, images: str, folder: Path, log: Log) -> Listed:
         report(place, names, files, str(folder), log)
     views: list[tuple[str, View | None]] = []
     for entry, name, file in zip(entries, map(tidy, names), files, strict=True):
-        view = file and View(name, file, *read_camera(entry, cameras, file), stored=True)
+        view = (
+            None
+            if file is None
+            else View(name, file, *read_camera(entry, cameras, file), stored=True)
+        )
         views.append((name, view))
     return views
 

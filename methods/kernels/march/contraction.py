@@ -67,7 +67,8 @@ class Course:
         first = torch.where(past.abs() <= 1, past, past.sign() * (2 - 1 / past.abs()))
         width = step / HALF
         numbers = middle, reach, first, width * apart, middle + 2 / width * reach
-        return cls(*(x.to(rays.origins.dtype) for x in numbers), width)
+        middle, reach, first, length, end = (x.to(rays.origins.dtype) for x in numbers)
+        return cls(middle, reach, first, length, end, width)
 
     def at(self, ray: Tensor, k: Tensor) -> Tensor:
         """t of the steps `k`, with their phases, of the rays `ray`."""
