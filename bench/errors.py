@@ -48,8 +48,8 @@ def not_there(path: Path, expected: str = "a file") -> SteerbenchError:
     while not gone.parent.exists():
         gone = gone.parent
     there = sorted(each.name for each in gone.parent.iterdir()) if gone.parent.is_dir() else ()
-    near = f"{gone.parent} has no {gone.name}, but {nearest(gone.name, there)}"
-    return unexpected(path, expected, f"nothing there; {near}")
+    near = f"no '{gone.name}' in {gone.parent}; nearest: {nearest(gone.name, there)}"
+    return unexpected(path, expected, near)
 
 
 def nearest(name: str, there: Iterable[str]) -> str:

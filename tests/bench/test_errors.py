@@ -8,10 +8,10 @@ from bench.errors import not_there
 @pytest.mark.parametrize(
     ("path", "said"),
     [
-        ("in/cameras.jsn", "in/cameras.jsn: expected a file, got nothing there; "),
-        ("in/CAMERA.json", "/in has no CAMERA.json, but cameras.json"),
-        ("im/cameras.json", " has no im, but in"),
-        ("many/0", "/many has no 0, but a1, a2, a3, a4, a5 and 2 more"),
+        ("in/cameras.jsn", "in/cameras.jsn: expected a file, got no 'cameras.jsn' in "),
+        ("in/CAMERA.json", "/in; nearest: cameras.json"),
+        ("im/cameras.json", "nearest: in"),
+        ("many/0", "/many; nearest: a1, a2, a3, a4, a5 and 2 more"),
         ("in", "in: expected a file, got a folder"),
         ("in/broken", "got a link to elsewhere, which is not there"),
     ],
