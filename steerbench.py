@@ -137,7 +137,7 @@ def results(outputs: str | Path = "outputs") -> pd.DataFrame:
 
     docs/protocol.md explains the columns.
     """
-    return rows_of(existing_store(Path(outputs)))
+    return rows_of(existing_store(Path(outputs)), ConsoleLog(Path(outputs)).info)
 
 
 def check(baseline: str | Path, outputs: str | Path = "outputs") -> list[Assertion]:

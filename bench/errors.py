@@ -1,9 +1,11 @@
 """Errors for users. Not in `bench.types`, so that the command line need not load torch."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
+
+NAMED = 5  # an error names at most this many things and gives the number of the rest
 
 
 class SteerbenchError(Exception):
@@ -33,6 +35,34 @@ def unknown(kind: str, name: str, existing: Iterable[str]) -> SteerbenchError:
     near = near or get_close_matches(name, names)
     more = f"Did you mean {' or '.join(near)}?" if near else f"There are: {', '.join(names)}."
     return SteerbenchError(f"unknown {kind} '{name}'. {more}")
+
+
+def not_there(path: Path, expected: str = "a file") -> SteerbenchError:
+    """The error for a `path` that is not what is `expected`; if nothing is there, it names what is
+    nearest to the first part of the path that is missing."""
+    if path.exists():
+        return unexpected(path, expected, "a folder" if path.is_dir() else "a file")
+    if path.is_symlink():
+        return unexpected(path, expected, f"a link to {path.readlink()}, which is not there")
+    gone = path
+    while not gone.parent.exists():
+        gone = gone.parent
+    there = sorted(each.name for each in gone.parent.iterdir()) if gone.parent.is_dir() else ()
+    near = f"no '{gone.name}' in {gone.parent}; nearest: {nearest(gone.name, there)}"
+    return unexpected(path, expected, near)
+
+
+def nearest(name: str, there: Iterable[str]) -> str:
+    """The one of the names `there` that is most like `name`, in any case; if none is, all."""
+    names = {each.lower(): each for each in there}
+    near = get_close_matches(name.lower(), names, 1)
+    return names[near[0]] if near else some([*names.values()]) or "nothing"
+
+
+def some(names: Sequence[str]) -> str:
+    """The first of `names`, and how many more there are."""
+    further = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + further
 
 
 def install_command(extra: str) -> str:

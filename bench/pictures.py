@@ -15,7 +15,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from bench.errors import unexpected
+from bench.errors import not_there, some, unexpected
 from bench.metrics import Lpips, check_size
 from bench.protocol import EvaluationProtocol
 from bench.results import STEADY, Measurement
@@ -35,8 +35,6 @@ MAP = re.compile(r"(.+)_(acc|accumulation|albedo|alpha|depth|disp|mask|normals?)
 
 OF_A_RUN = re.compile(r"\d+-(rendered|truth|error)")
 """File names, without ending, of the pictures that a run keeps."""
-
-NAMED = 5  # an error names at most this many files and gives the number of the rest
 
 Match = Literal["name", "order"]
 
@@ -81,14 +79,14 @@ def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
         names = [Path(name).name for name in names]
     if twice := _repeated(names):
         wanted = "true pictures of different names; --match order takes both in their order"
-        raise unexpected(folder, wanted, f"several of {_some(twice)}")
+        raise unexpected(folder, wanted, f"several of {some(twice)}")
     known = dict(zip(keys, files, strict=True))
     missing = [name for name in names if name not in known]
     further = sorted(known.keys() - set(names), key=_natural)
     if missing or further:
         advice = "; --match order takes both in their order" if len(files) == len(names) else ""
-        got = [f"none for {_some(missing)}"] if missing else []
-        got += [f"also {_some(further)}"] if further else []
+        got = [f"none for {some(missing)}"] if missing else []
+        got += [f"also {some(further)}"] if further else []
         raise unexpected(folder, "a picture for each true one", f"{', '.join(got)}{advice}")
     return [known[name] for name in names]
 
@@ -104,7 +102,7 @@ def listed(folder: Path) -> list[Path]:
     """The pictures in a folder, if it has none in those below it, 10 after 9; raises if there are
     none, or two names differ in their ending."""
     if not folder.is_dir():
-        raise unexpected(folder, "a folder", "a file" if folder.exists() else "nothing there")
+        raise not_there(folder, "a folder")
     for pattern in ("*", "**/*"):
         # Unlike those of Path, it follows links, and leaves out what is hidden.
         found = glob(pattern, root_dir=folder, recursive=True)  # noqa: PTH207
@@ -113,10 +111,10 @@ def listed(folder: Path) -> list[Path]:
         if names:
             break
     else:
-        raise unexpected(folder, f"pictures ({', '.join(SUFFIXES)})", _some(below) or "none")
+        raise unexpected(folder, f"pictures ({', '.join(SUFFIXES)})", some(below) or "none")
     stems = [str(Path(name).with_suffix("")) for name in names]
     if twice := _repeated(stems):
-        raise unexpected(folder, "one picture of a name", f"several of {_some(twice)}")
+        raise unexpected(folder, "one picture of a name", f"several of {some(twice)}")
     known = set(stems)
     maps = {stem for stem in stems if (of := MAP.fullmatch(stem)) and of[1] in known}
     files = [folder / name for name, stem in zip(names, stems, strict=True) if stem not in maps]
@@ -136,10 +134,13 @@ def reported_times(file: Path, pairs: Sequence[Pair]) -> list[float]:
     picture, in their order. Raises SteerbenchError if the file cannot be read, or a time is missing
     or not above 0.
     """
+    if not file.is_file():
+        raise not_there(file)
     try:
         table = pd.read_csv(file, dtype={"name": "str"})
     except (OSError, ValueError) as error:
-        raise unexpected(file, "a readable CSV file", error) from error
+        got = " ".join(str(error).split())
+        raise unexpected(file, "a readable CSV file", got) from error
     if "frame_ms" not in table:
         raise unexpected(file, "a column frame_ms", ", ".join(map(str, table)) or "none")
     if "name" in table:
@@ -151,9 +152,7 @@ def reported_times(file: Path, pairs: Sequence[Pair]) -> list[float]:
             table.index = table.index.map(lambda name: Path(name).name)
         counts = table.index.value_counts().reindex(names, fill_value=0)
         if wrong := [name for name in names if counts[name] != 1]:
-            raise unexpected(
-                file, "one line for each picture", f"none or several of {_some(wrong)}"
-            )
+            raise unexpected(file, "one line for each picture", f"none or several of {some(wrong)}")
         table = table.loc[names]
     times = pd.to_numeric(table["frame_ms"], errors="coerce").tolist()
     if len(times) != len(pairs):
@@ -243,8 +242,3 @@ def _natural(name: str) -> list[tuple[int, str]]:
     """A sort key that orders numbers in names as numbers."""
     parts = re.split(r"(\d+)", name)
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
-
-
-def _some(names: Sequence[str]) -> str:
-    further = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return ", ".join(names[:NAMED]) + further

@@ -5,6 +5,7 @@ A run folder holds `rows.csv` (one metric per row, `COLUMNS`), `frames.csv` (one
 It gets its final name only when it is complete.
 """
 
+import csv
 import hashlib
 import io
 import json
@@ -12,10 +13,10 @@ import os
 import shutil
 import time
 import uuid
-import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import reduce
 from glob import escape
 from pathlib import Path
 
@@ -23,8 +24,9 @@ import numpy as np
 import pandas as pd
 from PIL import Image
 
-from bench.errors import SteerbenchError, explained, unexpected
+from bench.errors import SteerbenchError, explained, nearest, not_there, some, unexpected
 from bench.provenance import commit, machine
+from bench.records import Record, read_record
 
 SCHEMA_VERSION = 4  # of record.json and rows.csv; other folders are reported and skipped
 
@@ -42,8 +44,16 @@ fewer preceding frames than the method looks back on), or "all" for a figure of 
 STEADY, COLD, WHOLE = "steady", "cold", "all"  # the values of the column `phase`
 REPORTED, IMPORTED = "reported", "imported"  # values of the column `device`: not measured here
 
+FRAME = ("frame", "name", "phase")  # the first columns of frames.csv
 FIGURES = {"value": "float64", "lo": "float64", "hi": "float64", "n": "int64", "seed": "int64"}
-RECORD, PARTIAL = "record.json", ".partial-"
+KINDS = {
+    **dict.fromkeys(("made_of", "made_of.config", "machine", "scene", "protocol", "budget"), dict),
+    **dict.fromkeys(("missing", "parts", "neighbours", "axes"), dict),
+    **dict.fromkeys(("command", "scene.digest", "machine.cpu", "peak_bytes", "error_map"), str),
+    **{"stored": float, "machine.gpus": list},
+}
+"""What the fields of a record hold."""
+RECORD, ROWS, PARTIAL = "record.json", "rows.csv", ".partial-"
 STALE_S = 24 * 3600.0
 
 
@@ -101,7 +111,7 @@ class Store:
         }
         rows = measurement.rows.assign(run=key, commit=commit())[COLUMNS]
         with self.write(key) as folder:
-            rows.to_csv(folder / "rows.csv", index=False, lineterminator="\n")
+            rows.to_csv(folder / ROWS, index=False, lineterminator="\n")
             measurement.frames.to_csv(folder / "frames.csv", index=False, lineterminator="\n")
             (folder / "pictures").mkdir()
             for name, pixels in measurement.pictures.items():
@@ -144,42 +154,56 @@ class Store:
             shutil.rmtree(removed, ignore_errors=True)
 
     def rows(
-        self, report: Callable[[str], object] = warnings.warn, keys: Collection[str] | None = None
+        self,
+        report: Callable[[str], object] = lambda line: None,
+        keys: Collection[str] | None = None,
     ) -> pd.DataFrame:
-        """Every row of all runs, or of those in `keys`; `report` gets a line on each schema that
-        cannot be read."""
-        header = ",".join(COLUMNS)
+        """Every row of all runs, or of those in `keys`; `report` gets a line on those that cannot
+        be read, for each reason."""
         bodies: list[str] = []
-        others: dict[object, list[str]] = {}
+        left_out: dict[str, list[str]] = {}
         for folder in sorted(self.folder.glob("[!.]*")):
             if keys is not None and folder.name not in keys:
                 continue
             try:
-                schema = json.loads(_text(folder / RECORD))["schema_version"]
-            except (ValueError, KeyError, TypeError):
-                schema = None
-            first, _, body = _text(folder / "rows.csv").partition("\n")
-            if schema == SCHEMA_VERSION and first == header:
-                bodies.append(body)
-            else:
-                others.setdefault(schema, []).append(folder.name)
-        for schema, names in others.items():
-            more = f" and {len(names) - 1} more" * (len(names) > 1)
-            report(f"{self.folder}: left out: {names[0]}{more}: {unreadable(schema)}")
+                bodies.append(_body(folder))
+            except SteerbenchError as error:
+                left_out.setdefault(str(error), []).append(folder.name)
+        for why, names in left_out.items():
+            report(f"{self.folder}: left out: {some(names)}: {why}")
         return pd.read_csv(
-            io.StringIO("\n".join((header, "".join(bodies)))),
+            io.StringIO("\n".join((",".join(COLUMNS), "".join(bodies)))),
             dtype={column: FIGURES.get(column, "str") for column in COLUMNS},
             keep_default_na=False,
             na_values={column: ["", "nan"] for column in ("value", "lo", "hi")},
         )
 
-    def frames(self, run: str) -> pd.DataFrame:
+    def frames(self, run: str, metrics: Iterable[str] = ()) -> pd.DataFrame:
+        """The frames of a run, which must have the columns `FRAME`, and `metrics`."""
         path = self._existing(run) / "frames.csv"
-        return pd.read_csv(path, dtype={"name": "str"}, keep_default_na=False, na_values=[""])
+        if not path.is_file():
+            raise not_there(path)
+        try:
+            table = pd.read_csv(path, dtype={"name": "str"}, keep_default_na=False, na_values=[""])
+        except (OSError, ValueError) as error:
+            raise unexpected(path, "a table of frames", " ".join(str(error).split())) from error
+        for name in (*FRAME, *metrics):
+            if name not in table:
+                raise unexpected(path, f"a column {name}", nearest(name, map(str, table)))
+        for name in table.columns.difference(["name", "phase"]):
+            if not pd.api.types.is_numeric_dtype(table[name]):
+                raise unexpected(path, f"numbers in the column {name}", "text")
+        return table
 
-    def record(self, run: str) -> dict[str, object]:
+    def record(self, run: str) -> Record:
         """The record of a run: what it was made of, and on which machine."""
-        return json.loads((self._existing(run) / RECORD).read_text(encoding="utf-8"))
+        record = read_record(path := self._existing(run) / RECORD)
+        for name, kind in KINDS.items():
+            *outer, last = name.split(".")
+            held = reduce(lambda of, part: of.get(part, {}), outer, record).get(last, kind())
+            if not isinstance(held, kind):
+                raise unexpected(f"{path}: {name}", kind.__name__, repr(held)[:80])
+        return record
 
     def _sweep(self) -> None:
         """Delete what killed processes left behind: partial folders older than a day."""
@@ -205,15 +229,40 @@ def existing_store(root: Path) -> Store:
     return store
 
 
-def unreadable(schema: object) -> str:
-    return (
-        f"stored by another version of steerbench, or damaged (schema {schema}, this one reads "
-        f"{SCHEMA_VERSION}); measure again, with outputs=DIR to keep what is there"
-    )
+def _body(folder: Path) -> str:
+    """The rows of a run as lines of text; SteerbenchError says why they cannot be read."""
+    try:
+        schema = json.loads(_text(folder / RECORD))["schema_version"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise unexpected(RECORD, "a record with a schema_version", "a damaged one") from error
+    if schema != SCHEMA_VERSION:
+        raise SteerbenchError(
+            f"stored by another version of steerbench (schema {schema}, this one reads "
+            f"{SCHEMA_VERSION}); measure again, with outputs=DIR to keep what is there"
+        )
+    first, _, body = _text(folder / ROWS).partition("\n")
+    names = first.split(",")
+    for name in COLUMNS:
+        if name not in names:
+            others = [other for other in names if other not in COLUMNS]
+            raise unexpected(ROWS, f"a column {name}", nearest(name, others))
+    if names != COLUMNS:
+        raise unexpected(ROWS, f"{', '.join(COLUMNS)} in this order", "another")
+    if not body.endswith("\n"):
+        raise unexpected(ROWS, "whole lines below its first", "half of one" if body else "none")
+    try:
+        for line in csv.reader(io.StringIO(body)):
+            of = dict(zip(COLUMNS, line, strict=True))
+            _ = int(of["n"]), int(of["seed"]), [float(of[x] or 0) for x in ("value", "lo", "hi")]
+    except ValueError as error:
+        raise unexpected(ROWS, "numbers, and a value for each column", error) from error
+    if (run := body.partition(",")[0]) != folder.name:
+        raise unexpected(ROWS, "the run that its folder is named after", run)
+    return body
 
 
 def _text(path: Path) -> str:
-    return path.read_text(encoding="utf-8") if path.is_file() else ""
+    return path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
 
 
 def _sync(path: Path) -> None:

@@ -1,6 +1,7 @@
 """Plots of measured rows, as PNG. They need no display and no global state."""
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -79,7 +80,7 @@ def stage_bars(runs: Sequence[Run | Repeated], path: Path) -> None:
     axes.set_xlabel("mean ms of a frame")
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(loc="outside upper center", ncols=LEGEND_COLUMNS, frameon=False)
-    figure.savefig(path, dpi=150)
+    _save(figure, path)
 
 
 def quality_plot(
@@ -137,7 +138,7 @@ def quality_against(
         _name(axes, points)
     else:
         figure.legend(handles=legend.handles, loc="outside right upper", frameon=False)
-    figure.savefig(path, dpi=150)
+    _save(figure, path)
 
 
 class _Legend:
@@ -197,7 +198,7 @@ def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
         axes.plot(scored["frame"], scored["psnr"], marker="o", color=colour, label=run.label)
         axes.plot(cold["frame"], cold["psnr"], "o", color=colour, markerfacecolor="white")
     figure.legend(loc="outside upper center", ncols=LEGEND_COLUMNS, frameon=False)
-    figure.savefig(path, dpi=150)
+    _save(figure, path)
 
 
 @dataclass(frozen=True)
@@ -238,7 +239,7 @@ def quality_over_training(
         axes.set_xlim(axes.dataLim.x0 / 1.5, 1.5 * RELEASE_STEPS)
         axes.xaxis.set_minor_locator(NullLocator())
         axes.legend(frameon=False, fontsize="small", loc="center right")
-    figure.savefig(path, dpi=150)
+    _save(figure, path)
 
 
 def _style(number: int) -> dict[str, Any]:
@@ -285,7 +286,7 @@ def frontier_plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     figure.draw_without_rendering()  # fixes the positions of points on the page
     _circle(truth, pd.concat([unchanged, best]), "psnr")
     _circle(off, unchanged[np.isfinite(unchanged["psnr_to_first"])], "psnr_to_first")
-    figure.savefig(path, dpi=100)
+    _save(figure, path, 100)
 
 
 def _circle(axes: Axes, rows: pd.DataFrame, column: str) -> None:
@@ -325,6 +326,12 @@ def _error_against_time(axes: Axes, rows: pd.DataFrame, column: str) -> None:
         axis.set_minor_locator(NullLocator())
     axes.grid(color="0.92")
     axes.set_axisbelow(True)
+
+
+def _save(figure: Figure, path: Path, dpi: int = 150) -> None:
+    with warnings.catch_warnings():  # a letter that the font lacks is a box; pages have it in text
+        warnings.filterwarnings("ignore", "Glyph")
+        figure.savefig(path, dpi=dpi)
 
 
 def _rms(psnr: ArrayLike) -> np.ndarray:

@@ -16,6 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import uniform_filter
 
 from bench.results import COLD
+from bench.scenes.images import contents, decode_bytes
 from bench.trajectories import spread
 from reports.runs import Run
 from reports.tables import Table
@@ -119,8 +120,7 @@ def _view(run: Run, frame: str) -> RunView:
 
 
 def _read(path: Path) -> np.ndarray:
-    with Image.open(path) as picture:
-        return np.asarray(picture.convert("RGB"))
+    return decode_bytes(contents(path), path)[..., :3].numpy()
 
 
 def find_detail(truth: np.ndarray, renderings: Sequence[np.ndarray]) -> tuple[Box, str]:

@@ -1,7 +1,6 @@
 """Runs as lines of a table: seeds are repetitions, and settings that differ are columns."""
 
 import shlex
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -111,10 +110,10 @@ def varied(runs: Sequence[Run]) -> dict[str, list[str]]:
     return columns
 
 
-def results(store: Store, report: Callable[[str], object] = warnings.warn) -> pd.DataFrame:
+def results(store: Store, report: Callable[[str], object] = lambda line: None) -> pd.DataFrame:
     """Every row of all runs, with a column for each setting that differs between them.
 
-    `report` gets a line on each schema that cannot be read.
+    `report` gets a line on those that cannot be read, for each reason.
     """
     runs = readable(store, report=report)
     own = {name: values for name, values in varied(runs).items() if name not in FACTS}

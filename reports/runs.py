@@ -18,13 +18,16 @@ from bench.clock import OTHER
 from bench.errors import SteerbenchError
 from bench.metrics import psnr
 from bench.neighbours import Neighbours
-from bench.results import COLD, STEADY, Store, content_key, unreadable
+from bench.records import Record
+from bench.results import COLD, ROWS, STEADY, Store, content_key
 from bench.rows import half_interval, phase_rows
 from bench.scenes.images import contents, decode_bytes
 from bench.study import part_of
 from reports.tables import phases, run_tables
 
 STAGE = "stage_ms."  # prefix of the metrics of stages
+
+SHOWN = {"psnr", "frame_ms"}  # figures of single frames that pages show
 
 FIGURES = ("metric", "unit", "phase", "value", "n", "lo", "hi")
 """The columns of rows that are not facts about the whole run."""
@@ -65,9 +68,9 @@ class Run:
         return rows.set_index("metric")
 
     @cached_property
-    def values(self) -> dict[str, float]:
+    def values(self) -> Record:
         """Figures of the headline by metric."""
-        return {str(metric): value for metric, value in self.headline["value"].items()}
+        return Record(self.headline["value"].items(), self.pictures.parent / ROWS)
 
     def figure(self, metric: str) -> float | None:
         """A figure of the headline; a stage includes its nested stages. None if there is none."""
@@ -232,15 +235,15 @@ def readable(
 ) -> list[Run]:
     """Every readable run, or those in `keys`, labelled with its method, in the order of storing.
 
-    `report` gets a line on each schema that cannot be read.
+    `report` gets a line on those that cannot be read, for each reason.
     """
-    rows = store.rows(report=report, keys=keys)
+    rows = store.rows(report, keys)
     runs = [
         Run(
             folder.name,
             _label(record["command"], of_run),
             of_run,
-            cache(partial(store.frames, folder.name)),
+            cache(partial(store.frames, folder.name, SHOWN & set(of_run["metric"]))),
             record,
             folder / "pictures",
         )
@@ -253,14 +256,14 @@ def readable(
 def load_runs(store: Store, keys: Iterable[str]) -> list[Run]:
     """Load the runs with these `keys`, in this order, labelled with their methods.
 
-    Raises SteerbenchError if one is not in the store, or has a schema that cannot be read.
+    Raises SteerbenchError if one is not in the store, or cannot be read.
     """
-    wanted = list(keys)
-    runs = {run.key: run for run in readable(store, wanted)}
+    wanted, unread = list(keys), list[str]()
+    runs = {run.key: run for run in readable(store, wanted, unread.append)}
     for key in wanted:
         if key not in runs:
-            schema = store.record(key).get("schema_version")
-            raise SteerbenchError(f"{store.folder / key}: {unreadable(schema)}")
+            store.record(key)  # raises if there is none
+            raise SteerbenchError("; ".join(unread))
     return [runs[key] for key in wanted]
 
 

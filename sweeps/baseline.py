@@ -11,7 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bench.errors import SteerbenchError, explained
+from bench.errors import SteerbenchError, explained, unexpected
+from bench.records import made, read_record
 from bench.results import Store, existing_store
 from bench.sharing import whole
 from reports.regression import LIMITS, Assertion, Figures, Limit, changes, limited
@@ -67,16 +68,23 @@ def _stored(store: Store) -> list[Entry]:
 def read(path: Path) -> tuple[Mapping[str, Limit], list[Entry]]:
     """The limits and the runs of a baseline."""
     try:
-        held: Any = json.loads(path.read_text(encoding="utf-8"))
+        held = read_record(path)
         if held["schema"] != SCHEMA:
-            raise ValueError(f"schema {held['schema']}, expected {SCHEMA}")
-        for run in held["runs"]:
-            run["seeds"] = {seed: Figures(**of) for seed, of in run["seeds"].items()}
-        limits = {metric: Limit(**limit) for metric, limit in held["limits"].items()}
-        return limits, [Entry(**run) for run in held["runs"]]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise unexpected(path, f"schema {SCHEMA}", held["schema"])
+        if not isinstance(held["limits"], dict) or not isinstance(held["runs"], list):
+            raise unexpected(path, "limits by metric, and a list of runs", "others")
+        limits = {x: made(Limit, of, f"{path}: limits.{x}") for x, of in held["limits"].items()}
+        limited([f"{metric}=0" for metric in limits])  # refuses what is no metric
+        runs = [made(Entry, of, f"{path}: runs[{n}]") for n, of in enumerate(held["runs"])]
+        for n, run in enumerate(runs):
+            if len(run.subject) != len(SUBJECT) or not run.seeds:
+                raise unexpected(f"{path}: runs[{n}]", f"{', '.join(SUBJECT)}, and seeds", "others")
+            for seed, of in run.seeds.items():
+                run.seeds[seed] = made(Figures, of, f"{path}: runs[{n}].seeds.{seed}")
+        return limits, runs
+    except SteerbenchError as error:
         way = "remove it, then " * path.exists() + f"`steerbench check --record {path}` writes one"
-        raise SteerbenchError(f"{path}: no baseline ({error}); {way}") from error
+        raise SteerbenchError(f"no baseline: {error}; {way}") from error
 
 
 def record(path: Path, outputs: Path, words: Sequence[str], say: Callable[[str], object]) -> None:

@@ -8,10 +8,10 @@ import os
 import re
 import sys
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, lru_cache
 from pathlib import Path
-from types import UnionType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import torch
@@ -23,14 +23,13 @@ from omegaconf.errors import OmegaConfBaseException
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable, unexpected, unknown
 from bench.protocol import EvaluationProtocol
+from bench.records import fits
 from bench.scenes.assemble import hold_out
 from bench.trajectories import Trajectory
 from bench.types import DEVICE, Log, Method, Scene
 from reports.trackers import tracker
 from sweeps.overrides import CONFIGS, VALIDATION, target_of
-
-STANDS_FOR = {"Path": str, "tuple": list, "Sequence": list, "Mapping": dict, "float": float | int}
-"""By the name of a type in a signature: the type that a configuration holds instead."""
+from sweeps.processes import device_lock
 
 STANDARD = "steerbench-1"  # the protocol of a run, if no other is asked for
 
@@ -103,13 +102,19 @@ def training_threads(config: DictConfig) -> int:
     return min(threads, cores) if isinstance(threads, int) else cores
 
 
-def trained(config: DictConfig, log: Log, scene: Scene | None = None) -> Method:
-    """The method that `config` describes, trained on its scene, or on `scene`."""
+def trained(
+    config: DictConfig, log: ConsoleLog, scene: Scene | None = None, progress: Log | None = None
+) -> Method:
+    """The method that `config` describes, trained on its scene, or on `scene`, when it has a turn
+    on its device; the training tells `progress` of itself, by default the `log`."""
     settings = checked_settings(config)
     use_threads(settings)
     torch.manual_seed(settings.seed)
     method, budget = (build(config, name) for name in ("method", "budget"))
-    method.fit(scene or scene_of(config), budget, log)
+    scene = scene or scene_of(config)
+    turn = device_lock(settings.device, log, training_threads(config))
+    with turn if settings.exclusive else nullcontext():
+        method.fit(scene, budget, progress or log)
     return method
 
 
@@ -225,8 +230,9 @@ def check_settings(
             raise unknown("setting", f"{prefix}{name}", [f"{prefix}{other}" for other in names])
         if isinstance(value, dict) and "_target_" in value:
             check_settings(target_of(value), value, f"{prefix}{name}.")
-        elif not _fits(value, hints.get(name, Any)):
-            wanted = " or ".join(map(str, _choices(hints[name])))
+        elif not fits(value, hints.get(name, Any)):
+            literal = get_origin(hints[name]) is Literal
+            wanted = " or ".join(map(str, get_args(hints[name]))) if literal else ""
             wanted = wanted or _as_written(parameters[name].annotation)
             raise unexpected(f"{prefix}{name}", wanted, repr(value))
 
@@ -236,21 +242,3 @@ def _as_written(annotation: Any) -> str:
     if isinstance(annotation, str):
         return annotation
     return re.sub(r"[a-z]\w*\.", "", inspect.formatannotation(annotation))  # without modules
-
-
-def _choices(hint: Any) -> tuple[object, ...]:
-    """The values that a `Literal` allows; empty for other types."""
-    return get_args(hint) if get_origin(hint) is Literal else ()
-
-
-def _fits(value: object, hint: Any) -> bool:
-    """Whether a plain YAML `value` has the type `hint`; True if that cannot be decided."""
-    if get_origin(hint) is UnionType:
-        return any(_fits(value, option) for option in get_args(hint))
-    if choices := _choices(hint):
-        return value in choices
-    kind = get_origin(hint) or hint
-    kind = STANDS_FOR.get(getattr(kind, "__name__", ""), kind)
-    if not isinstance(kind, type | UnionType):
-        return True
-    return isinstance(value, kind) and (kind is bool or not isinstance(value, bool))

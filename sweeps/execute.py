@@ -8,10 +8,12 @@ import json
 import os
 import sys
 import time
+import uuid
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import as_completed
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
+from datetime import datetime
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -24,7 +26,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
 from hydra.errors import InstantiationException
 from hydra.types import HydraContext
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf, flag_override, open_dict
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable, explained
@@ -36,7 +38,7 @@ from reports.tables import decimal
 from sweeps.configured import trained, training_threads
 from sweeps.measurement import Job, JobFailed, obtain, reason, stored
 from sweeps.overrides import CONFIGS, composed, explain, setting, target_of
-from sweeps.processes import device_lock, on_gpu, processes, set_up
+from sweeps.processes import on_gpu, processes, set_up
 from sweeps.terminal import time_left
 
 OF_MEASUREMENT = ("engine", "precision", "protocol", "pictures", "exclusive")
@@ -79,6 +81,7 @@ class Launcher:
         with initialize_config_dir(str(CONFIGS), version_base="1.3"):
             loader = GlobalHydra.instance().config_loader()
         config = self._config()
+        own_folder(config)
         join_cluster(config)
         try:
             launcher = Plugins.instance().instantiate_launcher(
@@ -98,6 +101,17 @@ class Launcher:
     def _config(self) -> DictConfig:
         words = [*self.words, setting("outputs", str(self.outputs))]
         return composed(words, return_hydra_config=True)
+
+
+def own_folder(config: DictConfig) -> Path:
+    """Give the sweep a folder that no other has, for how its jobs end; it is below that in `config`
+    and takes its place, also in the configurations of the jobs."""
+    name = f"{datetime.now():%Y-%m-%d_%H-%M-%S}-{uuid.uuid4().hex[:6]}"
+    folder = Path(config.hydra.sweep.dir).resolve() / name
+    with flag_override(config, ["readonly", "struct"], False):
+        config.hydra.sweep.dir = str(folder)
+        config.hydra.overrides.hydra.append(setting("hydra.sweep.dir", str(folder)))
+    return folder
 
 
 def join_cluster(config: DictConfig) -> None:
@@ -333,6 +347,4 @@ def _train(config: DictConfig) -> float:
     """Train, or load the training, in a worker process; return the seconds it took."""
     log, quiet = (ConsoleLog(Path(config.outputs), quiet=each) for each in (False, True))
     quiet.followers = log.followers
-    turn = device_lock(config.device, log, training_threads(config))
-    with turn if config.exclusive else nullcontext():
-        return trained(config, quiet).train_s
+    return trained(config, log, progress=quiet).train_s

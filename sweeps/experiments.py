@@ -3,11 +3,9 @@
 from collections.abc import Sequence
 from typing import Any
 
-from omegaconf import OmegaConf
-
 from bench.errors import SteerbenchError, unknown
 from bench.study import Axis
-from sweeps.overrides import choices, swept
+from sweeps.overrides import choices, loaded, swept
 
 SEED = "seed"  # in a grid, it makes no lines: they are means over their seeds
 
@@ -16,10 +14,10 @@ def experiment(name: str, words: Sequence[str] = ()) -> Any:
     """What the file of an experiment holds."""
     files = choices("experiment", words)
     if name not in files:
-        tables = [each for each, file in files.items() if "table" in OmegaConf.load(file)]
+        tables = [each for each, file in files.items() if "table" in loaded(file)]
         error = unknown("table", name, tables)
         raise SteerbenchError(f"{error} --config-dir DIR names a folder with further ones")
-    return OmegaConf.to_container(OmegaConf.load(files[name]))
+    return loaded(files[name])
 
 
 def grid(name: str, words: Sequence[str] = ()) -> dict[str, list[str]]:

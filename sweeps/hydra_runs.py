@@ -20,7 +20,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from bench.errors import unexpected
-from sweeps.overrides import CONFIGS, explain, further, of_hydra, settled, swept
+from sweeps.overrides import CONFIGS, as_typed, explain, further, hint, of_hydra, settled, swept
 
 if TYPE_CHECKING:  # these load torch, which --help and completion do not need
     from sweeps.execute import Ended
@@ -45,9 +45,9 @@ class SweepCallback(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Note the folder of the sweep, before its launcher is made."""
-        from sweeps.execute import join_cluster
+        from sweeps.execute import join_cluster, own_folder
 
-        _sweep.get().folder = Path(config.hydra.sweep.dir)
+        _sweep.get().folder = own_folder(config)
         join_cluster(config)
 
 
@@ -60,8 +60,9 @@ def run_hydra(
     A failed job of a sweep is reported at once, and the others still run. Returns how the jobs of
     the sweep ended, and the errors. SteerbenchError if the sweep has several stores.
     """
+    argv = as_typed(argv)
     if several := swept([word for word in argv if word.startswith("outputs=")]):
-        got = ", ".join(several["outputs"])
+        got = ", ".join(several["outputs"]) + hint(f"outputs={','.join(several['outputs'])}")
         raise unexpected("outputs", "one folder, for the table of all jobs", got)
     # Hydra's parser accepts overrides only in one contiguous block, so flags go first.
     flags = [word for word in argv if word.startswith("-") or not re.search("^~|=", word)]
@@ -75,13 +76,16 @@ def run_hydra(
         sources = present.runtime.config_sources
         folders = [f"--config-dir={x.path}" for x in sources if x.provider == "command-line"]
         command = ["steerbench", "run", *folders, *present.overrides.task]
-        config = settled(config, further(folders))
-        if present.mode == RunMode.MULTIRUN:
-            _one_of_many(config, command)
-            return
+        several = present.mode == RunMode.MULTIRUN
         try:
-            alone(config, command)
+            config = settled(config, further(folders))
+            if several:
+                _one_of_many(config, command)
+            else:
+                alone(config, command)
         except Exception as error:
+            if several and present.runtime.choices["hydra/launcher"] != "basic":
+                raise  # in another process, whose errors are not these
             errors.append(error)  # bypasses Hydra, which would print it in its own way
 
     token = _sweep.set(sweep := RunningSweep())

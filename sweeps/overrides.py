@@ -6,8 +6,10 @@ further choices. Installed packages bring folders of choices, too, named by entr
 
 import pkgutil
 import re
+import shlex
 import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import cache
 from importlib import metadata, util
 from itertools import pairwise
@@ -18,15 +20,23 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Quote, QuotedString, Sweep
 from hydra.core.plugins import Plugins
 from hydra.errors import MissingConfigException, OverrideParseException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf, open_dict
+from yaml import YAMLError
 
-from bench.errors import SteerbenchError, unknown
+from bench.errors import SteerbenchError, unexpected, unknown
 
 CONFIGS = Path(__file__).parent / "configs"
 FLAGS = ("--config-dir", "-cd")
+
+PLACE = re.compile(
+    r"[+]*(\w+\.)*(\w+_)?(path|file|dir|folder|root|images|checkpoint|outputs|report|weights)="
+    r"|[+]*scene\.(model|split|masks?)="
+)
+"""Settings whose value names a file or a folder."""
 
 VALIDATION = "validation"
 """The split of held-out training pictures, and the trajectory that renders them."""
@@ -40,8 +50,7 @@ def composed(words: Sequence[str], **options: bool) -> DictConfig:
 
     SteerbenchError if a setting or a choice does not exist, or cannot be read.
     """
-    quoted = [str(folder).replace("'", r"\'") for folder in _typed(words)]
-    paths = ",".join(f"'file://{folder}'" for folder in quoted)
+    paths = ",".join(quoted(f"file://{folder}") for folder in _typed(words))
     overrides = [*_overrides(words), *([f"hydra.searchpath=[{paths}]"] if paths else [])]
     try:
         with initialize_config_dir(str(CONFIGS), version_base="1.3"):
@@ -59,6 +68,11 @@ def settled(config: DictConfig, folders: Sequence[Path]) -> DictConfig:
 
     From here on only the trajectory determines which pictures are scored, hence held out.
     """
+    for group in ("method", "scene", "trajectory", "protocol", "budget", "engine"):
+        node = config.get(group)
+        if not OmegaConf.is_dict(node) or not isinstance(node.get("_target_"), str):
+            expected = "settings with `_target_`, the name of a class or function"
+            raise unexpected(f"{group}: its YAML file", expected, "none")
     with open_dict(config):
         for declared in ("table", "study"):
             config.pop(declared, None)
@@ -100,17 +114,46 @@ def swept(words: Sequence[str], loader: ConfigLoader | None = None) -> dict[str,
 
 
 def setting(name: str, text: str) -> str:
-    """The word that sets `name` to `text`, quoted if Hydra would misread it."""
-    if re.fullmatch(r"[\w/.+-]+", text, re.ASCII):
-        return f"{name}={text}"
-    escaped = text.replace("'", r"\'")
-    return f"{name}='{escaped}'"
+    """The word that sets `name` to `text`, quoted if Hydra would read something else."""
+    plain = _value(text) == text and "${" not in text
+    return f"{name}={text if plain else quoted(text)}"
+
+
+def quoted(text: str) -> str:
+    """`text` in quotes as Hydra reads them, also if it looks like an interpolation."""
+    return QuotedString(text.replace("${", r"\${"), Quote.single).with_quotes()
 
 
 def unquoted(text: str) -> str:
-    """What a value means that `setting` has quoted, or that is typed in quotes inside quotes."""
-    quoted = re.fullmatch(r"(['\"])(.*)\1", text)
-    return quoted[2].replace(f"\\{quoted[1]}", quoted[1]) if quoted else text
+    """What `setting` has quoted, or what is typed in quotes inside quotes."""
+    return value if isinstance(value := _value(text), str) else text
+
+
+def as_typed(words: Iterable[str]) -> list[str]:
+    """`words` with the names of files and folders in quotes where Hydra would read others.
+
+    Commas separate the values of a sweep, unless a file or folder has a name with them.
+    """
+    return [_as_typed(*word.split("=", 1)) if PLACE.match(word) else word for word in words]
+
+
+def _as_typed(name: str, text: str) -> str:
+    with suppress(OSError, RuntimeError, ValueError):  # of what can be no name
+        if text and Path(text).expanduser().exists():
+            return setting(name, text)
+    value = _value(text)
+    meant = text in ("", "null", "???") or text[0] in "'\"" or "${" in text
+    if meant or isinstance(value, Sweep):
+        return f"{name}={text}"
+    parts = text.split(",") if value is None else [text]
+    return f"{name}={','.join(setting('', part)[1:] for part in parts)}"
+
+
+def _value(text: str) -> Any:
+    """What Hydra reads as the value of a setting; None if it cannot."""
+    with suppress(Exception):  # its parser raises many kinds
+        return OverridesParser.create().parse_override(f"x={text}").value()
+    return None
 
 
 def of_hydra(error: Exception) -> bool:
@@ -120,7 +163,8 @@ def of_hydra(error: Exception) -> bool:
     an exception of its own.
     """
     *_, (innermost, _) = traceback.walk_tb(error.__traceback__)
-    return innermost.f_globals["__name__"].partition(".")[0] in ("hydra", "omegaconf", "antlr4")
+    library = innermost.f_globals["__name__"].partition(".")[0]
+    return library in ("hydra", "omegaconf", "antlr4", "yaml") or isinstance(error, UnicodeError)
 
 
 def explain(error: Exception, words: Sequence[str]) -> SteerbenchError:
@@ -128,13 +172,15 @@ def explain(error: Exception, words: Sequence[str]) -> SteerbenchError:
     if isinstance(error, OverrideParseException):
         return SteerbenchError(
             f"cannot read '{error.override}': settings are written key=value, "
-            "for example seed=1 or scene=wires; a value with other signs than letters, digits and "
-            "_/.+- is written in quotes inside quotes, as in \"scene.path='~/my data'\" "
+            f"for example seed=1 or scene=wires{hint(error.override)} "
             f"({error.message.splitlines()[0]})"
         )
-    if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
+    if several := re.match(r"(?:Ambiguous value for argument|Sweep parameters) '(.*)'", str(error)):
+        name, got = several[1].partition("=")[0], f"several{hint(several[1])}"
+        return unexpected(name, "one value, or `steerbench run -m`, which measures each", got)
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         group, _, name = error.missing_cfg_file.rpartition("/")
-        return unknown(group, name, error.options)
+        return unknown(group, name, error.options or choices(group, words))
     if key := re.match(r"Could not override '([^']+)'", str(error)):
         if (CONFIGS / key[1]).is_dir():
             return SteerbenchError(
@@ -142,9 +188,21 @@ def explain(error: Exception, words: Sequence[str]) -> SteerbenchError:
                 "budget for its sizes"
             )
         return unknown("setting", key[1], _settings(words))
+    for word in words:  # a file that cannot be read is named
+        group, _, name = word.lstrip("+").partition("=")
+        if file := choices(group, words).get(name):
+            loaded(file)
     causes = [error, error.__cause__] if error.__cause__ else [error]
     lines = [line.strip() for cause in causes for line in str(cause).splitlines()]
     return SteerbenchError("; ".join(line for line in lines if line))
+
+
+def hint(word: str) -> str:
+    """How a shell takes a text as the value of a setting; empty if `word` sets nothing."""
+    name, equals, text = word.partition("=")
+    word = setting(name, text)
+    shown = shlex.quote(word) if set('"$`\\!') & set(word) else f'"{word}"'
+    return f"; a text with such signs is written in quotes inside quotes, {shown}" if equals else ""
 
 
 def _settings(words: Sequence[str]) -> list[str]:
@@ -196,16 +254,25 @@ def described(group: str, words: Sequence[str] = ()) -> dict[str, str]:
     comment that is not a Hydra directive (`# @package`)."""
     comments = {}
     for name, path in choices(group, words).items():
-        lines = [line[1:].strip() for line in path.read_text().splitlines() if line[:1] == "#"]
+        text = path.read_text(encoding="utf-8", errors="replace")
+        lines = [line[1:].strip() for line in text.splitlines() if line[:1] == "#"]
         comments[name] = next((line for line in lines if not line.startswith("@")), "")
     return comments
+
+
+def loaded(path: Path) -> Any:
+    """What a YAML file holds; SteerbenchError if it cannot be read, or holds no settings."""
+    try:
+        return OmegaConf.to_container(OmegaConf.load(path))
+    except (OSError, ValueError, YAMLError) as error:
+        raise unexpected(path, "a YAML file of settings", " ".join(str(error).split())) from error
 
 
 def target_of(node: Mapping[str, Any] | DictConfig) -> Any:
     """The class or function that `_target_` names; SteerbenchError if it cannot be imported."""
     try:
         return pkgutil.resolve_name(node["_target_"])
-    except (ImportError, AttributeError, ValueError) as error:
+    except (ImportError, AttributeError, ValueError, TypeError) as error:
         raise SteerbenchError(
             f"cannot import {node['_target_']}: {error}; PYTHONPATH must name the folder of a "
             "package that is not installed"
@@ -216,7 +283,7 @@ def engine_kinds(words: Sequence[str]) -> dict[str, Any]:
     """The class of each engine by name, but for one without precisions, which chooses among the
     others; torch, the standard, comes first."""
     files = sorted(choices("engine", words).items(), key=lambda file: (file[0] != "torch", file))
-    kinds = {name: target_of(OmegaConf.load(path)) for name, path in files}  # type: ignore[arg-type]
+    kinds = {name: target_of(loaded(path)) for name, path in files}
     return {name: kind for name, kind in kinds.items() if kind.precisions}
 
 
@@ -226,7 +293,7 @@ def folder_words(words: Sequence[str]) -> list[str]:
 
 
 def _overrides(words: Sequence[str]) -> list[str]:
-    return [word for word in words if not word.startswith(f"{FLAGS[0]}=")]
+    return [word for word in as_typed(words) if not word.startswith(f"{FLAGS[0]}=")]
 
 
 def searched(words: Sequence[str]) -> list[Path]:

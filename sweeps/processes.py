@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bench.errors import not_there
 from bench.memory import keep_freed
 from bench.waiting import queued
 
@@ -101,4 +102,7 @@ def lock_file(device: str) -> Path:
     which = torch.cuda.get_device_properties(device).uuid if gpu else device
     name = hashlib.sha256(f"{platform.node()} {which}".encode()).hexdigest()[:16]
     usual = "/var/tmp" if os.access("/var/tmp", os.W_OK) else tempfile.gettempdir()
-    return Path(os.environ.get(LOCKS) or usual) / f"steerbench-{name}.lock"
+    folder = Path(os.environ.get(LOCKS) or usual)
+    if not folder.is_dir():
+        raise not_there(folder, f"a folder for locks, as ${LOCKS} says")
+    return folder / f"steerbench-{name}.lock"

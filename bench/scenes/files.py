@@ -3,7 +3,6 @@
 The argument `where` is the start of an error message: the file, and the field inside it.
 """
 
-import json
 import math
 import sys
 from collections.abc import Mapping
@@ -13,8 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bench.errors import unexpected
-from bench.scenes.lookup import absent
+from bench import records
+from bench.errors import not_there, unexpected
 from bench.scenes.remarks import Remarks
 
 SMALLEST_ANGLE = 1e-9  # of view in radians: below any telescope's, but its tangent is not 0
@@ -26,35 +25,17 @@ def data_folder(path: str | Path) -> Path:
     """The data set's folder with all links resolved; SteerbenchError if it is not a folder."""
     root = Path(path).expanduser()
     if not root.is_dir():
-        raise unexpected(root, "a folder", "a file" if root.exists() else "nothing there")
+        raise not_there(root, "a folder")
     return root.resolve()
 
 
 def read_text(root: Path, relative: str) -> str:
-    path = root / relative
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError as error:
-        raise unexpected(path, "a file", absent(root, relative)) from error
-    except (OSError, ValueError) as error:
-        raise unexpected(path, "a readable text file", error) from error
+    return records.read_text(root / relative)
 
 
 def read_json(root: Path, relative: str, listed: str = "") -> dict:
     """The object in a file; a list is one whose field `listed` it is, where that is given."""
-    path = root / relative
-    try:
-        value = json.loads(read_text(root, relative))
-    except json.JSONDecodeError as error:
-        at = f"{path}: line {error.lineno}, column {error.colno}"
-        raise unexpected(at, "JSON", error.msg) from error
-    except (RecursionError, ValueError) as error:
-        raise unexpected(path, "JSON", error) from error
-    if listed and isinstance(value, list):
-        return {listed: value}
-    if not isinstance(value, dict):
-        raise unexpected(path, "a JSON object", type(value).__name__)
-    return value
+    return records.read_json(root / relative, listed=listed)
 
 
 def entries_of(record: Mapping, name: str, path: Path) -> list[tuple[str, dict]]:

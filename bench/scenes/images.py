@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from bench.cameras import crop_camera, pixel_grid, scale_camera
-from bench.errors import unexpected
+from bench.errors import not_there, unexpected
 from bench.threads import in_parallel
 from bench.types import Camera, Log
 
@@ -191,7 +191,9 @@ def contents(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise unexpected(path, "a readable picture", error) from error
+        if not path.exists():
+            raise not_there(path, "a picture") from error
+        raise unexpected(path, "a readable picture", error.strerror) from error
 
 
 def decode_bytes(content: bytes, path: Path, upright: bool = True) -> Tensor:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import torch
 
-from bench.errors import SteerbenchError, Unavailable
+from bench.errors import SteerbenchError, Unavailable, unexpected
 from bench.provenance import computed_by
 from bench.types import Log
 from methods.engines import Engine, keep
@@ -77,7 +77,11 @@ class Auto:
             new.write_text(json.dumps(measured))
 
         keep(path, write, log)
-        found = [EngineFigures(*figures) for figures in json.loads(path.read_text())]
+        try:
+            found = [EngineFigures(*figures) for figures in json.loads(path.read_text())]
+        except (ValueError, TypeError) as error:
+            got = f"{error}; remove it, and they are measured again"
+            raise unexpected(path, "a list with the figures of engines", got) from error
         for engine, figures in zip(engines, found, strict=True):
             log.info(f"engine {engine}: {figures.ms:.1f} ms, {figures.psnr:.2f} dB")
         good = [place for place, it in enumerate(found) if it.psnr >= found[0].psnr - self.loss]

@@ -23,6 +23,7 @@ import torch
 
 from bench.errors import SteerbenchError, explained, unexpected
 from bench.provenance import computed_by, sha256
+from bench.records import read_record
 from bench.results import content_key
 from bench.scenes.export import data_camera, picture_file, write_blender
 from bench.sharing import missing, whole
@@ -179,7 +180,7 @@ class External:
                     self._restart()  # without the memory of a training
             else:
                 log.info(f"{self.name}: found in {folder}")
-                cost = json.loads(finished.read_text())
+                cost = read_record(finished)
             self.train_s = cost["train_s"]
             self.train_peak_bytes = cost["train_peak_bytes"] or math.nan
         if "load" in can:

@@ -19,6 +19,7 @@ import torch
 from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
+from bench.errors import not_there
 from bench.sharing import whole
 from bench.types import Scene, SteerbenchError
 from methods.gaussians.model import Gaussians
@@ -77,7 +78,8 @@ def read(path: Path, scene: Scene, say: Callable[[str], object]) -> Gaussians:
         if wrong:
             raise SteerbenchError(f"{path}: {why}")
 
-    refuse(not path.is_file(), "expected a PLY file of 3D Gaussians, there is none")
+    if not path.is_file():
+        raise not_there(path, "a PLY file of 3D Gaussians")
     convert = f"convert it: splat-transform {path.name} {path.name.partition('.')[0]}-plain.ply"
     kind = path.suffix.lower()
     refuse(kind in PACKED, f"expected a PLY file of 3D Gaussians, got {kind}; {convert}")

@@ -184,7 +184,8 @@ class Viewer:
     def _turn(self, place: int, knob: str, settings: Sequence[str]) -> None:
         now = {**self._turned[place], knob: settings}
         try:
-            config = composed([*self.wanted[place], *chain(*now.values())])
+            words = [*self.wanted[place], *chain(*now.values())]
+            config = composed([*words, "exclusive=false"])  # nothing is trained, as a rule
             self.painter.put(place, trained(config, self.log))
             self._turned[place] = now
         except SteerbenchError as error:

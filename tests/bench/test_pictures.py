@@ -117,7 +117,7 @@ def test_pictures_that_do_not_match_are_named(tmp_path, match, names, said):
     true = write(tmp_path / "true", dict.fromkeys(["a.png", "b.png"], noise()))
     with pytest.raises(SteerbenchError, match=said):
         pictures.pairs_with_folder(ours, true, match)
-    with pytest.raises(SteerbenchError, match="expected a folder, got nothing there"):
+    with pytest.raises(SteerbenchError, match="expected a folder, got no"):
         pictures.listed(tmp_path / "nowhere")
     (tmp_path / "linear").mkdir()
     (tmp_path / "linear/0.exr").touch()

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from bench import results
-from bench.results import COLUMNS, SCHEMA_VERSION, Measurement, Store, content_key
+from bench.results import COLUMNS, SCHEMA_VERSION, STEADY, Measurement, Store, content_key
 from bench.types import SteerbenchError
 
 JSON = st.recursive(
@@ -33,7 +33,9 @@ def measurement(values: list[float], text: str = "plain") -> Measurement:
     figures = {"n": 1, "lo": math.nan, "hi": math.nan, "seed": 0}
     words = dict.fromkeys(set(COLUMNS) - {"run", "commit", "metric", "value", *figures}, text)
     rows = pd.DataFrame({"metric": metrics, "value": values, **figures, **words})
-    frames = pd.DataFrame({"frame": [0, 1], "name": ["007", "NA"], "psnr": [30.25, math.nan]})
+    frames = pd.DataFrame(
+        {"frame": [0, 1], "name": ["007", "NA"], "phase": STEADY, "psnr": [30.25, math.nan]}
+    )
     picture = np.arange(60, dtype=np.uint8).reshape(4, 5, 3)
     return Measurement(rows, frames, {"0000-truth": picture}, {"note": "as measured"})
 
@@ -162,10 +164,44 @@ def test_runs_of_another_schema_are_reported_in_one_line_and_left_out(store):
     reports: list[str] = []
     assert set(store.rows(report=reports.append)["run"]) == {*kept}
     assert len(reports) == 2
-    assert any(f"{min(one, two)} and 1 more" in line and "schema 99" in line for line in reports)
+    both = f"{min(one, two)}, {max(one, two)}: stored by another version"
+    assert any(both in line and "schema 99" in line for line in reports)
     assert any(damaged in line for line in reports)
-    with pytest.warns(UserWarning, match="left out"):
-        store.rows()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (",phase,", ",fase,", "expected a column phase, got fase"),
+        (",lo,hi,", ",hi,lo,", "in this order, got another"),
+        ("metric_0", "metric_0,,", "a value for each column, got zip() argument 2 is longer"),
+        (",1,", ",one,", "got invalid literal for int() with base 10: 'one'"),
+        ("\n", "", "expected a column commit"),
+        ("{key}", "other", "the run that its folder is named after, got other"),
+    ],
+)
+def test_a_run_whose_rows_are_damaged_is_left_out_and_the_reason_is_said(store, old, new, said):
+    key, kept = (store.save({"seed": i}, measurement([i])) for i in range(2))
+    file = store.folder / key / "rows.csv"
+    file.write_text(file.read_text().replace(old.format(key=key), new))
+    reports: list[str] = []
+    assert set(store.rows(reports.append)["run"]) == {kept}
+    assert [f"left out: {key}: rows.csv: " in line and said in line for line in reports] == [True]
+
+
+def test_fields_of_frames_and_records_that_are_not_there_are_named(store):
+    key = store.save({"seed": 0}, measurement([1.0]))
+    frames, record = (store.folder / key / name for name in ("frames.csv", "record.json"))
+    with pytest.raises(SteerbenchError, match=r"frames.csv: expected a column psnr_, got psnr"):
+        store.frames(key, ["psnr_"])
+    frames.write_text(frames.read_text().replace("30.25", "thirty"))
+    with pytest.raises(SteerbenchError, match=r"expected numbers in the column psnr, got text"):
+        store.frames(key)
+    with pytest.raises(SteerbenchError, match=r"record.json: expected a field Note, got note"):
+        store.record(key)["Note"]
+    record.write_text(record.read_text().replace('"made_of": {', '"made_of": 5, "x": {'))
+    with pytest.raises(SteerbenchError, match=r"record.json: made_of: expected dict, got 5"):
+        store.record(key)
 
 
 def test_a_disk_that_refuses_is_a_clear_error_and_leaves_nothing(store, monkeypatch):

@@ -81,8 +81,21 @@ def test_what_is_no_baseline_is_refused_with_the_way_to_make_one(text, outputs, 
     path = tmp_path / "none.json"
     if text is not None:
         path.write_text(text)
-    with pytest.raises(SteerbenchError, match=r"no baseline .*check --record"):
+    with pytest.raises(SteerbenchError, match=r"no baseline: .*check --record"):
         check(path, outputs)
+
+
+def test_a_damaged_baseline_is_refused_by_the_place(baseline, outputs):
+    text = baseline.read_text()
+    for old, new, said in (
+        ('"absolute"', '"absolut"', "limits.psnr: expected fields of better, absolute,"),
+        ('"psnr": {', '"psnrr": {', "unknown metric 'psnrr'. Did you mean psnr"),
+        ('"views": "', '"views": 5, "x": "', r"runs\[0\].seeds.5: expected fields of values,"),
+        ('"values": {', '"values": 5, "frames": {', r"seeds.5.values: expected Mapping"),
+    ):
+        baseline.write_text(text.replace(old, new, 1))
+        with pytest.raises(SteerbenchError, match=rf"no baseline: .*{said}.*check --record"):
+            check(baseline, outputs)
 
 
 @pytest.fixture

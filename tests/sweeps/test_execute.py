@@ -8,6 +8,7 @@ from unittest.mock import Mock
 
 import pytest
 
+import steerbench
 from bench import waiting
 from bench.errors import SteerbenchError
 from sweeps import execute
@@ -149,7 +150,8 @@ def test_a_run_trains_on_its_threads_also_ahead_of_a_table_and_is_timed_alone(se
         raise KeyError  # it leaves the queue all the same
     assert recorded("threads=1")["neighbours"]["exclusive"]
     execute._train(composed([*STAND_INS, "budget.threads=1"]))
-    assert seen == [("fit", [1]), ("render", [None]), ("fit", [1])]
+    steerbench.fit(*STAND_INS, "budget.threads=1")
+    assert seen == [("fit", [1]), ("render", [None]), ("fit", [1]), ("fit", [1])]
 
 
 def test_what_is_not_exclusive_waits_for_nobody_and_is_another_run(seen, quiet_log):

@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import shlex
 import signal
 from pathlib import Path
 
@@ -229,13 +230,17 @@ def test_a_folder_named_after_what_is_swept_gets_a_page_of_its_own(run, tmp_path
         assert f"scene.frames={5 - frames}" not in text
 
 
-def test_a_second_sweep_is_read_from_the_store_and_knows_nothing_of_the_first(run, tmp_path):
-    run("-m", "seed=0,1,2")
-    again = run("-m", "seed=0,1")
+@pytest.mark.parametrize("folder", ["outputs/sweeps", "shared"])
+def test_a_second_sweep_is_read_from_the_store_and_knows_nothing_of_the_first(
+    run, tmp_path, folder
+):
+    run("-m", "seed=0,1,2", f"hydra.sweep.dir={folder}")
+    again = run("-m", "seed=0,1", f"hydra.sweep.dir={folder}")
     assert "seed=2" not in again.out
+    assert "2 of 2 jobs done" in again.err
     assert "about" not in again.err
     assert len(stored(tmp_path)) == 3
-    assert len(list((tmp_path / "outputs/sweeps").iterdir())) == 2
+    assert len(list((tmp_path / folder).iterdir())) == 2
 
 
 @pytest.mark.parametrize(
@@ -258,6 +263,8 @@ def test_a_sweep_that_cannot_begin_is_one_line(run, tmp_path):
 def test_a_sweep_has_one_folder_of_outputs_for_its_table(run):
     refused = run("-m", "outputs=a,b").refused()
     assert "outputs: expected one folder, for the table of all jobs, got a, b" in refused
+    (word,) = shlex.split(refused.partition("in quotes inside quotes, ")[2])
+    run("-m", "seed=0", word).ok()
 
 
 def test_equal_jobs_share_a_line(run):

@@ -170,7 +170,7 @@ def test_what_a_link_leads_to_is_read(blender_folder, tmp_path, log, what):
     (blender_folder / what).rename(tmp_path / "outside")
     (blender_folder / what).symlink_to(tmp_path / "outside")
     assert blender.load(blender_folder, log=log).digest == digest
-    with pytest.raises(SteerbenchError, match=r"nowhere: expected a folder, got nothing there"):
+    with pytest.raises(SteerbenchError, match=r"nowhere: expected a folder, got no"):
         blender.load(tmp_path / "nowhere", log=log)
 
 

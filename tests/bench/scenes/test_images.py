@@ -211,7 +211,7 @@ def test_files_that_were_damaged_or_change_before_they_are_decoded_are_refused(f
     for index, message in (
         (1, "a whole picture"),
         (2, "the picture that was there at the start, got another"),
-        (3, "a readable picture"),
+        (3, "a picture, got no"),
     ):
         with pytest.raises(SteerbenchError, match=rf"{index}\.png: expected {message}"):
             lazy[index]

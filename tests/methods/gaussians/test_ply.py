@@ -218,7 +218,7 @@ def test_packed_files_are_named_with_what_converts_them(name, tiny_scene, tmp_pa
 
 def test_a_missing_or_damaged_file_and_one_of_another_place_are_refused(tiny_scene, tmp_path):
     path = tmp_path / "a.ply"
-    with pytest.raises(SteerbenchError, match="there is none"):
+    with pytest.raises(SteerbenchError, match="expected a PLY file of 3D Gaussians, got no"):
         ply.read(path, tiny_scene, print)
     ply.write(some(), tiny_scene, path)
     with pytest.raises(SteerbenchError, match="none of 50 Gaussians lies inside the scene"):
