@@ -19,6 +19,10 @@ FIRST_ROUNDS = (8, 16)
 """How many samples of a ray a CPU evaluates in each of the first rounds, before it knows whether
 the ray goes on; a last round has all that are left."""
 
+NEAR = HALF / 4
+"""Distance from a camera below which gradients fall with its square, where space has no end. On
+three captures, 300 steps, it is 0.2 to 0.3 dB better than half a side."""
+
 KEPT_THIN = 4  # one of so many thin samples is kept, with the length of all
 
 
@@ -49,7 +53,7 @@ def render_batch(
     sigma, values = query(field, samples.positions, samples.ray, directions, samples.encoded)
     if occupancy.contracted:
         away = samples.t * rays.directions.norm(dim=1).index_select(0, samples.ray)
-        share = (away / HALF).square().clamp(max=1)
+        share = (away / NEAR).square().clamp(max=1)
         sigma, values = _Scaled.apply(sigma, values, share)
     pixels = composite(sigma, values, samples, stop=how.stop, backend=field.backend)
     return pixels if background is None else pixels.over(background), len(samples)

@@ -14,6 +14,7 @@ from methods.kernels.march import march
 from methods.kernels.types import Occupancy, Pixels
 from methods.rendering.batch import (
     KEPT_THIN,
+    NEAR,
     Round,
     opacity_entropy,
     render_batch,
@@ -144,10 +145,10 @@ def test_the_entropy_of_opacities_is_smallest_where_rays_are_opaque_or_empty():
 def test_where_space_has_no_end_gradients_grow_with_the_squared_distance(cloud, device):
     field, occupancy = cloud
     occupancy, rays = Occupancy(occupancy.cells, contracted=True), rays_on(device)
-    rays = Rays(0.5 + 0.2 * (rays.origins - 0.5), rays.directions)  # the nearest samples are near
+    rays = Rays(0.5 + 0.1 * (rays.origins - 0.5), rays.directions)  # the nearest samples are near
     samples = march(rays, occupancy, STEP)
     away = samples.t * rays.directions.norm(dim=1)[samples.ray]
-    share = (away / 0.25).square().clamp(max=1)
+    share = (away / NEAR).square().clamp(max=1)
     assert share.min() < 0.3
     assert share.max() == 1
     sigma, geometry = field.density(samples.positions)
