@@ -90,7 +90,7 @@ class HashField(nn.Module):
     def encode_directions(self, directions: Tensor) -> Tensor:
         """Spherical harmonics [R, 16] of ray `directions` [R, 3] of any length."""
         unit = functional.normalize(directions, dim=-1)
-        return spherical_harmonics(unit, backend=self.backend).to(self._compute_dtype)
+        return spherical_harmonics(unit).to(self._compute_dtype)
 
     def encode(self, positions: Tensor) -> Tensor:
         """Features [S, channels] of the table at `positions` [S, 3]."""

@@ -15,7 +15,7 @@ from torch import Tensor
 from bench.cameras import pixel_grid, project, unproject
 from bench.types import Camera
 from methods.rendering.frame import FeatureFrame
-from methods.steernerf.kernels.splat import splat
+from methods.steernerf.splat import splat
 
 RELIABLE_ALPHA = 0.1  # the expected depth of a pixel is reliable if its opacity is more than this
 
@@ -58,24 +58,24 @@ class PointCloud:
         alpha, centre = torch.where(self.reliable, self.alpha, torch.nan), self.camera.c2w[:, 3]
         return replace(self, points=centre + (self.points - centre) / alpha[:, None])
 
-    def interval(self, low: Camera, epsilon: float, backend: str) -> Tensor:
+    def interval(self, low: Camera, epsilon: float) -> Tensor:
         """The z-depths [h, w, 2] between which each pixel of the low-resolution camera `low` is
         sampled: D - epsilon and D + epsilon, or 0 and inf where no point lands."""
-        pixel, depth = self._reprojected(low, backend)
+        pixel, depth = self._reprojected(low)
         found = depth.new_zeros(low.width * low.height + 1, 2)
         found[:, 1] = torch.inf
         found[pixel] = torch.stack((depth - epsilon, depth + epsilon), dim=-1)  # Eq. 8
         return found[:-1].view(low.height, low.width, 2)
 
-    def shown_in(self, full: Camera, backend: str) -> Points:
+    def shown_in(self, full: Camera) -> Points:
         """The features that the camera `full`, at full resolution, shows of this frame (Eq. 10)."""
-        return Points(self.values, self._reprojected(full, backend)[0])
+        return Points(self.values, self._reprojected(full)[0])
 
-    def _reprojected(self, camera: Camera, backend: str) -> tuple[Tensor, Tensor]:
+    def _reprojected(self, camera: Camera) -> tuple[Tensor, Tensor]:
         """The pixel of `camera` that shows each point, and the z-depth of each point there."""
         pixels, depth = project(camera, self.points)  # Eq. 7 at low resolution, Eq. 9 at full
-        size = camera.width, camera.height  # + 0.5: corners are rounded to the nearest one
-        return splat(pixels + 0.5, depth, *size, backend=backend), depth
+        # + 0.5: corners are rounded to the nearest one
+        return splat(pixels + 0.5, depth, camera.width, camera.height), depth
 
 
 Buffer = deque[PointCloud]

@@ -121,7 +121,7 @@ class Patches:
         top, left = (self._random(size - side + 1) for size in (view.low.height, view.low.width))
         cut = view.crop((slice(top, top + side), slice(left, left + side)))
         truth = self._truth(example, top, left, cut.full)
-        points = [cloud.shown_in(cut.full, self.pipeline.backend) for cloud in example.buffer]
+        points = [cloud.shown_in(cut.full) for cloud in example.buffer]
         return Patch(example, cut, truth, points)
 
     @cached_property

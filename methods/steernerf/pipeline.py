@@ -51,7 +51,7 @@ class Pipeline:
         self, trained: TrainedField, background: Tensor, renderer: UNet, model: ModelOptions
     ) -> None:
         self.field, self.occupancy, self.renderer = trained.field, trained.occupancy, renderer
-        self.model, self.backend = model, trained.field.backend
+        self.model = model
         more = (0, model.channels - 3)
         background = background.to(trained.field.device)
         self.background = functional.pad(background, more, value=model.feature_background)  # [K]
@@ -97,7 +97,7 @@ class Pipeline:
             with probe.stage("depth_reprojection"):
                 expected = reduction.depth == "expected"
                 cloud = preceding[0].expected() if expected else preceding[0]
-                near_far = cloud.interval(view.low, reduction.epsilon, self.backend)
+                near_far = cloud.interval(view.low, reduction.epsilon)
                 how = replace(how, window=near_far.view(-1, 2))
         with probe.stage("field"):
             where = self.occupancy if rendering.skip.empty else self._cube
@@ -120,7 +120,7 @@ class Pipeline:
         drawn = view.crop(part)
         pixels, every = (seen.full.width * seen.full.height for seen in (drawn, view))
         probe.count("drawn_pixels", pixels, every)
-        points = [cloud.shown_in(drawn.full, self.backend) for cloud in preceding]
+        points = [cloud.shown_in(drawn.full) for cloud in preceding]
         return Observation(frame, points, part)
 
     @cached_property

@@ -341,8 +341,6 @@ GO_ON = [
     ("composite backward", "one sample a ray"),
     ("encode backward", "one sample"),
     ("hash adam", "1 samples, 2 features"),
-    ("spherical", "131 directions"),
-    ("splat", "at borders, outside or not finite"),
 ]
 """Cases of kernels for which the host does not wait."""
 

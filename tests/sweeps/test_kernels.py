@@ -87,7 +87,7 @@ def test_what_a_kernel_brings_has_a_line_for_each_that_a_method_calls(steerbench
     few = ("budget.samples=64", "budget.frames=2", "--repeats", "1", f"outputs={tmp_path}")
     found = steerbench("worth", "method=ngp", *small, *few).ok().json
     rows = {row["kernel"]: row for row in found}
-    assert set(rows) == {"adam", "composite", "encode", "march", "mlp", "spherical"}
+    assert set(rows) == {"adam", "composite", "encode", "march", "mlp"}
     assert rows["adam"]["frame_ms_reference"] is None  # it is called in training alone
     for row in rows.values():
         assert row["method"] == "ngp"
@@ -133,9 +133,9 @@ def test_compiled_kernels_compute_their_quick_cases(monkeypatch):
 
 @pytest.mark.slow
 def test_compile_computes_the_cases_of_all_modules_in_processes(steerbench, monkeypatch):
-    monkeypatch.setattr("methods.checks.modules", lambda name: ["methods.kernels.spherical.cases"])
+    monkeypatch.setattr("methods.checks.modules", lambda name: ["methods.kernels.shade.cases"])
     assert steerbench("compile").status == 0
-    monkeypatch.setattr("methods.checks.modules", lambda name: ["methods.kernels.spherical"])
+    monkeypatch.setattr("methods.checks.modules", lambda name: ["methods.kernels.shade"])
     with pytest.raises(AttributeError, match="has no attribute 'cases'"):
         steerbench("compile")
 

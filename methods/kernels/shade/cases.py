@@ -3,11 +3,11 @@
 from functools import partial
 
 import torch
+from torch.nn.functional import normalize
 
 from bench.case import U32, Bound, Case, Given, Operation
 from methods.kernels.dispatch import served
 from methods.kernels.shade import SIZES, shade
-from methods.kernels.spherical.cases import unit_directions
 
 SHADE = Operation(
     "shade",
@@ -42,4 +42,6 @@ def cases() -> list[Case]:
 def _coloured(count: int, size: int) -> Given:
     generator = torch.Generator().manual_seed(count + 1)
     coefficients = torch.randn(count, size, 3, generator=generator).clamp(-6, 6)
-    return {"coefficients": coefficients, **unit_directions(count)}
+    generator = torch.Generator().manual_seed(count)
+    directions = normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    return {"coefficients": coefficients, "directions": directions}

@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from methods.kernels.spherical.reference import spherical_harmonics
+from methods.kernels.spherical import spherical_harmonics
 
 
 def shade(coefficients: Tensor, directions: Tensor) -> Tensor:

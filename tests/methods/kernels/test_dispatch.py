@@ -8,7 +8,7 @@ import torch
 
 from bench.errors import Unavailable
 from methods.kernels import availability, dispatch, resolve
-from methods.kernels.spherical import spherical_harmonics
+from methods.kernels.shade import shade
 
 
 def test_auto_goes_by_the_device():
@@ -35,19 +35,19 @@ def test_backend_that_cannot_be_used_says_why(monkeypatch):
 @pytest.mark.parametrize("backend", ["auto", "cpu"])
 def test_a_kernel_without_a_version_is_computed_by_its_reference(backend, monkeypatch):
     monkeypatch.setattr(dispatch, "served", lambda kernel: ("reference",))
-    kernel, device = "methods.kernels.spherical", torch.device("cpu")
+    kernel, device = "methods.kernels.shade", torch.device("cpu")
     assert dispatch.implementation(kernel, backend, device).__name__ == f"{kernel}.reference"
 
 
 def test_for_a_while_a_kernel_is_computed_by_its_reference_whatever_is_asked_for():
     """The reference alone gives a gradient for directions."""
-    directions = torch.rand(3, 3, requires_grad=True)
-    kernel = "methods.kernels.spherical"
+    given = torch.rand(3, 1, 3), torch.rand(3, 3, requires_grad=True)
+    kernel = "methods.kernels.shade"
     with dispatch.forced(kernel, "reference"), dispatch.kernel_calls() as called:
-        assert spherical_harmonics(directions, backend="cpu").requires_grad
+        assert shade(*given, backend="cpu").requires_grad
     assert called == {kernel}
     with pytest.raises(ValueError, match="no gradient for directions"):
-        spherical_harmonics(directions, backend="cpu")
+        shade(*given, backend="cpu")
 
 
 def test_an_interpreted_backend_is_not_compiled(monkeypatch):
@@ -61,10 +61,10 @@ def test_an_interpreted_backend_is_not_compiled(monkeypatch):
 def test_torch_keeps_its_threads_when_the_first_kernel_starts_its_own():
     program = """
 import torch
-from methods.kernels.spherical import spherical_harmonics
+from methods.kernels.shade import shade
 
 torch.set_num_threads(1)
-spherical_harmonics(torch.rand(100, 3), backend="cpu")
+shade(torch.rand(100, 1, 3), torch.rand(100, 3), backend="cpu")
 print(torch.get_num_threads())
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)

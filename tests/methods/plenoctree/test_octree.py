@@ -36,7 +36,7 @@ def test_the_picture_of_the_visible_leaves_is_that_of_a_plain_loop_over_all():
         ends = torch.stack(((lower - origin) / direction, (lower + 1 / 16 - origin) / direction))
         near, far = ends.amin(dim=0).amax(dim=1), ends.amax(dim=0).amin(dim=1)
         towards = (direction / direction.norm()).float()[None]
-        basis = spherical_harmonics(towards, backend="reference")[0, :4].double()
+        basis = spherical_harmonics(towards)[0, :4].double()
         light, colour = 1.0, torch.zeros(3, dtype=torch.float64)
         for leaf in near.argsort()[(near < far)[near.argsort()]].tolist():
             sigma = max(octree.light.density[leaf].item(), 0)

@@ -43,7 +43,7 @@ def low_camera(scale: int) -> Camera:
 
 def shown(cloud: PointCloud, camera: Camera) -> Tensor:
     """The point of `cloud` that each pixel of `camera` shows, -1 for none: [H, W]."""
-    pixel = cloud.shown_in(camera, "auto").pixel
+    pixel = cloud.shown_in(camera).pixel
     index = torch.full((camera.height * camera.width + 1,), -1)
     index[pixel] = torch.arange(len(pixel))
     return index[:-1].view(camera.height, camera.width)
@@ -132,7 +132,7 @@ def render(field: Solid, interval: Tensor | None = None) -> tuple[FeatureFrame, 
 
 def interval_of(frame: FeatureFrame) -> Tensor:
     """Of a camera that stays where it is."""
-    return PointCloud.of(frame).expected().interval(along_x(), EPSILON, "cpu")
+    return PointCloud.of(frame).expected().interval(along_x(), EPSILON)
 
 
 def test_a_surface_is_found_inside_the_interval_alone():

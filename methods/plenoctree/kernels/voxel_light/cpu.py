@@ -23,7 +23,8 @@ from methods.kernels.cpu import (
     sigmoid,
     u64,
 )
-from methods.kernels.spherical import CHANNELS, spherical_harmonics
+from methods.kernels.shade.cpu import basis_of
+from methods.kernels.spherical import CHANNELS
 from methods.kernels.types import Pixels
 from methods.kernels.voxel_walk import Voxels
 from methods.kernels.voxel_walk.cpu import length_of, maps_of, walk_ray
@@ -50,7 +51,7 @@ def render_voxels(
     check_float32(rays.origins, rays.directions, light.density, light.harmonics)
     pixels = Pixels.blank(len(rays.origins), 3)
     crossed, shaded = torch.zeros(2, len(rays.origins), dtype=torch.int32)
-    basis = spherical_harmonics(normalize(rays.directions, dim=1), backend="cpu")
+    basis = basis_of(normalize(rays.directions, dim=1))
     _render(
         tuple(arrays(rays.origins, rays.directions, basis.view(-1))),
         tuple(arrays(light.density, light.harmonics.reshape(-1))),
@@ -66,7 +67,7 @@ def shade_voxels(
     harmonics: Tensor, voxel: Tensor, ray: Tensor, directions: Tensor, grad_buffer: Tensor | None
 ) -> Tensor:
     check_float32(harmonics, directions)
-    basis = spherical_harmonics(directions, backend="cpu")
+    basis = basis_of(directions)
     return _ShadeVoxels.apply(harmonics, voxel, ray, basis, grad_buffer)
 
 

@@ -1,14 +1,26 @@
-"""Spherical harmonics in plain torch."""
+"""Real spherical harmonics of view directions, degrees 0 to 3."""
+
+import math
 
 import torch
 from torch import Tensor
 
-from methods.kernels.spherical import FACTORS
+from bench.types import check_shape
+
+CHANNELS = 16
+RATIOS = (1 / 4, 3 / 4, 15 / 4, 5 / 16, 15 / 16, 35 / 32, 105 / 4, 21 / 32, 7 / 16, 105 / 16)
+FACTORS = [math.sqrt(ratio / math.pi) for ratio in RATIOS]
+"""Factors of the polynomials, in the order of their first use by degree and order."""
 
 C00, C1, C2, C20, C22, C33, C3XYZ, C31, C30, C32 = FACTORS
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:
+    """Values at unit `directions` [R, 3]: [R, 16], ordered (l, m) = (0,0) (1,-1) (1,0) ... (3,3).
+
+    Orthonormal over the sphere, without the Condon-Shortley phase, as polynomials in x, y, z.
+    """
+    check_shape("directions", directions, None, 3)
     x, y, z = directions.unbind(dim=-1)
     xx, yy, zz = x * x, y * y, z * z
     values = (

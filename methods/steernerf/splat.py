@@ -7,12 +7,10 @@ import torch
 from torch import Tensor
 
 from bench.types import check_shape
-from methods.kernels.dispatch import implementation
 
 
-def splat(
-    pixels: Tensor, depth: Tensor, width: int, height: int, *, backend: str = "auto"
-) -> Tensor:
+@torch.no_grad()
+def splat(pixels: Tensor, depth: Tensor, width: int, height: int) -> Tensor:
     """Find the pixel of a width x height picture that shows each of N points: [N] int64, row by
     row, or width * height, one after the last, for a point that no pixel shows.
 
@@ -23,8 +21,14 @@ def splat(
     """
     check_shape("depth", depth, None)
     check_shape("pixels", pixels, len(depth), 2)
-    chosen, nowhere = implementation(__name__, backend, pixels.device), width * height
-    last = torch.full((nowhere + 1,), -1, dtype=torch.int32, device=pixels.device)
-    landed = chosen.splat(pixels.detach(), depth.detach(), width, height, last)
+    nowhere, (u, v) = width * height, pixels.unbind(dim=1)
+    # Compared as floats, where comparisons with NaN are false; converting huge or non-finite
+    # values to integers is undefined.
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    taken = inside & (depth > 0) & (depth < torch.inf)  # [N]
+    # The point is rounded to a pixel; the conversion is floor, as coordinates are not negative.
+    row, column = (torch.where(taken, x, 0).long() for x in (v, u))
+    landed = torch.where(taken, row * width + column, nowhere)
     number = torch.arange(len(depth), dtype=torch.int32, device=pixels.device)
+    last = number.new_full((nowhere + 1,), -1).scatter_reduce_(0, landed, number, "amax")
     return torch.where(last[landed] == number, landed, nowhere)

@@ -1,1 +1,0 @@
-"""Operations that this method alone computes; see `methods.kernels`."""
