@@ -237,7 +237,6 @@ def _converse(channel, kind):
         elif message in ("fit", "load"):
             job = Job(header, channel)
             getattr(renderer, message)(job)
-            answer = {"peak_bytes": getattr(renderer, "peak_bytes", _peak)()}
             files = [path for path in job.state.rglob("*") if path.is_file()] if job.state else []
             answer = {"notes": list(getattr(renderer, "notes", ()))}
             stored = {"model": sum(path.stat().st_size for path in files)} if files else {}

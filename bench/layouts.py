@@ -83,10 +83,6 @@ def _colmap(scene: Scene, folder: Path, log: Log) -> None:
         def write(number: int, split: Split = split, pictures: Path = pictures) -> None:
             flat = as_bytes(composite(split.images[number - 1], scene.background))
             Image.fromarray(flat).save(pictures / f"{number:04}.png")
-            if (mask := split.mask(number - 1)) is not None:
-                masks = pictures.with_name("masks")
-                masks.mkdir(exist_ok=True)
-                Image.fromarray(mask.numpy()).save(masks / f"{number:04}.png.png")
 
         numbers, cameras, images = range(1, len(split) + 1), [], []
         in_parallel(write, numbers, f"write {name}", log)

@@ -25,6 +25,7 @@ from bench.scenes.files import (
     focal_length,
     matrix,
     number,
+    numbers_of,
     opengl_pose,
     opengl_to_opencv,
     read_json,
@@ -32,7 +33,7 @@ from bench.scenes.files import (
     whole_number,
 )
 from bench.scenes.remarks import Remarks
-from bench.scenes.transforms import BOX, KNOWN, program_maps, read_camera, read_lens
+from bench.scenes.transforms import KNOWN, program_maps, read_camera, read_lens
 from bench.types import Camera, Scene
 
 KEYFRAMES = "camera_path"  # under which a file of nerfstudio's viewer lists its cameras
@@ -45,14 +46,16 @@ FORMS = {
     KEYFRAMES: "nerfstudio's viewer",
     "frames": "NerfBaselines, or a transforms.json",
     "path": "instant-ngp's base_cam.json",
-    LISTED: "3D Gaussian Splatting's cameras.json, or ns-export",
+    LISTED: "3D Gaussian Splatting's cameras.json",
 }
 """The files that have a field of that name."""
+
+READ = "; ".join(f"{name} ({form})" for name, form in FORMS.items())
 
 HARMLESS = """coordinates camera_type render_width render_height camera_to_world fov default_fov
     aspect fps seconds is_cycle smoothness_value default_transition_sec keyframes format image_size
     source pose intrinsics R T loop time timestamp spline_order duration_seconds default_t id
-    img_name width height position transform fx fy"""
+    img_name width height position fx fy"""
 """Fields that are read, or do not change what is seen."""
 
 
@@ -61,143 +64,118 @@ def read_path(
 ) -> list[Camera]:
     """The cameras of a file in one of the `FORMS`, in order, in the units of `scene`; at least one.
 
-    The first test camera gives what a `transforms.json` lacks, all but the pose to ns-export, and
-    the size to key frames of instant-ngp. Poses of nerfstudio's viewer and of ns-export are those
-    of a model; what the file `model` says is undone. What a user should know is added to `remarks`.
+    The first test camera gives what a `transforms.json` lacks, and the size to key frames of
+    instant-ngp. Poses of nerfstudio's viewer are those of a model; what the file `model` says is
+    undone. What a user should know is added to `remarks`.
     Raises SteerbenchError if the file is damaged or has no cameras, or a pose is not rigid.
     """
-    cameras = _Reader(file, scene, remarks, model).cameras()
+    record = read_json(file.parent, file.name, LISTED)
+    name = next((name for name in FORMS if name in record), None)
+    if name is None:
+        raise unexpected(file, READ, ", ".join(record) or "an empty object")
+    entries = entries_of(record, name, file)
+    levels = [record, *(entry for _, entry in entries)]
+    remarks.add_unread(file, levels, {name, *KNOWN, *HARMLESS.split()})
+    read = dict(zip(FORMS, (_of_viewer, _of_frame, _of_ngp, _of_splatting), strict=True))[name]
+    usual = scene.splits["test"].cameras[0] if scene.splits else None
+    cameras = [read(ChainMap(entry, record), where, remarks, usual) for where, entry in entries]
+    if name == "path":
+        cube = (scene.maps or program_maps(file, {}))["instant-ngp"]
+        cameras = _moved(cameras, cube, file)
+    elif name == KEYFRAMES and not record.items() >= OURS.items():
+        cameras = _out_of_model(cameras, file, scene, remarks, model)
     scale, offset = 1 / scene.unit_length, -scene.origin.double() / scene.unit_length
     return [move_camera(camera, scale, offset) for camera in cameras]
 
 
-class _Reader:
-    """Reads the cameras of one file, in the coordinates of the data set."""
+def _of_viewer(settings: ChainMap, where: str, remarks: Remarks, _: Camera | None) -> Camera:
+    if (kind := settings.get("camera_type", "perspective")) != "perspective":
+        raise unexpected(f"{where}.camera_type", "perspective", describe(kind))
+    pose = opengl_pose(settings, "camera_to_world", where, remarks)
+    fov = settings.get("fov", settings.get("default_fov"))
+    return _centred(pose, fov, *_size(settings, where, "render_"), where)
 
-    def __init__(self, file: Path, scene: Scene, remarks: Remarks, model: Path | None) -> None:
-        self.file, self.scene, self.remarks, self.model = file, scene, remarks, model
-        self.record = read_json(file.parent, file.name, LISTED)
 
-    def cameras(self) -> list[Camera]:
-        name = next((name for name in FORMS if name in self.record), None)
-        if name is None:
-            forms = "; ".join(f"{name} ({form})" for name, form in FORMS.items())
-            raise unexpected(self.file, forms, ", ".join(self.record) or "an empty object")
-        entries = entries_of(self.record, name, self.file)
-        levels = [self.record, *(entry for _, entry in entries)]
-        self.remarks.add_unread(self.file, levels, {name, *KNOWN, *BOX, *HARMLESS.split()})
-        readers = self.of_viewer, self.of_frame, self.of_ngp, self.of_list
-        read = dict(zip(FORMS, readers, strict=True))[name]
-        cameras = [read(entry, where) for where, entry in entries]
-        if name == "path":
-            return self.out_of_cube(cameras)
-        theirs = name == KEYFRAMES and not self.record.items() >= OURS.items()
-        return self.out_of_model(cameras) if theirs or "transform" in entries[0][1] else cameras
-
-    def usual(self, settings: Mapping, where: str) -> Camera:
-        """The camera that has what the `settings` of an entry lack."""
-        if self.scene.splits:
-            return self.scene.splits["test"].cameras[0]
-        if not {"w", "h"} <= settings.keys():
-            expected = "w and h, or scene=..., whose first test camera has them"
-            raise unexpected(where, expected, "neither")
-        return Camera(torch.eye(4)[:3], 0, 0, 0.5, 0.5, 1, 1)
-
-    def of_viewer(self, entry: dict, where: str) -> Camera:
-        kind = self.record.get("camera_type", "perspective")
-        if kind != "perspective":
-            raise unexpected(f"{self.file}: camera_type", "perspective", describe(kind))
-        size = self.size(self.record, "render_")
-        pose = opengl_pose(entry, "camera_to_world", where, self.remarks)
-        return _centred(pose, entry.get("fov", self.record.get("default_fov")), size, where)
-
-    def size(self, record: dict, prefix: str = "") -> list[int]:
-        names = (f"{prefix}{side}" for side in ("width", "height"))
-        return [whole_number(record.get(name), f"{self.file}: {name}", 1) for name in names]
-
-    def of_frame(self, frame: dict, where: str) -> Camera:
-        if self.record.get("format") == NERFBASELINES:
-            return self.of_nerfbaselines(frame, where)
-        settings = ChainMap(frame, self.record)
-        if lens := read_lens(settings, where):
-            self.remarks.add(where, "a frame of a path is a pinhole's, without its lens", lens)
-        pose = opengl_pose(frame, "transform_matrix", where, self.remarks)
-        usual = replace(self.usual(settings, where), c2w=pose)
-        return read_camera(settings, usual, where, self.remarks)
-
-    def of_nerfbaselines(self, frame: dict, where: str) -> Camera:
-        if (model := self.record.get("camera_model")) != "pinhole":
-            raise unexpected(f"{self.file}: camera_model", "pinhole", describe(model))
-        size = _numbers(self.record.get("image_size"), 2, f"{self.file}: image_size")
-        width, height = (whole_number(x, f"{self.file}: image_size", 1) for x in size)
-        pose = rigid_pose(frame.get("pose"), f"{where}.pose", self.remarks)
-        fx, fy, cx, cy = _numbers(frame.get("intrinsics"), 4, f"{where}.intrinsics")
+def _of_frame(settings: ChainMap, where: str, remarks: Remarks, usual: Camera | None) -> Camera:
+    if settings.get("format") == NERFBASELINES:
+        if (model := settings.get("camera_model")) != "pinhole":
+            raise unexpected(f"{where}.camera_model", "pinhole", describe(model))
+        size = numbers_of(settings.get("image_size"), 2, f"{where}.image_size")
+        width, height = (whole_number(x, f"{where}.image_size", 1) for x in size)
+        pose = rigid_pose(settings.get("pose"), f"{where}.pose", remarks)
+        fx, fy, cx, cy = numbers_of(settings.get("intrinsics"), 4, f"{where}.intrinsics")
         fx, fy = (number(x, f"{where}.intrinsics", 0) for x in (fx, fy))
         return Camera(pose, fx, fy, cx, cy, width, height)
+    if lens := read_lens(settings, where):
+        remarks.add(where, "a frame of a path is a pinhole's, without its lens", lens)
+    pose = opengl_pose(settings, "transform_matrix", where, remarks)
+    return read_camera(settings, replace(_known(usual, settings, where), c2w=pose), where, remarks)
 
-    def of_ngp(self, entry: dict, where: str) -> Camera:
-        turn = _numbers(entry.get("R"), 4, f"{where}.R")
-        number(math.hypot(*turn), f"{where}.R: its length", 0)
-        centre = _numbers(entry.get("T"), 3, f"{where}.T")
-        pose = np.column_stack((Rotation.from_quat(turn).as_matrix(), centre))
-        usual = self.usual(entry, where)
-        size = usual.width, usual.height
-        return _centred(torch.from_numpy(pose), entry.get("fov"), size, where)
 
-    def of_list(self, entry: dict, where: str) -> Camera:
-        if "transform" in entry:
-            pose = opengl_pose(entry, "transform", where, self.remarks)
-            return replace(self.usual(entry, where), c2w=pose)
-        try:
-            rows = zip(entry["rotation"], entry["position"], strict=True)
-            pose = rigid_pose([[*row, x] for row, x in rows], where, self.remarks)
-        except (KeyError, TypeError, ValueError) as error:
-            raise unexpected(where, "a position and three rows of a rotation", error) from error
-        width, height = self.size(entry)
-        fx, fy = (number(entry.get(k), f"{where}.{k}", 0) for k in ("fx", "fy"))
-        middle = {"cx": width / 2, "cy": height / 2}
-        cx, cy = (number(entry.get(k, x), f"{where}.{k}") for k, x in middle.items())
-        return Camera(pose, fx, fy, cx, cy, width, height)
+def _of_ngp(settings: ChainMap, where: str, remarks: Remarks, usual: Camera | None) -> Camera:
+    turn = numbers_of(settings.get("R"), 4, f"{where}.R")
+    number(math.hypot(*turn), f"{where}.R: its length", 0)
+    centre = numbers_of(settings.get("T"), 3, f"{where}.T")
+    pose = np.column_stack((Rotation.from_quat(turn).as_matrix(), centre))
+    like = _known(usual, settings, where)
+    return _centred(torch.from_numpy(pose), settings.get("fov"), like.width, like.height, where)
 
-    def out_of_cube(self, cameras: list[Camera]) -> list[Camera]:
-        """Key frames of instant-ngp, from its cube as the scene has it, or as it is by default."""
-        cubes = {"0.33 x + 0.5": program_maps(self.file, {}), "of the scene": self.scene.maps}
-        moved = {
-            f"key frames in the cube {name}": _moved(cameras, maps["instant-ngp"], self.file)
-            for name, maps in cubes.items()
-            if maps
-        }
-        return self.nearest(moved)
 
-    def out_of_model(self, cameras: list[Camera]) -> list[Camera]:
-        """Cameras that nerfstudio wrote, moved back from a model to the data set."""
-        model = self.model or self.file.with_name(MODEL)
-        if not (self.model or model.is_file()):
-            kind = f"without {MODEL} beside it, poses are taken as the data set's"
-            how = "if they are a model's, copy its file there, or trajectory.transforms=FILE"
-            self.remarks.add(self.file, kind, how)
-            return cameras
-        saved, forth = read_json(model.parent, model.name), torch.eye(4).double()
-        forth[:3] = matrix(saved.get("transform"), f"{model}: transform")
-        forth[:3] *= number(saved.get("scale"), f"{model}: scale", 0)
-        number(torch.linalg.det(forth).abs().item(), f"{model}: determinant", 0)
-        before = self.scene.maps.get("nerfstudio", torch.eye(4).double())
-        moved = _moved(cameras, before @ torch.linalg.inv(forth), model)
-        given = {} if self.model else {"those of the data set": cameras}
-        return self.nearest({f"those of a model, moved back as {model} says": moved, **given})
+def _of_splatting(settings: ChainMap, where: str, remarks: Remarks, _: Camera | None) -> Camera:
+    try:
+        rows = zip(settings["rotation"], settings["position"], strict=True)
+        pose = rigid_pose([[*row, x] for row, x in rows], where, remarks)
+    except (KeyError, TypeError, ValueError) as error:
+        expected = f"a position and three rows of a rotation, or a file with {READ}"
+        raise unexpected(where, expected, f"{', '.join(settings)}: {error}") from error
+    width, height = _size(settings, where)
+    fx, fy = (number(settings.get(name), f"{where}.{name}", 0) for name in ("fx", "fy"))
+    middle = {"cx": width / 2, "cy": height / 2}
+    cx, cy = (number(settings.get(name, x), f"{where}.{name}") for name, x in middle.items())
+    return Camera(pose, fx, fy, cx, cy, width, height)
 
-    def nearest(self, readings: dict[str, list[Camera]]) -> list[Camera]:
-        """The one that is nearest to the cameras of the data set; no file says which is right."""
-        splits = self.scene.splits.values()
-        there = [data_camera(self.scene, c) for split in splits for c in split.cameras]
 
-        def far(name: str) -> float:
-            between = torch.cdist(_centres(readings[name]), _centres(there))
-            return between.amin(1).mean().item()
+def _known(usual: Camera | None, settings: Mapping, where: str) -> Camera:
+    """The camera that has what the `settings` of an entry lack."""
+    if not usual and not {"w", "h"} <= settings.keys():
+        expected = "w and h, or scene=..., whose first test camera has them"
+        raise unexpected(where, expected, "neither")
+    return usual or Camera(torch.eye(4)[:3], 0, 0, 0.5, 0.5, 1, 1)
 
-        name = min(readings, key=far) if there else next(iter(readings))
-        self.remarks.add(self.file, "poses are read as", name)
-        return readings[name]
+
+def _size(settings: Mapping, where: str, prefix: str = "") -> tuple[int, int]:
+    names = (f"{prefix}{side}" for side in ("width", "height"))
+    width, height = (whole_number(settings.get(name), f"{where}.{name}", 1) for name in names)
+    return width, height
+
+
+def _out_of_model(
+    cameras: list[Camera], file: Path, scene: Scene, remarks: Remarks, given: Path | None
+) -> list[Camera]:
+    """Cameras that nerfstudio wrote, moved back from a model to the data set. A file beside them
+    counts if they come so nearer to the cameras of the data set: they do not say what they are."""
+    model = given or file.with_name(MODEL)
+    if not (given or model.is_file()):
+        kind = f"without {MODEL} beside it, poses are taken as the data set's"
+        how = "if they are a model's, copy its file there, or trajectory.transforms=FILE"
+        remarks.add(file, kind, how)
+        return cameras
+    saved, forth = read_json(model.parent, model.name), torch.eye(4).double()
+    forth[:3] = matrix(saved.get("transform"), f"{model}: transform")
+    forth[:3] *= number(saved.get("scale"), f"{model}: scale", 0)
+    number(torch.linalg.det(forth).abs().item(), f"{model}: determinant", 0)
+    before = scene.maps.get("nerfstudio", torch.eye(4).double())
+    moved = _moved(cameras, before @ torch.linalg.inv(forth), model)
+    there = [data_camera(scene, c) for split in scene.splits.values() for c in split.cameras]
+
+    def far(read: list[Camera]) -> float:
+        return torch.cdist(_centres(read), _centres(there)).amin(1).mean().item()
+
+    if not given and there and far(cameras) < far(moved):
+        remarks.add(file, "poses are read as", "those of the data set")
+        return cameras
+    remarks.add(file, "poses are read as", f"those of a model, moved back as {model} says")
+    return moved
 
 
 def _centres(cameras: Sequence[Camera]) -> Tensor:
@@ -215,18 +193,11 @@ def _moved(cameras: Sequence[Camera], move: Tensor, where: Path) -> list[Camera]
     return moved
 
 
-def _centred(pose: Tensor, degrees: object, size: Sequence[int], where: str) -> Camera:
+def _centred(pose: Tensor, degrees: object, width: int, height: int, where: str) -> Camera:
     """Square pixels, the principal point at the centre, a vertical field of view."""
-    width, height = size
     angle = math.radians(number(degrees, f"{where}.fov", 0, 180))
     focal = focal_length(angle, height, f"{where}.fov")
     return Camera(pose, focal, focal, width / 2, height / 2, width, height)
-
-
-def _numbers(value: object, count: int, where: str) -> list[float]:
-    if not isinstance(value, list) or len(value) != count:
-        raise unexpected(where, f"{count} numbers", describe(value))
-    return [number(x, where) for x in value]
 
 
 def write_path(

@@ -21,6 +21,7 @@ from bench.protocol import EvaluationProtocol
 from bench.results import STEADY, Measurement
 from bench.rows import phase_rows, row_table, score_rows, single
 from bench.scenes.images import contents, decode_bytes
+from bench.scenes.lookup import natural
 from bench.scoring import PICTURES, Scoring
 from bench.trajectories import resolution, spread
 from bench.types import BACKGROUNDS, Camera, Log, Split, SteerbenchError, composite
@@ -82,7 +83,7 @@ def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
         raise unexpected(folder, wanted, f"several of {some(twice)}")
     known = dict(zip(keys, files, strict=True))
     missing = [name for name in names if name not in known]
-    further = sorted(known.keys() - set(names), key=_natural)
+    further = sorted(known.keys() - set(names), key=natural)
     if missing or further:
         advice = "; --match order takes both in their order" if len(files) == len(names) else ""
         got = [f"none for {some(missing)}"] if missing else []
@@ -103,21 +104,18 @@ def listed(folder: Path) -> list[Path]:
     none, or two names differ in their ending."""
     if not folder.is_dir():
         raise not_there(folder, "a folder")
-    for pattern in ("*", "**/*"):
-        # Unlike those of Path, it follows links, and leaves out what is hidden.
-        found = glob(pattern, root_dir=folder, recursive=True)  # noqa: PTH207
-        below = sorted(found, key=_natural)
-        names = [name for name in below if Path(name).suffix.lower() in SUFFIXES]
-        if names:
+    for pattern in ("*", "**/*"):  # unlike those of Path, without what is hidden, and through links
+        below = sorted(glob(pattern, root_dir=folder, recursive=True), key=natural)  # noqa: PTH207
+        files = [folder / name for name in below if Path(name).suffix.lower() in SUFFIXES]
+        if files:
             break
     else:
         raise unexpected(folder, f"pictures ({', '.join(SUFFIXES)})", some(below) or "none")
-    stems = [str(Path(name).with_suffix("")) for name in names]
+    stems = [path.relative_to(folder).with_suffix("").as_posix() for path in files]
     if twice := _repeated(stems):
         raise unexpected(folder, "one picture of a name", f"several of {some(twice)}")
-    known = set(stems)
-    maps = {stem for stem in stems if (of := MAP.fullmatch(stem)) and of[1] in known}
-    files = [folder / name for name, stem in zip(names, stems, strict=True) if stem not in maps]
+    maps = {stem for stem in stems if (of := MAP.fullmatch(stem)) and of[1] in stems}
+    files = [path for path, stem in zip(files, stems, strict=True) if stem not in maps]
     if all(OF_A_RUN.fullmatch(path.stem) for path in files):
         raise SteerbenchError(
             f"{folder}: these are renderings, truths and error maps of a run, which is scored "
@@ -129,10 +127,9 @@ def listed(folder: Path) -> list[Path]:
 def reported_times(file: Path, pairs: Sequence[Pair]) -> list[float]:
     """The time of each picture in milliseconds, the column `frame_ms` of a CSV file.
 
-    With a column `name`, lines are matched by the name of the true picture without its ending, also
-    without its folder if names then differ, and others are ignored; without, there is one for each
-    picture, in their order. Raises SteerbenchError if the file cannot be read, or a time is missing
-    or not above 0.
+    With a column `name`, lines are matched by the name of the true picture, without its folder and
+    ending, and others are ignored; without, there is one for each picture, in their order. Raises
+    SteerbenchError if the file cannot be read, or a time is missing or not above 0.
     """
     if not file.is_file():
         raise not_there(file)
@@ -145,13 +142,10 @@ def reported_times(file: Path, pairs: Sequence[Pair]) -> list[float]:
         raise unexpected(file, "a column frame_ms", ", ".join(map(str, table)) or "none")
     if "name" in table:
         table = table.dropna(subset="name").set_index("name")
-        names = [str(Path(pair.name).with_suffix("")) for pair in pairs]
-        table.index = table.index.map(lambda name: str(Path(name).with_suffix("")))
-        if not _repeated([Path(name).name for name in names]):
-            names = [Path(name).name for name in names]
-            table.index = table.index.map(lambda name: Path(name).name)
-        counts = table.index.value_counts().reindex(names, fill_value=0)
-        if wrong := [name for name in names if counts[name] != 1]:
+        table.index = table.index.map(lambda name: Path(name).stem)
+        names = [Path(pair.name).stem for pair in pairs]
+        lines = Counter(table.index)
+        if wrong := [name for name in names if lines[name] != 1 or names.count(name) > 1]:
             raise unexpected(file, "one line for each picture", f"none or several of {some(wrong)}")
         table = table.loc[names]
     times = pd.to_numeric(table["frame_ms"], errors="coerce").tolist()
@@ -235,10 +229,4 @@ def _check(
 
 
 def _repeated(names: Sequence[str]) -> list[str]:
-    return sorted((name for name, count in Counter(names).items() if count > 1), key=_natural)
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    """A sort key that orders numbers in names as numbers."""
-    parts = re.split(r"(\d+)", name)
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
+    return sorted((name for name, count in Counter(names).items() if count > 1), key=natural)

@@ -63,9 +63,7 @@ def score(
     facts |= dict.fromkeys(("budget", *computed), NOTHING)
     reported = given.reported_times(Path(times), pairs) if times else []
     facts |= {"device": REPORTED} if times else {}
-    example = (
-        f"{pairs[0].picture.relative_to(folder)} is scored against {pairs[0].name}"  # to check
-    )
+    example = f"{pairs[0].picture.relative_to(folder)} is scored against {pairs[0].name}"
     log.info(f"{len(pairs)} pictures, matched by {match}: {example}")
     lpips, missing = protocol.load_lpips(weights, log)
     measurement = given.score(

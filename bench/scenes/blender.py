@@ -1,15 +1,11 @@
 """Loads NeRF-Synthetic: `transforms_{train,val,test}.json` beside RGBA pictures."""
 
-from collections import ChainMap
 from pathlib import Path
 
-from bench.errors import unexpected
-from bench.scenes.assemble import Box, assemble, cube, describe_splits, hull_box, parse_box
-from bench.scenes.files import data_folder, frames_of, read_json
-from bench.scenes.images import Pictures, View, image_size
-from bench.scenes.lookup import absent, find_all, report
-from bench.scenes.remarks import Remarks
-from bench.scenes.transforms import KNOWN, read_view
+from bench.scenes.assemble import assemble, cube, describe_splits, hull_box, parse_box
+from bench.scenes.files import data_folder, read_json
+from bench.scenes.images import View
+from bench.scenes.transforms import read_views
 from bench.types import Log, Scene
 
 HALF_EXTENT = 1.5  # the objects of NeRF-Synthetic lie in [-1.5, 1.5]^3
@@ -36,7 +32,14 @@ def load(
     read = ((split, read_split(root, split, log)) for split in ("train", "val", "test"))
     views = {split: of_split for split, of_split in read if of_split}
     pictures = describe_splits(views, downscale, log)
-    box = scene_box(bounds, pictures["train"], log)
+    train, box = pictures["train"], cube(HALF_EXTENT)
+    if bounds == "auto":
+        hull = hull_box([picture.camera for picture in train.described], train, box)
+        if hull is None:
+            log.info("bounds: the training pictures hold no masks, taking [-1.5, 1.5]^3")
+        box = hull or box
+    elif bounds != "full":
+        box = parse_box(bounds)
     files = [root / camera_file(split) for split in views]
     return assemble(name or root.name, pictures, box, background=background, camera_files=files)
 
@@ -46,41 +49,10 @@ def camera_file(split: str) -> str:
 
 
 def read_split(root: Path, split: str, log: Log) -> list[View]:
-    """The views of a split; empty if it is optional and its pictures do not exist."""
-    optional = split == "val"
-    path = root / camera_file(split)
+    """The views of a split; empty if it is val, and its pictures do not exist."""
+    path, optional = root / camera_file(split), split == "val"
     if optional and not path.exists():
         return []
     record = read_json(root, path.name)
-    frames = frames_of(record, path)
-    names = [frame["file_path"] for _, frame in frames]
-    found = find_all(root, names)
-    files = [file for file in found if file]
-    if optional and not files:
-        log.info(f"{path.name}: none of its {len(found)} pictures are there, split left out")
-        return []
-    if len(files) < len(found):
-        first = found.index(None)
-        raise unexpected(f"{frames[first][0]}.file_path", "a picture", absent(root, names[first]))
-    report(root, names, found, path.name, log)
-    size, remarks, views = image_size(files[0]), Remarks(), []
-    remarks.add_unread(path, [record, *(frame for _, frame in frames)], KNOWN)
-    for (at, frame), file in zip(frames, files, strict=True):
-        settings = ChainMap(frame, record, dict(zip("wh", size, strict=True)))
-        views.append(read_view(root, file, settings, at, remarks))
-    remarks.tell(log.info)
-    return views
-
-
-def scene_box(bounds: str | list, train: Pictures, log: Log) -> Box:
-    """The box, in the data set's units, that `bounds` of `load` stands for."""
-    space = cube(HALF_EXTENT)
-    if bounds == "full":
-        return space
-    if bounds != "auto":
-        return parse_box(bounds)
-    hull = hull_box([picture.camera for picture in train.described], train, space)
-    if hull is None:
-        half = HALF_EXTENT
-        log.info(f"bounds: the training pictures hold no masks, taking [-{half}, {half}]^3")
-    return hull or space
+    listed = read_views(root, record, path, log, every=True, optional=optional)
+    return [view for _, view in listed if view]

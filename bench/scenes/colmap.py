@@ -1,10 +1,9 @@
 """Loads a capture reconstructed by COLMAP: a sparse model beside the pictures."""
 
 import os
-import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -24,8 +23,8 @@ from bench.scenes.assemble import (
 )
 from bench.scenes.files import data_folder, number, rigid_pose
 from bench.scenes.images import Lens, View, fitted_camera
-from bench.scenes.lookup import absent, bare, find_all, in_any_case, report, tidy
-from bench.scenes.masks import with_masks
+from bench.scenes.lookup import absent, bare, find_all, found, in_any_case, natural, report, tidy
+from bench.scenes.masks import mask_folder, mask_in
 from bench.scenes.remarks import Remarks
 from bench.scenes.sparse import Entry, read_cameras, read_images, read_points
 from bench.scenes.splits import Listed, divide, read_lists
@@ -55,7 +54,7 @@ def load(
     The pictures may be smaller than those that COLMAP saw; the model is by default the first of
     `MODELS`. `bounds` are those of the box: "auto" or [[x, y, z], [x, y, z]]. "auto" is the box of
     the points without outliers, or, in all of space, that of the cameras. For `masks` see
-    `masks.with_masks`, for `split`, `split_every` and `space` `transforms.load`, for `downscale`
+    `masks.mask_folder`, for `split`, `split_every` and `space` `transforms.load`, for `downscale`
     and `background` `blender.load`.
 
     Lens distortion is undone for every COLMAP camera model that has a focal length, and pictures
@@ -68,7 +67,7 @@ def load(
         how = install_command("colmap")
         raise Unavailable(f"{folder}: models of COLMAP need pycolmap: {how}")
     lists = read_lists(root, split, {}, folder)
-    listed = with_masks(read_views(root, images, folder, log), root, images, masks, log)
+    listed = read_views(root, images, folder, mask_folder(root, images, masks), log)
     splits = divide(listed, split_every, lists, folder, log)
     pictures = describe_splits(splits, downscale, log)
     space = space_of(space, pictures)
@@ -111,27 +110,26 @@ def points_box(folder: Path) -> Box:
     return Box(*torch.from_numpy(points[[stray, last - stray]])).grown()
 
 
-def read_views(root: Path, images: str, folder: Path, log: Log) -> Listed:
-    place = in_any_case(root / tidy(images), os.path.isdir)
-    if not place:
-        raise unexpected("scene.images", "a folder of pictures", absent(root, images))
+def read_views(root: Path, images: str, folder: Path, masks: Path | None, log: Log) -> Listed:
+    place = found(root, images, "scene.images", "a folder of pictures", os.path.isdir)
     cameras = read_cameras(folder / f"cameras{_kind(folder)}")
-    entries = read_images(folder / f"images{_kind(folder)}", log)
+    entries = read_images(folder / f"images{_kind(folder)}")
     names = [words[-1] for _, words in entries]
     files = find_all(place, names)
     if not any(files) and (ordered := in_order(root / "images", names, place)):
         files, first = ordered, f"{ordered[0]} for {names[0]}"
         log.info(f"{place}: pictures are paired in the order of names: {first}")
     else:
-        report(place, names, files, str(folder), log)
+        report(place, names, files, str(folder), log, False)
     views: list[tuple[str, View | None]] = []
     for entry, name, file in zip(entries, map(tidy, names), files, strict=True):
-        view = (
-            None
-            if file is None
-            else View(name, file, *read_camera(entry, cameras, file), stored=True)
-        )
+        mask = masks and mask_in(masks, name)
+        view = None
+        if file:
+            view = View(name, file, *read_camera(entry, cameras, file), mask, stored=True)
         views.append((name, view))
+    if masks and not any(view and view.mask for _, view in views):
+        log.info(f"{masks}: not used: no picture has its mask there, {views[0][0]}.png or so")
     return views
 
 
@@ -139,23 +137,15 @@ def in_order(full: Path, names: Sequence[str], folder: Path) -> list[Path | None
     """The pictures in `folder` in the order of `names`, as LLFF's images_8 are paired with images.
 
     Where the folder `full` has all `names`, its other pictures count, too: those that COLMAP did
-    not register. Nothing if there are more or fewer, or if names sort differently by letters and by
-    numbers and do not have the same numbers.
+    not register. Nothing if there are more or fewer, or letters and numbers sort names differently.
     """
-
-    def digits(name: str) -> list[str | int]:
-        parts = re.split(r"(\d+)", bare(name))
-        return [int(part) if part.isdecimal() else part for part in parts]
-
     there, every = (
         sorted(str(file.relative_to(of)) for file in of.rglob("*") if bare(file.name) != file.name)
         for of in (folder, full)
     )
     every = every if {*names} <= {*every} else sorted(names)
-    sure = [sorted(of, key=digits) for of in (there, every)] == [there, every]
-    there, every = sorted(there, key=digits), sorted(every, key=digits)
-    same = [digits(name) for name in there] == [digits(name) for name in every]
-    if len(there) != len(every) or not (sure or same):
+    sure = all(sorted(of, key=lambda name: natural(bare(name))) == of for of in (there, every))
+    if len(there) != len(every) or not sure:
         return []
     return [folder / there[every.index(name)] for name in names]
 
@@ -186,15 +176,13 @@ def camera_of(cameras: Mapping[str, Entry], camera_id: str, image: str) -> Any:
     import pycolmap
 
     where, words = cameras.get(camera_id, (image, ("CAMERA_ID", camera_id, "without an entry")))
-    try:
+    with suppress(ValueError, LookupError, RuntimeError, TypeError):
         _, model, width, height, *params = words
         kind, size = pycolmap.CameraModelId.__members__[model], (int(width), int(height))
         params = [number(float(word), where) for word in params]
         camera = pycolmap.Camera(model=kind, width=size[0], height=size[1], params=params)
         if camera.verify_params() and min(size) > 0:
             return camera
-    except (ValueError, LookupError, RuntimeError, TypeError):
-        pass
     expected = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[] as COLMAP has them"
     raise unexpected(where, expected, " ".join(map(str, words)))
 
@@ -204,14 +192,10 @@ class ColmapLens:
     model: str
     params: tuple[float, ...]
 
-    @cached_property
-    def _camera(self) -> Any:
+    def __call__(self, points: Tensor) -> Tensor:
         import pycolmap
 
-        return pycolmap.Camera(model=self.model, width=1, height=1, params=self.params)
-
-    def __call__(self, points: Tensor) -> Tensor:
-        camera = self._camera
+        camera = pycolmap.Camera(model=self.model, width=1, height=1, params=self.params)
         seen = camera.img_from_cam(np.column_stack((points.numpy(), np.ones(len(points)))))
         matrix = torch.from_numpy(camera.calibration_matrix())
         return (torch.from_numpy(seen) - matrix[:2, 2]) / matrix.diagonal()[:2]

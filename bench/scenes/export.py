@@ -2,12 +2,11 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 from PIL import Image
-from torch import Tensor
 
 from bench.cameras import move_camera
 from bench.errors import unexpected
@@ -33,28 +32,23 @@ def picture_file(split: str, number: int) -> str:
     return f"{split}/r_{number}.png"
 
 
-def mask_file(split: str, number: int) -> str:
-    """Where its mask is, if it has one."""
-    return f"{split}/mask_{number}.png"
-
-
 def write_blender(scene: Scene, folder: Path, files: Mapping[str, str], log: Log) -> None:
     """Write splits of `scene` in NeRF-Synthetic's layout into the empty `folder`.
 
     `files` says of which split the cameras in each `transforms_NAME.json` are: several names may
     show the same pictures, and a split that is not named is not written. Pictures are RGBA; opaque
-    where the data set has no alpha. `mask_path` is a mask, black where pixels do not count. Beside
+    where the data set has no alpha. Masks are not written, which is logged. Beside
     `camera_angle_x`, the files have the intrinsics in the names of instant-ngp and nerfstudio, for
     each frame if they differ. Readers that know only `camera_angle_x` fail where it does not say
     all, because it is missing there.
     """
+    if any(scene.splits[split].masks for split in files.values()):
+        log.info(f"{folder}: without the masks of {scene.name}")
     for split in sorted(set(files.values())):
         (folder / split).mkdir(parents=True)
 
         def write(number: int, split: str = split, given: Split = scene.splits[split]) -> None:
-            pixels, mask = given.images[number], given.mask(number)
-            if mask is not None:
-                Image.fromarray(mask.numpy()).save(folder / mask_file(split, number))
+            pixels = given.images[number]
             if pixels.shape[2] == 3:
                 pixels = torch.cat((pixels, torch.full_like(pixels[..., :1], 255)), dim=2)
             file = folder / picture_file(split, number)
@@ -63,13 +57,11 @@ def write_blender(scene: Scene, folder: Path, files: Mapping[str, str], log: Log
         in_parallel(write, range(len(scene.splits[split])), f"write pictures of {scene.name}", log)
     for name, split in files.items():
         cameras = [data_camera(scene, camera) for camera in scene.splits[split].cameras]
-        record = _transforms(cameras, split, scene.splits[split].masks)
+        record = _transforms(cameras, split)
         (folder / camera_file(name)).write_text(json.dumps(record, indent=1) + "\n")
 
 
-def _transforms(
-    cameras: list[Camera], split: str, masks: Sequence[Tensor | None]
-) -> dict[str, object]:
+def _transforms(cameras: list[Camera], split: str) -> dict[str, object]:
     lenses = [_lens(camera) for camera in cameras]
     alike = all(lens == lenses[0] for lens in lenses)
     frames = []
@@ -77,8 +69,6 @@ def _transforms(
         pose = opengl_to_opencv(camera.c2w).tolist()  # its own inverse: it flips two axes
         path = picture_file(split, number).removesuffix(".png")
         frame = {"file_path": f"./{path}", "transform_matrix": [*pose, [0.0, 0.0, 0.0, 1.0]]}
-        if masks and masks[number] is not None:
-            frame["mask_path"] = mask_file(split, number)
         frames.append(frame if alike else {**frame, **lens})
     if not alike:
         return {"frames": frames}

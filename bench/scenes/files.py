@@ -83,6 +83,13 @@ def whole_number(value: Any, where: str, low: int) -> int:
     raise unexpected(where, f"a whole number from {low} on", describe(value))
 
 
+def numbers_of(value: object, count: int, where: str) -> list[float]:
+    """The finite numbers in a list of `count`."""
+    if not isinstance(value, list) or len(value) != count:
+        raise unexpected(where, f"{count} numbers", describe(value))
+    return [number(x, where) for x in value]
+
+
 def numbers(text: str, where: str | Path) -> list[list[float]]:
     """The numbers of a text, line by line, without empty lines."""
     try:
@@ -108,23 +115,20 @@ def matrix(value: object, where: str) -> Tensor:
 def rigid_pose(value: object, where: str, remarks: Remarks) -> Tensor:
     """A `matrix` that is a rigid, right-handed camera-to-world pose.
 
-    A uniform scale of its rotation is left out, as by readers that normalise rays; of a rotation
-    with two digits, the nearest is taken.
+    Of a rotation with two digits, or with a uniform scale, which readers that normalise rays do not
+    see, the nearest is taken.
     """
     pose = matrix(value, where)
     rotation = pose[:, :3]
-    error, scale = _off(rotation), rotation.norm().item() / math.sqrt(3)
-    rest = min(error, _off(rotation / scale))
-    if not rest <= ROUNDED_TOLERANCE:  # nor NaN
-        raise unexpected(where, "an orthonormal rotation", f"one that is off by {error:.2g}")
+    off, scale = _off(rotation), rotation.norm().item() / math.sqrt(3)
+    if not min(off, _off(rotation / scale)) <= ROUNDED_TOLERANCE:  # nor NaN
+        raise unexpected(where, "an orthonormal rotation", f"one that is off by {off:.2g}")
     if torch.linalg.det(rotation) < 0:
         raise unexpected(where, "a right-handed rotation", "a mirrored one")
-    if error <= ORTHONORMAL_TOLERANCE:
+    if off <= ORTHONORMAL_TOLERANCE:
         return pose
-    if rest > ORTHONORMAL_TOLERANCE:
-        remarks.add(where, "rounded rotation, taking the nearest; it is off by", f"{rest:.2g}")
-    if rest <= ORTHONORMAL_TOLERANCE or abs(scale - 1) > ROUNDED_TOLERANCE:
-        remarks.add(where, "scaled rotation, leaving out its scale", f"{scale:.4g}")
+    kind = "scaled or rounded rotation, taking the nearest without its scale"
+    remarks.add(where, kind, f"{scale:.4g}")
     left, _, right = torch.linalg.svd(rotation / scale)
     return torch.cat((left @ right, pose[:, 3:]), dim=1)
 

@@ -59,9 +59,9 @@ class ScaledView:
     camera: Camera
     sha256: str
     clear: bool  # whether it says how transparent its pixels are
+    seen: tuple[int, int]  # the size of what of it is left without its lens
     mask: "ScaledView | None" = None  # in full size, with the lens
     turned: bool | None = None  # whether its EXIF orientation is obeyed; None: it is upright
-    seen: tuple[int, int] | None = None  # the size of what of it is left without its lens
 
 
 class Pictures(Sequence[Tensor]):
@@ -149,7 +149,7 @@ def describe(view: View, downscale: int) -> ScaledView:
         if size != (camera.width, camera.height):
             expected = f"{camera.width} x {camera.height} pixels"
             raise unexpected(view.path, expected, "{} x {}".format(*size))
-    seen = None
+    seen = size
     if view.lens:
         camera = undistorted_camera(camera, view.lens, view.path)
         source, _, _ = _window(view.camera, view.lens)
@@ -158,7 +158,7 @@ def describe(view: View, downscale: int) -> ScaledView:
     camera = shrunk_camera(camera, downscale, view.path)
     mask = describe(View(view.name, view.mask, view.camera), 1) if view.mask else None
     sha256 = hashlib.sha256(content).hexdigest()
-    return ScaledView(view, downscale, camera, sha256, clear, mask, turned, seen)
+    return ScaledView(view, downscale, camera, sha256, clear, seen, mask, turned)
 
 
 def obeyed(image: Image.Image, view: View) -> bool | None:
@@ -168,11 +168,11 @@ def obeyed(image: Image.Image, view: View) -> bool | None:
         return None
     if number > 4 and image.width != image.height:
         return image.size != (view.camera.width, view.camera.height)
-    if view.stored:
-        return False
-    how = "turn the pixels (mogrify -auto-orient) or remove it (exiftool -Orientation=)"
-    got = f"EXIF orientation {number}, which the camera may mean or not: {how}"
-    raise unexpected(view.path, "pixels that are stored upright", got)
+    if not view.stored:
+        how = "turn the pixels (mogrify -auto-orient) or remove it (exiftool -Orientation=)"
+        got = f"EXIF orientation {number}, which the camera may mean or not: {how}"
+        raise unexpected(view.path, "pixels that are stored upright", got)
+    return False
 
 
 def decode(picture: ScaledView) -> Tensor:

@@ -1,6 +1,7 @@
 """Finds the files that a data set names in the words of other tools, systems and machines."""
 
 import os
+import re
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from difflib import get_close_matches
@@ -12,6 +13,9 @@ from bench.types import Log
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 """Of pictures, in the order in which they are tried where a name has none or another one."""
+
+There = Callable[[Path], bool]
+"""Whether something is there: os.path.isfile or isdir."""
 
 
 def tidy(name: str) -> str:
@@ -25,13 +29,29 @@ def bare(name: str) -> str:
     return stem if stem and f".{ending.lower()}" in ENDINGS else name
 
 
-def in_any_case(path: Path, there: Callable[[Path], bool] = os.path.isfile) -> Path | None:
+def natural(name: str) -> list[tuple[int, str]]:
+    """A sort key that orders numbers in names as numbers."""
+    parts = re.split(r"(\d+)", name)
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
+
+
+def in_any_case(path: Path, there: There = os.path.isfile) -> Path | None:
     """`path`, or what differs from it only in the case of letters; None if that is not `there`."""
     if there(path):
         return path
     folder = None if path == path.parent else in_any_case(path.parent, os.path.isdir)
     like = (child for child in _children(folder) if child.name.casefold() == path.name.casefold())
     return next(filter(there, like), None)
+
+
+def found(
+    root: Path, name: str, where: str | Path, kind: str, there: There = os.path.isfile
+) -> Path:
+    """What is called `name` in `root`, in any case of letters; raises if that is not `there`."""
+    path = in_any_case(root / tidy(name), there)
+    if path is None:
+        raise unexpected(where, kind, absent(root, name))
+    return path
 
 
 def _children(folder: Path | None) -> list[Path]:
@@ -72,28 +92,25 @@ def find_all(root: Path, names: Sequence[str]) -> list[Path | None]:
 
 
 def report(
-    root: Path, names: Sequence[str], files: Sequence[Path | None], where: str, log: Log
+    root: Path,
+    names: Sequence[str],
+    files: Sequence[Path | None],
+    where: str,
+    log: Log,
+    every: bool,
 ) -> None:
-    """Log which pictures are missing, called otherwise, or outside `root`; raises if none is there.
-
-    `files` are those of `names`, as from `find_all`.
-    """
-    pairs = [*zip(map(tidy, names), files, strict=True)]
-    if not any(files):
-        raise unexpected(where, "pictures", f"none of {len(names)} files: {absent(root, names[0])}")
-    missing = [name for name, file in pairs if not file]
+    """Log which pictures are missing or called otherwise; raises if none is there, or not `every`
+    one. `files` are those of `names` in `root`, as from `find_all`."""
+    missing = [name for name, file in zip(names, files, strict=True) if not file]
+    if not any(files) or (every and missing):
+        got = f"{len(missing)} of {len(names)} not there: {absent(root, missing[0])}"
+        raise unexpected(where, "pictures", got)
     renamed = [
         f"{file.name} for {name}"
-        for name, file in pairs
+        for name, file in zip(map(tidy, names), files, strict=True)
         if file and PurePosixPath(name).name not in (file.name, bare(file.name))
     ]
-    normal = [(name, Path(os.path.normpath(file))) for name, file in pairs if file]
-    outside = [name for name, file in normal if not file.is_relative_to(root)]
-    for some, how in (
-        (missing, "are not there, left out"),
-        (renamed, "have another name"),
-        (outside, "are outside its folder"),
-    ):
+    for some, how in ((missing, "are not there, left out"), (renamed, "have another name")):
         if some:
             listed = ", ".join(some[:9]) + ", ..." * (len(some) > 9)
             log.info(f"{where}: {len(some)} of {len(names)} pictures {how}: {listed}")
@@ -105,9 +122,8 @@ def absent(root: Path, name: str) -> str:
     ends = (root.joinpath(*parts[start:]) for start in range(1, len(parts)))
     near = [*filter(os.path.isfile, ends)][:1]  # in the folder of another machine
     if not near:
-        path = root.joinpath(*parts)
-        folder = next(filter(os.path.isdir, path.parents))
+        folder = next(filter(os.path.isdir, root.joinpath(*parts).parents))
         there = {child.name: child for child in _children(folder)}
-        like = get_close_matches(path.relative_to(folder).parts[0], there, 1) or [*there][:3]
-        near = [there[each] for each in like]
+        first = root.joinpath(*parts).relative_to(folder).parts[0]
+        near = [there[each] for each in get_close_matches(first, there, 1) or [*there][:3]]
     return f"no '{name}' in {root}; nearest: {', '.join(map(str, near)) or 'nothing'}"

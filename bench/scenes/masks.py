@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 from torch import Tensor
@@ -11,9 +10,7 @@ from torch.nn import functional
 from bench.errors import unexpected
 from bench.scenes.files import describe
 from bench.scenes.images import Pictures, ScaledView, decode, undistort
-from bench.scenes.lookup import absent, in_any_case, tidy
-from bench.scenes.splits import Listed
-from bench.types import Log
+from bench.scenes.lookup import found, in_any_case
 
 
 def frame_mask(
@@ -26,31 +23,23 @@ def frame_mask(
         return (beside, True) if beside.is_file() else (None, False)
     if not isinstance(given, str):
         raise unexpected(f"{where}.mask_path", "a path", describe(given))
-    if (mask := in_any_case(root / tidy(given))) is None:
-        raise unexpected(f"{where}.mask_path", "a picture", absent(root, given))
-    return mask, False
+    return found(root, given, f"{where}.mask_path", "a picture"), False
 
 
-def with_masks(listed: Listed, root: Path, images: str, masks: str | None, log: Log) -> Listed:
-    """COLMAP's pictures, whose folder is `images`, with the masks NAME.png in the folder `masks`,
-    where NAME may lack its ending. "auto": `masks`, for `images_4` also `masks_4`; None: no masks.
-    If no picture has its mask there, that is logged."""
-    auto = [f"masks{images.removeprefix('images')}", "masks"]
-    places = auto if masks == "auto" else [masks] if masks else []
-    folders = (in_any_case(root / tidy(place), os.path.isdir) for place in places)
-    folder = next(filter(None, folders), None)
-    if folder is None:
-        if masks not in ("auto", None):
-            raise unexpected("scene.masks", "a folder of masks", absent(root, str(masks)))
-        return listed
-    found = []
-    for name, view in listed:
-        files = folder / f"{name}.png", (folder / name).with_suffix(".png")
-        mask = next(filter(Path.is_file, files), None)
-        found.append((name, view and replace(view, mask=mask)))
-    if not any(view and view.mask for _, view in found):
-        log.info(f"{folder}: not used: no picture has its mask there, {listed[0][0]}.png or so")
-    return found
+def mask_folder(root: Path, images: str, masks: str | None) -> Path | None:
+    """The folder `masks` of COLMAP's masks. "auto": `masks`, for `images_4` also `masks_4`; None if
+    there is none, or `masks` is None."""
+    if masks is None or masks == "auto":
+        places = (root / f"masks{images.removeprefix('images')}", root / "masks")
+        there = (in_any_case(place, os.path.isdir) for place in places)
+        return next(filter(None, there), None) if masks else None
+    return found(root, masks, "scene.masks", "a folder of masks", os.path.isdir)
+
+
+def mask_in(folder: Path, name: str) -> Path | None:
+    """The mask NAME.png of a picture, where NAME may lack its ending."""
+    files = folder / f"{name}.png", (folder / name).with_suffix(".png")
+    return next(filter(Path.is_file, files), None)
 
 
 class Masks(Pictures):

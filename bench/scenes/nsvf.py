@@ -11,7 +11,7 @@ from bench.errors import unexpected
 from bench.scenes.assemble import MARGIN, Box, assemble, describe_splits
 from bench.scenes.files import data_folder, number, numbers, read_text, rigid_pose, whole_number
 from bench.scenes.images import View, fitted_camera, image_size
-from bench.scenes.lookup import absent, in_any_case
+from bench.scenes.lookup import found, in_any_case
 from bench.scenes.remarks import Remarks
 from bench.types import Camera, Log, Scene
 
@@ -106,9 +106,7 @@ def read_matrix(root: Path, relative: str) -> tuple[list[list[float]], list[floa
 
 
 def picture_files(root: Path) -> list[Path]:
-    folder = in_any_case(root / "rgb", os.path.isdir)
-    if not folder:
-        raise unexpected(root / "rgb", "a folder of pictures", absent(root, "rgb"))
+    folder = found(root, "rgb", root / "rgb", "a folder of pictures", os.path.isdir)
     names = sorted(path.name for path in folder.iterdir() if PICTURE_NAME.fullmatch(path.name))
     if not names:
         raise unexpected(folder, "pictures named 0_*, 1_* or 2_*", "none")

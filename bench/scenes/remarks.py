@@ -8,7 +8,6 @@ import torch
 from bench.scenes.images import ScaledView
 
 OFF_CENTRE = 0.4  # of half a picture, from its middle: a doubtful principal point
-OBLONG = 1.25  # a doubtful ratio of the sides of a pixel
 LOSES = 0.9  # a lens is said to cut a picture if a smaller share of it is left without
 
 
@@ -36,12 +35,9 @@ class Remarks:
             if max(map(abs, middle)) > OFF_CENTRE:
                 kind = "principal point far from the middle: a crop, or of pictures of another size"
                 self.add(name, kind, f"({camera.cx:g}, {camera.cy:g}) {size}")
-            if max(camera.fx, camera.fy) > OBLONG * min(camera.fx, camera.fy):
-                self.add(name, "pixels far from square", f"fx {camera.fx:g}, fy {camera.fy:g}")
-            if seen and seen[0] * seen[1] < LOSES * camera.width * camera.height:
-                self.add(
-                    name, "without its lens, its middle is left", f"{seen[0]} x {seen[1]} {size}"
-                )
+            if seen[0] * seen[1] < LOSES * camera.width * camera.height:
+                kind = "without its lens, its middle is left"
+                self.add(name, kind, f"{seen[0]} x {seen[1]} {size}")
         poses = torch.stack([picture.view.camera.c2w for picture in pictures])  # [N, 3, 4]
         centres, forward = poses[:, :, 3], poses[:, :, 2]
         if len(poses) > 2 and (((centres.mean(0) - centres) * forward).sum(1) < 0).all():

@@ -14,8 +14,7 @@ from plyfile import PlyData, PlyParseError
 
 from bench.errors import unexpected
 from bench.scenes.files import read_text
-from bench.scenes.lookup import absent
-from bench.types import Log
+from bench.scenes.lookup import found
 
 Entry = tuple[str, Sequence[Any]]
 """Where an entry is, for messages, and its words."""
@@ -33,12 +32,9 @@ def read_cameras(file: Path) -> dict[str, Entry]:
     return {str(words[0]): (where, words) for where, words in entries}
 
 
-def read_images(file: Path, log: Log) -> list[Entry]:
+def read_images(file: Path) -> list[Entry]:
     """The entries QW QX QY QZ TX TY TZ CAMERA_ID NAME; at least one."""
     images = list(_entries(file, _image) if file.suffix == ".bin" else _text_images(file))
-    said = re.search(r"# Number of images: (\d+)", "" if file.suffix == ".bin" else _text(file))
-    if said and int(said[1]) != len(images):
-        log.info(f"{file}: it has {len(images)} images, not {said[1]} as its comment says")
     if not images:
         raise unexpected(file, "images", "none")
     return images
@@ -56,13 +52,10 @@ def read_points(file: Path) -> np.ndarray:
     return np.array([words for _, words in entries], dtype=np.float64).reshape(-1, 3)
 
 
-def _text(file: Path) -> str:
-    return read_text(file.parent, file.name)
-
-
 def _lines(file: Path) -> Iterator[tuple[str, str]]:
     """The lines of a text but comments, and where they are."""
-    for number, line in enumerate(map(str.strip, _text(file).split("\n")), start=1):
+    lines = read_text(file.parent, file.name).split("\n")
+    for number, line in enumerate(map(str.strip, lines), start=1):
         if not line.startswith("#"):
             yield f"{file}: line {number}", line
 
@@ -73,8 +66,7 @@ def _text_images(file: Path) -> Iterator[Entry]:
     for where, line in _lines(file):
         above = bool(line) and not (above and KEYPOINTS.match(f" {line}"))
         if above:
-            match = IMAGE.fullmatch(line)
-            if not match:
+            if not (match := IMAGE.fullmatch(line)):
                 expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, keypoints a line below"
                 raise unexpected(where, expected, repr(line[:80]))
             yield where, match.groups()
@@ -92,9 +84,7 @@ def _text_points(file: Path) -> Iterator[Entry]:
 
 def _entries(file: Path, read: Callable[[bytes, int], tuple[list[Any], int]]) -> Iterator[Entry]:
     """The entries of a binary list: `read` has the place of one, and returns that of the next."""
-    if not file.is_file():
-        raise unexpected(file, "a file", absent(file.parent, file.name))
-    content, number, end = file.read_bytes(), 0, 8
+    content, number, end = found(file.parent, file.name, file, "a file").read_bytes(), 0, 8
     try:
         for number in range(*struct.unpack_from("<Q", content)):
             words, end = read(content, end)

@@ -27,6 +27,7 @@ from bench.scenes.files import (
     frames_of,
     matrix,
     number,
+    numbers_of,
     opengl_pose,
     read_json,
     whole_number,
@@ -59,9 +60,8 @@ OTHER_TERMS = (
 )
 """Further terms of a lens; a file is rejected if it has one that its lens does not support."""
 
-BOX = {"scale", "offset", "aabb_scale"}
 READ = """frames file_path transform_matrix w h cx cy fl_x fl_y x_fov y_fov camera_angle_x
-    camera_angle_y camera_model is_fisheye k1 k2 applied_transform train val test mask_path
+    camera_angle_y camera_model is_fisheye k1 k2 applied_transform mask_path scale offset aabb_scale
     train_filenames val_filenames test_filenames"""
 HARMLESS = """scene rotation sharpness colmap_im_id up orientation_override ply_file_path depth_path
     depth_file_path enable_depth_loading integer_depth_scale enable_ray_loading"""
@@ -83,15 +83,14 @@ def load(
     """Read the capture folder `path`; for `downscale` and `background` see `blender.load`.
 
     `space` is "box", the cube of instant-ngp; "all", without end around what the cameras look at;
-    or "auto", the latter if the pictures have a background: no training picture is transparent.
+    or "auto", the latter if no training picture is transparent. `split` is a file of names (see
+    `splits.read_lists`), by default the lists `test_filenames` and so on of the file. Without any,
+    pictures 0, split_every, 2 * split_every ... by name are the test split, the others train.
 
-    `split` is a file of names (see `splits.read_lists`), by default the `train_filenames`,
-    `val_filenames` and `test_filenames` of the file. Without any, or with "every", pictures 0,
-    split_every, 2 * split_every ..., in the order of their names, are the test split, all others
-    the training split. `aabb_scale` is the side of the box relative to that of
-    instant-ngp, x * 0.33 + 0.5; by default the value in the file, or 1. `scale` and `offset` in the
-    file replace 0.33 and 0.5. In all of space, the file's box is not needed; of a larger one than
-    instant-ngp's, the box of the visual hull of the training masks is taken.
+    `aabb_scale` is the side of the box relative to that of instant-ngp, x * 0.33 + 0.5, whose
+    numbers `scale` and `offset` replace; by default the value in the file, or 1; where that is
+    larger, the box is that of the visual hull of the training masks. In all of space, it is not
+    needed.
 
     Intrinsics of a frame take precedence over those of the file. Lens distortion is undone, and
     pictures are cropped to what the lens saw. Frames without a picture are logged and left out.
@@ -100,7 +99,7 @@ def load(
     root = data_folder(path)
     record, path = read_json(root, CAMERA_FILE), root / CAMERA_FILE
     lists = read_lists(root, split, record, path)
-    splits = divide(read_views(root, record, log), split_every, lists, path, log)
+    splits = divide(read_views(root, record, path, log), split_every, lists, path, log)
     pictures = describe_splits(splits, downscale, log)
     space, cameras = space_of(space, pictures), [view.camera for view in splits["train"]]
     around = space == "all" and aabb_scale is None
@@ -113,48 +112,50 @@ def load(
     return replace(scene, maps=program_maps(path, record))
 
 
-def read_views(root: Path, record: dict, log: Log) -> Listed:
-    path = root / CAMERA_FILE
+def read_views(
+    root: Path, record: dict, path: Path, log: Log, every: bool = False, optional: bool = False
+) -> Listed:
+    """The pictures of the frames in a `record`, the file `path`, of any size in their proportions.
+    Raises if not `every` one is there, or none, unless they are `optional`."""
     frames = frames_of(record, path)
     names = [frame["file_path"] for _, frame in frames]
     files = find_all(root, names)
-    report(root, names, files, f"{path}: frames", log)
-    remarks = Remarks()
-    remarks.add_unread(path, [record, *(frame for _, frame in frames)], KNOWN | BOX)
-    views: list[tuple[str, View | None]] = []
+    if optional and not any(files):
+        log.info(f"{path.name}: none of its {len(files)} pictures are there, split left out")
+        return []
+    report(root, names, files, f"{path}: frames", log, every)
+    remarks, views = Remarks(), list[tuple[str, View | None]]()
+    remarks.add_unread(path, [record, *(frame for _, frame in frames)], KNOWN)
     for (where, frame), name, file in zip(frames, map(tidy, names), files, strict=True):
         if not file:
             views.append((name, None))
             continue
         settings = ChainMap(frame, record)
-        views.append((name, read_view(root, file, settings, where, remarks)))
+        pose = opengl_pose(settings, "transform_matrix", where, remarks)
+        width, height = image_size(file)
+        usual = Camera(pose, 0, 0, width / 2, height / 2, width, height)  # without a focal length
+        camera = fitted_camera(read_camera(settings, usual, where, remarks), file)
+        lens, mask = read_lens(settings, where), frame_mask(root, settings, file, where)
+        views.append((name, View(os.path.relpath(file, root), file, camera, lens, *mask)))
     remarks.tell(log.info)
     return views
 
 
-def read_view(root: Path, file: Path, settings: ChainMap, where: str, remarks: Remarks) -> View:
-    """The view of a frame. Its picture may be smaller than `w` and `h` say."""
-    pose = opengl_pose(settings, "transform_matrix", where, remarks)
-    width, height = image_size(file)
-    usual = Camera(pose, 0, 0, width / 2, height / 2, width, height)  # without a focal length
-    camera = read_camera(settings, usual, where, remarks)
-    lens, mask = read_lens(settings, where), frame_mask(root, settings, file, where)
-    return View(os.path.relpath(file, root), file, fitted_camera(camera, file), lens, *mask)
-
-
 def read_camera(settings: ChainMap, usual: Camera, where: str, remarks: Remarks) -> Camera:
     """The pinhole camera of a frame; what is not given is that of `usual`, scaled to its size."""
-    width = whole_number(settings.get("w", usual.width), f"{where}.w", 1)
-    height = whole_number(settings.get("h", usual.height), f"{where}.h", 1)
+    width, height = (
+        whole_number(settings.get(name, size), f"{where}.{name}", 1)
+        for name, size in (("w", usual.width), ("h", usual.height))
+    )
     usual = scale_camera(usual, width, height)
     x, y = (focal(settings, *one, where, remarks) for one in (("x", width), ("y", height)))
     fx, fy = x or y or usual.fx, y or x or usual.fy
     if not fx:
         raise unexpected(f"{where}.fl_x", "a focal length, or camera_angle_x", "neither")
-    cx = number(
-        settings.get("cx", usual.cx), f"{where}.cx"
-    )  # outside of a picture, if it is a crop
-    cy = number(settings.get("cy", usual.cy), f"{where}.cy")
+    cx, cy = (
+        number(settings.get(name, x), f"{where}.{name}")  # outside of a picture, if it is a crop
+        for name, x in (("cx", usual.cx), ("cy", usual.cy))
+    )
     return Camera(usual.c2w, fx, fy, cx, cy, width, height)
 
 
@@ -162,20 +163,21 @@ def focal(settings: ChainMap, axis: str, size: float, where: str, remarks: Remar
     """Focal length in pixels, from the frame or else the file; None if not given."""
     fov, length, angle = f"{axis}_fov", f"fl_{axis}", f"camera_angle_{axis}"
     for level in settings.maps:
-        if not (given := [name for name in (fov, length, angle) if name in level]):
+        given = {name: level[name] for name in (fov, length, angle) if name in level}
+        if not given:
             continue
-        name, *others = given
-        x, at = level[name], f"{where}.{name}"
+        name, x = next(iter(given.items()))
+        at = f"{where}.{name}"
         if name == length:
             pixels = number(x, at, 0)
         else:
             pixels = focal_length(math.radians(number(x, at)) if name == fov else x, size, at)
         radians = 2 * math.atan(size / 2 / pixels)
         meant = {fov: math.degrees(radians), length: pixels, angle: radians}
-        for name in others:
-            x, low, high = level[name], 0.98 * meant[name], 1.02 * meant[name]
-            if not (isinstance(x, int | float) and low < x < high):
-                remarks.add(at, f"is taken, not {name}, which contradicts it", describe(x))
+        for other, y in given.items():
+            low, high = 0.98 * meant[other], 1.02 * meant[other]
+            if not (isinstance(y, int | float) and low < y < high):
+                remarks.add(at, f"is taken, not {other}, which contradicts it", describe(y))
         return pixels
     return None
 
@@ -202,22 +204,18 @@ def read_lens(settings: Mapping, where: str) -> Lens | None:
 def capture_box(path: Path, record: dict, aabb_scale: float | None) -> Box:
     """The cube `aabb_scale` times as large as instant-ngp's unit cube, in the file's units."""
     scale, offset = ngp_cube(path, record)
-    given = aabb_scale is not None
-    sides = aabb_scale if given else record.get("aabb_scale", 1)
-    half = number(sides, "aabb_scale" if given else f"{path}: aabb_scale", 0) / scale / 2
-    middle = (0.5 - offset) / scale
+    where = f"{path}: aabb_scale" if aabb_scale is None else "aabb_scale"
+    sides = record.get("aabb_scale", 1) if aabb_scale is None else aabb_scale
+    half, middle = number(sides, where, 0) / scale / 2, (0.5 - offset) / scale
     return Box(middle - half, middle + half)
 
 
 def ngp_cube(path: Path, record: dict) -> tuple[float, Tensor]:
     """instant-ngp's `scale` and `offset` [3] float64, or its defaults."""
-    scale = number(record.get("scale", NGP_SCALE), f"{path}: scale", 0)
     offset = record.get("offset", NGP_OFFSET)
-    if isinstance(offset, int | float):
-        offset = [offset] * 3
-    if not isinstance(offset, list) or len(offset) != 3:
-        raise unexpected(f"{path}: offset", "three numbers", describe(offset))
-    offset = [number(x, f"{path}: offset[{i}]") for i, x in enumerate(offset)]
+    offset = [offset] * 3 if isinstance(offset, int | float) else offset
+    offset = numbers_of(offset, 3, f"{path}: offset")
+    scale = number(record.get("scale", NGP_SCALE), f"{path}: scale", 0)
     return scale, torch.tensor(offset, dtype=torch.float64)
 
 

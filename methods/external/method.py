@@ -164,25 +164,19 @@ class External:
             if "load" in can:
                 self._load({**job, "state": None}, log)
             return
-        if scene.splits["train"].masks:
-            log.info(
-                f"{self.name} is given masks; whether it leaves out what they hide is up to it"
-            )
         folder = log.stage_dir("external", self._key(job))
         stored = {**job, "state": str(folder / "state")}
         finished = folder / "trained.json"
         with missing(finished, log) as untrained:
             if untrained:
-                cost = self._train(folder, job, log)
+                self.train_s = self._train(folder, job, log)
                 if "load" in can:  # otherwise the next process trains again, alone
                     with whole(finished) as new:
-                        new.write_text(json.dumps(cost) + "\n")
+                        new.write_text(json.dumps({"train_s": self.train_s}) + "\n")
                     self._restart()  # without the memory of a training
             else:
                 log.info(f"{self.name}: found in {folder}")
-                cost = read_record(finished)
-            self.train_s = cost["train_s"]
-            self.train_peak_bytes = cost["train_peak_bytes"] or math.nan
+                self.train_s = read_record(finished)["train_s"]
         if "load" in can:
             self._load(stored, log)
 
@@ -213,9 +207,8 @@ class External:
             **computed_by(write_blender),
         }
 
-    def _train(self, folder: Path, job: Mapping[str, object], log: Log) -> dict[str, Any]:
-        """Let it train on the scene as files, and put what it stores into `folder`; the seconds and
-        the peak memory that took."""
+    def _train(self, folder: Path, job: Mapping[str, object], log: Log) -> float:
+        """Let it train on the scene as files, and put what it stores into `folder`; the seconds."""
         pictures = [
             {"file": picture_file("train", number), **self._described(camera)}
             for number, camera in enumerate(self._scene.splits["train"].cameras)
@@ -239,12 +232,12 @@ class External:
 
                 begun = time.monotonic()
                 where = {"scene": str(place), "pictures": pictures, "state": str(state)}
-                told, _ = self._worker.ask("fit", self.fit_s, {**job, **where}, progress)
+                self._worker.ask("fit", self.fit_s, {**job, **where}, progress)
                 seconds = time.monotonic() - begun
             shutil.rmtree(folder / "state", ignore_errors=True)
             state.rename(folder / "state")
             (folder / "output.txt").write_text(self._worker.output())
-        return {"train_s": seconds, "train_peak_bytes": self._peak(told)}
+        return seconds
 
     def _described(self, camera: Camera) -> dict[str, object]:
         """A camera in scene units, as the protocol has it."""
@@ -259,19 +252,15 @@ class External:
         """Let it render one frame; the times are its own."""
         told, arrays = self._worker.ask("render", self.frame_s, self._described(camera))
         ns, stages, counters = (told.get(name, {}) for name in ("ns", "stages", "counters"))
+        peak = told.get("peak_bytes")
         self._expect(type(ns) is int and ns > 0, "ns above 0", f"ns {ns}")
         self._expect(_counts(stages) and sum(stages.values()) <= ns, f"stages within {ns}", stages)
         self._expect(_counts(counters), "counters of 0 or more", counters)
-        probe.report(ns, stages, self._peak(told))
+        self._expect(peak is None or _counts({"": peak}), "peak_bytes of 0 or more", peak)
+        probe.report(ns, stages, peak)
         for name, done in counters.items():
             probe.count(name, done)
         return self._frame(arrays, (camera.height, camera.width))
-
-    def _peak(self, told: Header) -> int | None:
-        """The peak memory of its process in an answer, if told."""
-        peak = told.get("peak_bytes")
-        self._expect(peak is None or _counts({"": peak}), "peak_bytes of 0 or more", peak)
-        return peak
 
     def _frame(self, arrays: Mapping[str, np.ndarray], size: tuple[int, int]) -> Frame:
         for name, shape in (("rgb", (*size, 3)), ("depth", size), ("alpha", size)):

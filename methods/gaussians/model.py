@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from bench.types import Camera, Probe
 from methods.gaussians.kernels.blending import blend
-from methods.gaussians.kernels.projection import BLUR, project_gaussians
+from methods.gaussians.kernels.projection import project_gaussians
 from methods.kernels.shade import shade
 from methods.kernels.types import Pixels
 
@@ -22,8 +22,6 @@ OUTLIERS = 1e-3
 
 class Gaussians(nn.Module):
     """N Gaussians."""
-
-    antialiased = False  # whether what BLUR adds to an ellipse is taken from its opacity
 
     def __init__(
         self,
@@ -73,10 +71,6 @@ class Gaussians(nn.Module):
             opacities = self.opacities
             shape = self.means, self.log_scales.exp(), self.rotations
             ellipses = project_gaussians(*shape, opacities, camera, backend=backend)
-            if self.antialiased:  # Mip-Splatting's 2D filter (Yu et al. 2024)
-                a, b, c = ellipses.conics.unbind(dim=1)
-                kept = 1 - BLUR * (a + c) + BLUR**2 * (a * c - b * b)  # |V' - BLUR I| / |V'|
-                opacities = opacities * kept.clamp(min=0).sqrt()
         probe.count("gaussians", (ellipses.extents[:, 0] > 0).sum(), len(self))
         with probe.stage("shade"):
             towards = functional.normalize(self.means.detach() - camera.c2w[:, 3], dim=1)
@@ -93,7 +87,7 @@ def rounded(gaussians: Gaussians) -> Gaussians:
     opacities = _levels(gaussians.opacities, 8).clamp(1e-6, 1 - 1e-6)
     log_scales = gaussians.log_scales.detach()
     thinnest = log_scales[log_scales.isfinite()].min()
-    found = Gaussians(
+    return Gaussians(
         _levels(gaussians.means, 16),
         _levels(log_scales.clamp(min=thinnest), 8),
         _levels(functional.normalize(gaussians.rotations, dim=1), 8),
@@ -101,8 +95,6 @@ def rounded(gaussians: Gaussians) -> Gaussians:
         _levels(gaussians.base, 8, OUTLIERS),
         _levels(gaussians.view, 8, OUTLIERS),
     )
-    found.antialiased = gaussians.antialiased
-    return found
 
 
 def stored_bytes(gaussians: Gaussians) -> int:

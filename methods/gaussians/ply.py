@@ -6,7 +6,7 @@ scale_0..2 (logarithms), rot_0..3 (w x y z). The file's harmonics have the Condo
 ours do not: those of odd order m change sign.
 
 `read` also takes what others write: infinite opacities, opaque or unseen; scales of minus infinity,
-or no scale_2 (2DGS), flat; filter_3D (Mip-Splatting); comments that ask for antialiasing.
+or no scale_2 (2DGS), flat; filter_3D (Mip-Splatting).
 """
 
 import math
@@ -32,8 +32,8 @@ ROTATION = tuple(f"rot_{i}" for i in range(4))
 PACKED = (".spz", ".splat", ".ksplat", ".sog", ".lcc")
 """Endings of files that splat-transform of PlayCanvas makes PLY files of."""
 
-MODE = re.compile(r"SplatRenderMode:?\s*(\w+)|\bantialiased\s+([01])", re.IGNORECASE)
-"""How a comment of Brush or Postshot says for which renderer the file was trained."""
+MIP = re.compile(r"SplatRenderMode:?\s*mip|\bantialiased\s+1", re.IGNORECASE)
+"""How a comment of Brush or Postshot says that the file was trained with antialiasing."""
 
 FAR = 1000  # units of a scene from the origin, float32 leaves 14 bits for a unit
 
@@ -78,17 +78,17 @@ def read(path: Path, scene: Scene, say: Callable[[str], object]) -> Gaussians:
         if wrong:
             raise SteerbenchError(f"{path}: {why}")
 
+    good = "expected a PLY file of 3D Gaussians"
     if not path.is_file():
         raise not_there(path, "a PLY file of 3D Gaussians")
     convert = f"convert it: splat-transform {path.name} {path.name.partition('.')[0]}-plain.ply"
     kind = path.suffix.lower()
-    refuse(kind in PACKED, f"expected a PLY file of 3D Gaussians, got {kind}; {convert}")
+    refuse(kind in PACKED, f"{good}, got {kind}; {convert}")
     try:
         file = PlyData.read(path)
         vertices: np.ndarray = file["vertex"].data
     except (PlyParseError, KeyError, ValueError, UnicodeDecodeError) as error:
-        why = "expected a PLY file of 3D Gaussians, could not read one"
-        raise SteerbenchError(f"{path}: {why} ({error})") from error
+        raise SteerbenchError(f"{path}: {good}, could not read one ({error})") from error
     refuse(not len(vertices), "expected 3D Gaussians, it has none")
     names = vertices.dtype.names or ()
     packed = "packed_position" in names
@@ -102,7 +102,6 @@ def read(path: Path, scene: Scene, say: Callable[[str], object]) -> Gaussians:
     rest = sorted((n for n in names if re.fullmatch(r"f_rest_\d+", n)), key=lambda n: int(n[7:]))
     degrees = "0, 9, 24 or 45 properties f_rest_* (degrees 0 to 3)"
     refuse(len(rest) not in (0, 9, 24, 45), f"expected {degrees}, got {len(rest)}")
-    smooth = [name for name in names if name.lower() == "filter_3d"]
 
     def columns(*group: str) -> Tensor:
         """[N, len(group)] in the file's own precision."""
@@ -116,15 +115,14 @@ def read(path: Path, scene: Scene, say: Callable[[str], object]) -> Gaussians:
     if flat:
         log_scales = torch.cat((log_scales, torch.full_like(logits, -math.inf)[:, None]), dim=1)
         say(f"{path}: without scale_2 (2DGS): drawn as flat 3D Gaussians")
-    if smooth:
+    if smooth := [name for name in names if name.lower() == "filter_3d"]:
         logits, log_scales = _fused(logits, log_scales, columns(*smooth).double())
         say(f"{path}: filter_3D is fused into scales and opacities, as Mip-Splatting exports it")
     comments = [*file.comments, *(comment for part in file for comment in part.comments)]
-    modes = ["".join(found).lower() for found in MODE.findall("\n".join(comments))][-1:]
-    if modes in (["mip"], ["1"]):
-        say(f"{path}: drawn antialiased, as a comment in it says")
-    known = {*needed, *rest, *smooth, *NORMAL, "vertex", "default", "mip", "2dgs", "0", "1"}
-    there = *names, *(part.name for part in file), *modes
+    if any(map(MIP.search, comments)):
+        say(f"{path}: trained with antialiasing, as a comment in it says; drawn without")
+    known = {*needed, *rest, *smooth, *NORMAL, "vertex"}
+    there = *names, *(part.name for part in file)
     if unread := ", ".join(name for name in there if name not in known):
         say(f"{path}: not read: {unread}")
 
@@ -140,9 +138,7 @@ def read(path: Path, scene: Scene, say: Callable[[str], object]) -> Gaussians:
     view = harmonics[:, 3:].reshape(len(means), 3, len(rest) // 3).transpose(1, 2)
     log_scales -= math.log(scene.unit_length)
     parts = means, log_scales, rotations, logits, harmonics[:, None, :3], _flipped(view)
-    found = Gaussians(*(part[drawn].contiguous() for part in parts))
-    found.antialiased = modes in (["mip"], ["1"])
-    return found
+    return Gaussians(*(part[drawn].contiguous() for part in parts))
 
 
 def _fused(logits: Tensor, log_scales: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:

@@ -99,26 +99,16 @@ def test_a_transforms_file_gives_intrinsics_or_leaves_them_to_the_test_camera(sc
     ("record", "message"),
     [
         (viewer(), r"camera_path: expected a list with at least one entry, got list of 0"),
-        ({"camera_path": [{}]}, r"render_width: expected a whole number"),
+        ({"camera_path": [{}]}, r"camera_to_world: expected a 4x4 matrix"),
         (viewer(keyframe()) | {"camera_type": "fisheye"}, "camera_type: expected perspective"),
         (viewer(keyframe(fov=200)), r"camera_path\[0\]\.fov: expected a finite number above 0"),
-        (viewer(keyframe(camera_to_world=[1, 2])), r"camera_to_world: expected a 4x4 matrix"),
-        (
-            viewer(keyframe(camera_to_world=[2.0, *keyframe()["camera_to_world"][1:]])),
-            "expected an orthonormal rotation",
-        ),
-        (
-            nerfbaselines(camera_model="opencv", frames=[{}]),
-            "camera_model: expected pinhole, got",
-        ),
+        (viewer(keyframe()) | {"render_width": 0}, r"render_width: expected a whole number"),
+        (nerfbaselines(camera_model="opencv", frames=[{}]), "camera_model: expected pinhole, got"),
         (nerfbaselines(image_size=[40], frames=[{}]), "image_size: expected 2 numbers"),
         (nerfbaselines(frames=[{"pose": [1.0] * 9}]), r"frames\[0\]\.pose: expected a 4x4"),
         ({"nothing": 1}, r"expected camera_path \(nerfstudio's viewer\); frames .* got nothing"),
         ({"path": [{"R": [0] * 4, "T": [0] * 3}]}, r"R: its length: expected .* above 0, got 0"),
-        (
-            [{"position": [0] * 3, "rotation": [1]}],
-            r"expected a position and three rows of a rotation",
-        ),
+        ([{"position": [0] * 3, "rotation": [1]}], r"expected a position and three rows of a rot"),
     ],
 )
 def test_a_damaged_path_is_named_with_what_was_expected(scene, tmp_path, record, message):
@@ -160,9 +150,7 @@ def listed() -> dict[str, Any]:
 
 
 MOVED = keyframe(camera_to_world=[*chain(*in_a_model())])
-STILL = keyframe(
-    camera_to_world=[*chain(*(torch.cat(POSE, 1) * torch.tensor([1, -1, -1, 1])).tolist())]
-)
+STILL = keyframe(camera_to_world=(torch.cat(POSE, 1) * torch.tensor([1, -1, -1, 1])).tolist())
 
 
 @pytest.mark.parametrize(
@@ -170,16 +158,7 @@ STILL = keyframe(
     [
         (viewer(MOVED), 15, "those of a model, moved back as"),
         (viewer(STILL), 15, "those of the data set"),
-        (
-            [{"file_path": "a", "transform": in_a_model()[:3]}],
-            40,
-            "those of a model, moved back as",
-        ),
-        (
-            {"loop": True, "path": [in_the_cube()]},
-            12,
-            "not read: slice\n.*in the cube of the scene",
-        ),
+        ({"loop": True, "path": [in_the_cube()]}, 12, "not read: slice$"),
         ([listed()], 21, "^$"),
     ],
 )

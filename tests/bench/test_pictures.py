@@ -79,17 +79,12 @@ def test_pictures_in_subfolders_match_by_their_path(tmp_path, quiet_log, folder)
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(image.numpy()).save(path)
     split = Split([], list(images.values()), [f"images/{name}.jpg" for name in images])
-    times = tmp_path / "times.csv"
-    times.write_text(
-        "name,frame_ms\nimages/front/1.jpg,1\nimages/front/2.jpg,2\nimages/back/1.jpg,3\n"
-    )
     for pairs in (
         pictures.pairs_with_split(tmp_path / "ours", split),
         pictures.pairs_with_split(tmp_path / "ours", split, "order"),
     ):
         found = pictures.score(pairs, QUICK, {}, FACTS, quiet_log)
         assert found.frames["psnr"].tolist() == [math.inf] * 3
-        assert pictures.reported_times(times, pairs) == [3, 1, 2]
     flat = write(tmp_path / "flat", {"1.png": noise(), "2.png": noise()})
     with pytest.raises(SteerbenchError, match=r"true pictures of different names.* several of 1"):
         pictures.pairs_with_split(flat, split)

@@ -49,14 +49,6 @@ def test_opaque_pictures_take_the_whole_space(blender_folder, log):
     assert scene.splits["train"].images[0].shape == (6, 8, 3)
 
 
-@pytest.mark.parametrize("path", ["test/r_0.png", "test\\r_0", "Test/r_0.jpg"])
-def test_paths_may_be_as_other_tools_write_them(blender_folder, log, path):
-    extended = {"file_path": path}
-    edit_json(blender_folder / "transforms_test.json", lambda r: r["frames"][0].update(extended))
-    scene = blender.load(blender_folder, log=log)
-    assert scene.splits["test"].names == ["test/r_0.png", "test/r_1.png"]
-
-
 def test_a_validation_split_has_all_its_pictures_or_none(blender_folder, log):
     text = (blender_folder / "transforms_train.json").read_text().replace("./train", "./val")
     (blender_folder / "transforms_val.json").write_text(text)
@@ -65,7 +57,9 @@ def test_a_validation_split_has_all_its_pictures_or_none(blender_folder, log):
     assert log.messages == ["transforms_val.json: none of its 3 pictures are there, split left out"]
     shutil.copytree(blender_folder / "train", blender_folder / "val")
     (blender_folder / "val" / "r_1.png").unlink()
-    with pytest.raises(SteerbenchError, match=r"transforms_val.json: frames\[1\].file_path"):
+    with pytest.raises(
+        SteerbenchError, match=r"transforms_val.json: frames: .* 1 of 3 not there: no"
+    ):
         blender.load(blender_folder, log=log)
 
 
@@ -114,16 +108,7 @@ def placed(place: tuple[int, int], value: float):
         (lambda r: r.update(camera_angle_x=3.2), r"camera_angle_x: .* got 3.2"),
         (lambda r: r.update(camera_angle_x="0.7"), r"camera_angle_x: .* got '0.7'"),
         (lambda r: r.update(camera_angle_x=10**400), r"camera_angle_x: expected a finite number"),
-        *(
-            (lambda r, path=path: frame(r).update(file_path=path), f"file_path: expected {said}")
-            for path, said in (
-                ("./train/none", r"a picture, got no './train/none' in .*; nearest: .*train/r_"),
-                (
-                    "C:\\chair\\train\\r_1.png",
-                    r"a picture, got no 'C:.*: .*train/r_1",
-                ),
-            )
-        ),
+        (lambda r: frame(r).update(file_path="none"), "frames: .* 1 of 3 not there: no 'none' in"),
     ],
 )
 def test_bad_camera_file_names_file_and_field(blender_folder, log, change, message):
@@ -148,12 +133,6 @@ DEEP = png(struct.pack(">2I5B", 8, 6, 16, 2, 0, 0, 0), bytes(6 * (1 + 6 * 8)))
         ("transforms_test.json", None, r": expected a file"),
         ("train/r_2.png", encoded("RGB")[:-40], r": expected a whole picture"),
         ("train/r_0.png", b"not a picture", r": expected a whole picture"),
-        (
-            "train/r_1.png",
-            encoded("L", size=(7, 6)),
-            r": expected a picture of 8 x 6 pixels, .* got 7 x 6",
-        ),
-        ("train/r_1.png", encoded("I;16"), r": expected 8 bits a channel"),
         ("train/r_1.png", DEEP, r": expected 8 bits a channel"),
     ],
 )

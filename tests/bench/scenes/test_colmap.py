@@ -77,9 +77,8 @@ def test_the_box_is_that_of_the_points_without_outliers_and_of_a_ply_the_same(fo
     assert torch.equal(scene.bounds, expected.place_of(expected))
     pycolmap.Reconstruction(model).export_PLY(model / "points3D.ply")
     (model / "points3D.bin").unlink()
-    assert colmap.load(root, space="box", log=log).unit_length == pytest.approx(
-        scene.unit_length, rel=1e-6
-    )
+    again = colmap.load(root, space="box", log=log)
+    assert again.unit_length == pytest.approx(scene.unit_length, rel=1e-6)
 
 
 def test_smaller_pictures_have_smaller_cameras(folder, log):
@@ -118,9 +117,7 @@ def test_masks_lie_beside_the_pictures(folder, log, images, place):
     Image.fromarray(black[::2, ::2]).save(file)
     with pytest.raises(SteerbenchError, match=r"008\.png.*: expected 8 x 6 pixels, got 4 x 3"):
         colmap.load(root, images=images, log=log)
-    with pytest.raises(
-        SteerbenchError, match=r"scene\.masks: expected a folder of masks, got no 'none' in"
-    ):
+    with pytest.raises(SteerbenchError, match=r"scene\.masks: .* got no 'none' in"):
         colmap.load(root, images=images, masks="none", log=log)
 
 
@@ -178,34 +175,17 @@ def test_a_damaged_list_is_an_error_that_names_it(folder, log, name):
         colmap.load(path.parents[2], space="box", log=log)
 
 
-def test_a_text_that_lacks_images_is_told(folder, log):
-    path = folder(kind="text") / "sparse" / "0" / "images.txt"
-    path.write_text("\n".join(path.read_text().splitlines()[:-4]))
-    assert len(colmap.load(path.parents[2], log=log).splits["train"]) == 7
-    assert "has 8 images, not 10 as its comment says" in log.messages[0]
+KEYPOINTS = "\n1 2 3 4.5 5.5 -1 7 8 9 10 11 12\n"
+CHANGES: dict[str, Callable[[str], str]] = {
+    "no end": lambda text: text.rstrip("\n"),
+    "one line": lambda text: re.sub(r"\n+", "\n", text),
+    "three lines": lambda text: text.replace("\n\n", "\n\n\n"),
+    "keypoints": lambda text: text.replace("\n\n", KEYPOINTS),
+    "windows": lambda text: "\ufeff" + text.replace("\n", "\r\n"),
+}
 
 
-def no_end(text: str) -> str:
-    return text.rstrip("\n")
-
-
-def one_line(text: str) -> str:
-    return re.sub(r"\n+", "\n", text)
-
-
-def three_lines(text: str) -> str:
-    return text.replace("\n\n", "\n\n\n")
-
-
-def keypoints(text: str) -> str:
-    return text.replace("\n\n", "\n1 2 3 4.5 5.5 -1 7 8 9 10 11 12\n")
-
-
-def windows(text: str) -> str:
-    return "\ufeff" + text.replace("\n", "\r\n")
-
-
-@pytest.mark.parametrize("change", [no_end, one_line, three_lines, keypoints, windows])
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
 def test_every_image_of_a_text_is_read_by_its_whole_name(folder, log, change):
     binary, root = colmap.load(folder(), log=log), folder(kind="text")
     for path in (root / "images").iterdir():
@@ -223,30 +203,18 @@ def test_every_image_of_a_text_is_read_by_its_whole_name(folder, log, change):
     assert log.messages == []
 
 
+IMAGE, CAMERA = "3 1 0 0 0 0 0 0 002.png", "expected CAMERA_ID MODEL"
+
+
 @pytest.mark.parametrize(
     ("name", "pattern", "new", "message"),
     [
-        (
-            "images",
-            r"^3 .*",
-            "3 1 0 0 0 0 0 0 002.png",
-            r"line 9: expected IMAGE_ID QW .* got '3 1 0",
-        ),
-        (
-            "images",
-            r"1 002.png",
-            "7 002.png",
-            r"line 9: 002.png: .* got CAMERA_ID 7 without an entry",
-        ),
-        ("images", r"^3 \S+", "3 nan", r"line 9: 002.png: expected a finite number, got nan"),
-        ("cameras", r"PINHOLE", "PINHOLES", r"line 4: expected CAMERA_ID MODEL .* got 1 PINHOLES"),
-        ("cameras", r" \S+$", "", r"line 4: expected CAMERA_ID MODEL .* got 1 PINHOLE 8 6 9"),
-        (
-            "points3D",
-            r"^7 .*",
-            "7 0.5 x 1",
-            r"line \d+: expected POINT3D_ID X Y Z .* '7 0.5 x 1'",
-        ),
+        ("images", r"^3 .*", IMAGE, "line 9: expected IMAGE_ID QW .* got '3 1 0"),
+        ("images", r"1 002.png", "7 002.png", "line 9: 002.png: .* CAMERA_ID 7 without an entry"),
+        ("images", r"^3 \S+", "3 nan", "line 9: 002.png: expected a finite number, got nan"),
+        ("cameras", r"PINHOLE", "PINHOLES", f"line 4: {CAMERA} .* got 1 PINHOLES"),
+        ("cameras", r" \S+$", "", f"line 4: {CAMERA} .* got 1 PINHOLE 8 6 9"),
+        ("points3D", r"^7 .*", "7 0.5 x 1", r"line \d+: expected POINT3D_ID .* '7 0.5 x 1'"),
     ],
 )
 def test_a_bad_entry_of_a_text_is_named(folder, log, name, pattern, new, message):
@@ -296,7 +264,7 @@ def test_pictures_of_other_names_are_paired_in_order(folder, log, unregistered):
     assert np.array_equal(scene.splits["test"].images[1], picture(8, channels=3))
     assert "image00.jpg for 000.png" in log.messages[0]
     (small / "image.jpg").touch()
-    with pytest.raises(SteerbenchError, match=r"none of 10 files: no '000.png' in .*images_8;"):
+    with pytest.raises(SteerbenchError, match=r"10 of 10 not there: no '000.png' in .*images_8;"):
         colmap.load(root, images="images_8", log=log)
 
 

@@ -26,28 +26,20 @@ def test_a_scene_that_was_written_is_read_bit_by_bit(moved_scene, quiet_log, tmp
 
 
 def test_pictures_without_alpha_are_opaque_and_a_split_not_named_has_none(
-    moved_scene, quiet_log, tmp_path
+    moved_scene, log, tmp_path
 ):
     train = moved_scene.splits["train"]
-    opaque = replace(train, images=[image[..., :3] for image in train.images])
+    masks = [image[..., 0] > 99 for image in train.images]
+    opaque = replace(train, images=[image[..., :3] for image in train.images], masks=masks)
     scene = replace(moved_scene, splits={**moved_scene.splits, "train": opaque})
-    write_blender(scene, tmp_path, {"train": "train", "test": "train"}, quiet_log)
+    write_blender(scene, tmp_path, {"train": "train", "test": "train"}, log)
+    assert log.messages == [f"{tmp_path}: without the masks of {scene.name}"]
     assert len(list(tmp_path.rglob("*.png"))) == len(train)
-    found = blender.load(tmp_path, bounds="full", log=quiet_log)
+    found = blender.load(tmp_path, bounds="full", log=log)
     assert found.splits["test"].names == found.splits["train"].names
     (image, *_) = found.splits["train"].images
     assert (image[..., 3] == 255).all()
     assert torch.equal(image[..., :3], opaque.images[0])
-
-
-def test_masks_are_written_and_read(moved_scene, quiet_log, tmp_path):
-    train = moved_scene.splits["train"]
-    masks = [image[..., 0] > 99 if n else None for n, image in enumerate(train.images)]
-    scene = replace(moved_scene, splits={"train": replace(train, masks=masks)})
-    write_blender(scene, tmp_path, {"train": "train", "test": "train"}, quiet_log)
-    found = blender.load(tmp_path, bounds="full", log=quiet_log).splits["test"]
-    assert found.mask(0) is None
-    assert all(torch.equal(found.mask(n), masks[n]) for n in range(1, len(masks)))
 
 
 @pytest.mark.parametrize(

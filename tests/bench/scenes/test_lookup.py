@@ -29,7 +29,7 @@ def root(tmp_path: Path) -> Path:
         ("RGB/A.png", "rgb/a.png", True),
         ("rgb/b.png", "rgb/b.JPG", True),
         ("link/c.png", "link/c.png", False),
-        ("../other/c.png", "../other/c.png", True),
+        ("../other/c.png", "../other/c.png", False),
         ("{root}/rgb/a.png", "rgb/a.png", False),
         ("rgb", None, False),
         ("rgb/a.txt", None, False),
@@ -42,7 +42,7 @@ def test_a_file_is_found_and_told_if_its_name_or_place_differs(root, log, name, 
     names = [name.format(root=root), "rgb/other.png"]
     files = find_all(root, names)
     assert files[0] is None if found is None else files[0].samefile(root / found)
-    report(root, names, files, "here", log)
+    report(root, names, files, "here", log, False)
     assert len(log.messages) == (told or found is None)
 
 
@@ -67,6 +67,6 @@ def test_no_picture_is_that_of_two_names(root):
 )
 def test_what_is_missing_is_named_with_what_is_nearest(root, log, name, nearest):
     with pytest.raises(SteerbenchError) as error:
-        report(root, [name, "rgb/0"], find_all(root, [name, "rgb/0"]), "here", log)
-    expected = f"here: expected pictures, got none of 2 files: no '{name}' in {root}; nearest: "
+        report(root, [name, "rgb/0"], [None, root / "rgb/a.png"], "here", log, True)
+    expected = f"here: expected pictures, got 1 of 2 not there: no '{name}' in {root}; nearest: "
     assert str(error.value) == f"{expected}{root / nearest}"

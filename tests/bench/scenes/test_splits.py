@@ -1,6 +1,5 @@
 """Splits by every nth picture and by lists."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -44,20 +43,14 @@ def test_lists_are_obeyed_and_counted(change, splits, said, log):
     assert said in message
 
 
-@pytest.mark.parametrize(
-    ("file", "text", "test"),
-    [
-        ("test.txt", "# of the paper\n1.png\nimages/4\n\n", "14"),
-        ("train_list.txt", "\n".join(NAMES[:4]), "45"),
-        ("lists.json", json.dumps({"train": ["1", "2"], "test": ["3"]}), "3"),
-        ("lists.json", json.dumps(RECORD), "45"),
-    ],
-)
-def test_a_file_of_names_goes_before_the_lists_of_the_capture(tmp_path, log, file, text, test):
-    (tmp_path / file).write_text(text)
-    for root, split in ((tmp_path, file), (Path(), str(tmp_path / file))):
-        lists = read_lists(root, split, {"test_filenames": ["0"]}, Path())
-        assert numbers(divide(LISTED, 2, lists, Path(), log))["test"] == test
+@pytest.mark.parametrize("text", ["# of the paper\n1.png\n4\n\n", "/a/images/1.jpg\n./4"])
+def test_a_file_of_names_goes_before_the_lists_of_the_capture(tmp_path, log, text):
+    for name, split, others in (("mine.txt", "test", "train"), ("train_1.txt", "train", "test")):
+        (tmp_path / name).write_text(text)
+        for root, given in ((tmp_path, name), (Path(), str(tmp_path / name))):
+            lists = read_lists(root, given, {"test_filenames": ["0"]}, Path())
+            found = numbers(divide(LISTED, 2, lists, Path(), log))
+            assert found == {split: "14", others: "0235"}
 
 
 @pytest.mark.parametrize(
@@ -65,16 +58,13 @@ def test_a_file_of_names_goes_before_the_lists_of_the_capture(tmp_path, log, fil
     [
         ("none.txt", "", r"scene.split: expected a file of names, got no 'none.txt' in .*a.txt"),
         ("a.txt", "# none", r"a.txt: expected names of pictures, got none"),
-        ("a.txt", "9.png", r"a.txt: test: .* such as images/5.png, got '9.png'"),
-        ("a.json", '{"train": 3}', r"a.json: train: expected a list of names, got 3"),
+        ("a.txt", "9.png", r"a.txt: test: .* such as images/0.png, got '9.png'"),
         ("a.txt", "\n".join(NAMES), r"here: expected a picture to train on, got none of 0"),
+        (None, "", r"here: train_filenames: expected a list of names, got 3"),
     ],
 )
 def test_a_file_that_names_no_picture_is_refused(tmp_path, log, split, text, message):
-    (tmp_path / ("a.txt" if split == "none.txt" else split)).write_text(text)
+    (tmp_path / "a.txt").write_text(text)
+    record, here = {"train_filenames": 3}, Path("here")
     with pytest.raises(SteerbenchError, match=message):
-        divide(LISTED, 2, read_lists(tmp_path, split, {}, Path()), Path("here"), log)
-
-
-def test_every_nth_can_be_asked_for():
-    assert read_lists(Path(), "every", RECORD, Path()) is None
+        divide(LISTED, 2, read_lists(tmp_path, split, record, here), here, log)

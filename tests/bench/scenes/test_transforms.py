@@ -83,17 +83,12 @@ FISHEYE = {"is_fisheye": True, "fl_x": 2.6, "fl_y": 2.6, "cx": 4, "cy": 3}  # of
     [
         (every(cx=-4, cy=7.5), (9, 8, -4, 7.5), r"001.png: .* far from .*: \(-4, 7.5\) of 8 x 6 "),
         (every(w=16, h=12, cx=9, cy=5), (4.5, 4, 4.5, 2.5), None),
-        (
-            every(x_fov=50),
-            (8.578, 8, 4.5, 2.5),
-            r"\[0\].x_fov: is taken, not fl_x, .*: 9.0 \(and 9",
-        ),
+        (every(x_fov=50), (8.578, *GIVEN[1:]), r"x_fov: is taken, not fl_x, .*: 9.0 \(and 9"),
         (every(camera_angle_x=2), GIVEN, r"fl_x: is taken, not camera_angle_x, .*: 2 \(and 9"),
-        (every(fl_x=4), (4, 8, 4.5, 2.5), "001.png: pixels far from square: fx 4, fy 8"),
         (lambda r: r.pop("fl_x"), (8, 8, 4.5, 2.5), None),
         (every(aabb=[[0, 0], [0, 1]], sharpen=0.0), GIVEN, "not read: aabb$"),
-        (turned(0.25, 15), GIVEN, r"matrix: scaled rotation, .*: 0.25 \(and 9 more\)$"),
-        (turned(1, 2), GIVEN, r"frames\[0\].transform_matrix: rounded rotation, taking"),
+        (turned(0.25, 15), GIVEN, r"matrix: scaled or rounded rot.*: 0.25 \(and 9 more\)$"),
+        (turned(1, 2), GIVEN, r"frames\[0\].transform_matrix: scaled or rounded rotation, taking"),
         (turned(1, 15, 1, -1, -1), GIVEN, "poses: all cameras look away from their middle"),
         (every(**FISHEYE), (2.6, 2.6, 4, 3), "001.png: without its lens, .*: . x . of 8 x 6"),
     ],
@@ -206,9 +201,7 @@ def test_a_background_is_what_pictures_without_transparency_have(folder, log):
     assert transforms.load(folder, log=log).space == "all"
     Image.fromarray(picture(1)).save(folder / "images" / "001.png")
     assert transforms.load(folder, log=log).space == "box"
-    with pytest.raises(
-        SteerbenchError, match=r"scene.space: expected auto or box or all, got 'no'"
-    ):
+    with pytest.raises(SteerbenchError, match=r"scene.space: .* auto or box or all, got 'no'"):
         transforms.load(folder, space="no", log=log)
 
 
@@ -224,10 +217,7 @@ FAR = [[1, 0, 0, 1e308], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     [
         (every(fl_x=0), r"frames\[0\].fl_x: expected a finite number above 0, got 0"),
         (first(fl_y="9"), r"transforms\.json: frames\[0\].fl_y: .* got '9'"),
-        (
-            lambda r: (r.pop("fl_x"), r.pop("fl_y")),
-            r"frames\[0\].fl_x: expected a focal length, or",
-        ),
+        (lambda r: (r.pop("fl_x"), r.pop("fl_y")), r"\[0\].fl_x: expected a focal length, or"),
         (first(mask_path=5), r"frames\[0\].mask_path: expected a path, got 5"),
         (first(mask_path="m.png"), r"mask_path: expected a picture, got no .m\.png. in"),
         (first(cx=[9]), r"frames\[0\].cx: expected a finite number, got list of 1"),
@@ -239,7 +229,7 @@ FAR = [[1, 0, 0, 1e308], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         (every(camera_model="EQUIRECTANGULAR"), r"frames\[0\].camera_model: expected one of OP"),
         (every(aabb_scale=0), r"transforms\.json: aabb_scale: .* above 0"),
         (every(scale=-1), r"transforms\.json: scale: .* above 0"),
-        (every(offset=[1, 2]), r"transforms\.json: offset: expected three numbers"),
+        (every(offset=[1, 2]), r"transforms\.json: offset: expected 3 numbers, got list of 2"),
         (first(camera_angle_x=5e-324), "camera_angle_x: expected a finite number above 1e-09"),
         (every(fl_x=1e-310), r"images/\d+.png: expected lengths of"),
         (every(fl_x=1e300), r"images/\d+.png: expected lengths of"),
@@ -265,7 +255,7 @@ def test_too_few_pictures_and_a_bad_split_are_refused(folder, log):
     with pytest.raises(SteerbenchError, match=r"expected a picture to train on"):
         transforms.load(folder, log=log)
     first.unlink()
-    with pytest.raises(SteerbenchError, match=r"frames: expected pictures, got none of 10 files"):
+    with pytest.raises(SteerbenchError, match=r"frames: expected pictures, got 10 of 10 not there"):
         transforms.load(folder, log=log)
 
 

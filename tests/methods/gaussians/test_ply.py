@@ -11,7 +11,7 @@ import torch
 from numpy.lib.recfunctions import append_fields, repack_fields
 from plyfile import PlyData, PlyElement
 
-from bench.types import Camera, NullProbe, Scene, SteerbenchError
+from bench.types import NullProbe, Scene, SteerbenchError
 from methods.gaussians import ply
 from methods.gaussians.model import Gaussians, rounded
 from methods.kernels.shade import shade
@@ -147,37 +147,14 @@ def test_an_infinite_opacity_or_no_thickness_is_drawn(name, infinite, finite, ti
     torch.testing.assert_close(*pictures)
 
 
-@pytest.mark.parametrize(
-    ("comments", "antialiased"),
-    [
-        (["SplatRenderMode: mip"], True),
-        (["antialiased 1"], True),
-        (["SplatRenderMode: mip", "SplatRenderMode: default"], False),
-    ],
-)
-def test_a_comment_asks_for_opacities_without_what_the_blur_adds(
-    comments, antialiased, tiny_scene, tmp_path
+def test_the_filter_of_mip_splatting_is_fused_and_what_is_not_read_or_drawn_named(
+    tiny_scene, tmp_path
 ):
-    """A ball far smaller than a pixel, seen at the centre of one: sqrt(|V| / |V + BLUR I|)."""
-    path = tmp_path / "a.ply"
-    sizes = dict.fromkeys(ply.SCALE, -4.0)
-    scene = replace(tiny_scene, unit_length=1.0)
-    ball = vertices_of(scene, path, x=0.5, y=0.5, z=0.5, opacity=2.0, **sizes)[:1]
-    found, said = read_again(ball, path, scene, comments=comments)
-    assert ("antialiased" in said) == antialiased
-    pose = torch.eye(4)[:3] + torch.tensor([0, 0, 0, 1.0]) * torch.tensor([[0.5], [0.5], [-9.5]])
-    pixels = found.render(Camera(pose, 40.0, 40.0, 4.5, 4.5, 9, 9), 1e-4, NullProbe())
-    # One less two numbers near a half, in float32: the share has an error of a few 1e-7, squared.
-    variance = (math.exp(-4) * 40 / 10) ** 2
-    share = variance / (variance + 0.3) if antialiased else 1.0
-    assert pixels.alpha[40].item() == pytest.approx(share / (1 + math.exp(-2)), rel=1e-3)
-
-
-def test_the_filter_of_mip_splatting_is_fused_and_what_is_not_read_named(tiny_scene, tmp_path):
     path, given, more = tmp_path / "a.ply", some(), ["filter_3D", "motion_0"]
     plain = vertices_of(tiny_scene, path)
     vertices = append_fields(plain, more, [np.full(50, 0.03)] * 2, usemask=False)
-    found, said = read_again(vertices, path, tiny_scene)
+    found, said = read_again(vertices, path, tiny_scene, comments=["SplatRenderMode: mip"])
+    assert "trained with antialiasing, as a comment in it says; drawn without" in said
     assert "filter_3D is fused" in said
     assert "not read: motion_0" in said
     scales = (given.log_scales.exp().square() + (0.03 / tiny_scene.unit_length) ** 2).sqrt()
