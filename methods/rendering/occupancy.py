@@ -39,6 +39,8 @@ INITIAL = 1.2 * THRESHOLD
 LARGEST = math.exp(LOG_DENSITY_CLAMP)
 """Higher densities are stored as this value, so that they can decay: infinity does not."""
 
+DISTANT = 0.375  # from the middle of the cube: two half sides of the box
+
 MIN_VIEWS = 2  # training cameras that must see a place before it may count as occupied
 
 
@@ -48,7 +50,8 @@ def learnable_cells(bounds: Tensor, cameras: Sequence[Camera], contracted: bool 
     They overlap `bounds` [2, 3] and lie in a brick of 4^3 cells that at least `MIN_VIEWS` cameras
     have in their picture: what only one camera sees could be anywhere along its rays, and training
     would put it right in front of that camera. Bricks at most one brick away from a camera are left
-    out as well.
+    out as well. In contracted space, all bricks beyond `DISTANT` are in: they are so large that a
+    picture shows parts of them without their middle, and something must be behind everything.
     """
     device = bounds.device
     edge = torch.arange(RESOLUTION, device=device) / RESOLUTION
@@ -68,7 +71,10 @@ def learnable_cells(bounds: Tensor, cameras: Sequence[Camera], contracted: bool 
         views += (depth > 0) & within(pixels, camera.width, camera.height)
         at = contract(camera.c2w[:, 3]) if contracted else camera.c2w[:, 3]
         free &= (centres - at).abs().amax(dim=1) > 1.5 / side
-    bricks = ((views >= MIN_VIEWS) & free).view(side, side, side)
+    known = views >= MIN_VIEWS
+    if contracted:
+        known |= (centres - 0.5).abs().amax(dim=1) > DISTANT
+    bricks = (known & free).view(side, side, side)
     for dim in range(3):
         bricks = bricks.repeat_interleave(BRICK, dim=dim)
     return inside & bricks

@@ -43,6 +43,14 @@ def test_what_one_camera_sees_cannot_be_learnt():
     assert not learnable_cells(UNIT_CUBE, [one, behind]).any()
 
 
+def test_where_space_has_no_end_what_is_distant_can_always_be_learnt():
+    cells = learnable_cells(UNIT_CUBE, AROUND[:1], contracted=True)
+    at = (torch.arange(RESOLUTION) + 0.5) / RESOLUTION - 0.5
+    far = torch.stack(torch.meshgrid(at, at, at, indexing="ij")).abs().amax(dim=0) > 0.375
+    assert not (cells & ~far).any()  # from two half sides on, a contracted 3/2
+    assert (far & ~cells).sum() <= (3 * 4) ** 3  # at the camera
+
+
 def test_cells_at_a_camera_cannot_be_learnt():
     inside = replace(AROUND[0], c2w=AROUND[0].c2w.clone())
     inside.c2w[:, 3] = torch.tensor([0.51, 0.51, 0.51])
