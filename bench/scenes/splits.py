@@ -62,7 +62,7 @@ def divide(
     }
     for split, purpose in (("train", "train on"), ("test", "test")):
         if not views[split]:
-            got = f"none of {len(parts[split])} among {len(listed)}"
+            got = f"no file for {split}, which has {len(parts[split])} of {len(listed)} pictures"
             raise unexpected(where, f"a picture to {purpose}", got)
     return views
 

@@ -59,7 +59,11 @@ def test_a_file_of_names_goes_before_the_lists_of_the_capture(tmp_path, log, tex
         ("none.txt", "", r"scene.split: expected a file of names, got no 'none.txt' in .*a.txt"),
         ("a.txt", "# none", r"a.txt: expected names of pictures, got none"),
         ("a.txt", "9.png", r"a.txt: test: .* such as images/0.png, got '9.png'"),
-        ("a.txt", "\n".join(NAMES), r"here: expected a picture to train on, got none of 0"),
+        (
+            "a.txt",
+            "\n".join(NAMES),
+            r"here: expected a picture to train on, got no file for train, which has 0 of",
+        ),
         (None, "", r"here: train_filenames: expected a list of names, got 3"),
     ],
 )
