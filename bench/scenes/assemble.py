@@ -27,6 +27,7 @@ from bench.types import BACKGROUNDS, Camera, Log, Scene, Split
 MARGIN = 0.05  # enlarges the box of a hull by this share of its longest side, half at each end
 
 SPACES = ("auto", "box", "all")
+PLAIN, JPEG_NOISE = 0.9, 8  # share of a border that is plain, of 255 levels
 PULL = 1e-3  # of the centres of cameras on the point that they look at, of that of their axes
 
 CELLS = 64  # along each side of the cube that is searched for the visual hull
@@ -175,16 +176,29 @@ class Box:
         return Box(self.lower - share * self.side / 2, self.upper + share * self.side / 2)
 
 
-def space_of(space: str, pictures: Mapping[str, Pictures]) -> str:
-    """What `scene.space` stands for, "box" or "all": "auto" is all of space if no training picture
-    is transparent anywhere, so that there is a background."""
+def space_of(space: str, pictures: Mapping[str, Pictures], background: str) -> str:
+    """What `scene.space` stands for, "box" or "all": "auto" is all of space if the training
+    pictures have a background: they are neither transparent anywhere nor of the scene's
+    `background` all along their border, as pictures of objects are."""
     if space not in SPACES:
         raise unexpected("scene.space", " or ".join(SPACES), repr(space))
     if space != "auto":
         return space
     train = pictures["train"]
     clear = (train[n] for n, picture in enumerate(train.described) if picture.clear)
-    return "box" if any((picture[..., 3] < 255).any() for picture in clear) else "all"
+    if any((picture[..., 3] < 255).any() for picture in clear):
+        return "box"
+    level = 255 * BACKGROUNDS.get(background, 0)
+    some = train[:: -(-len(train) // GLANCES)]
+    return "box" if all(_border_share(picture, level) > PLAIN for picture in some) else "all"
+
+
+def _border_share(picture: Tensor, level: float) -> float:
+    """The share of the pixels at the border of a picture [H, W, 3] whose channels are all about at
+    `level` of 255: not as far off as a JPEG file may be."""
+    sides = picture[0], picture[-1], picture[:, 0], picture[:, -1]
+    off = (torch.cat(sides)[:, :3].float() - level).abs().amax(dim=1)
+    return (off <= JPEG_NOISE).float().mean().item()
 
 
 def box_of_cameras(cameras: Sequence[Camera]) -> Box:

@@ -70,7 +70,7 @@ def load(
     listed = read_views(root, images, folder, mask_folder(root, images, masks), log)
     splits = divide(listed, split_every, lists, folder, log)
     pictures = describe_splits(splits, downscale, log)
-    space = space_of(space, pictures)
+    space = space_of(space, pictures, background)
     if bounds != "auto":
         box = parse_box(bounds)
     elif space == "all":

@@ -83,7 +83,7 @@ def load(
     """Read the capture folder `path`; for `downscale` and `background` see `blender.load`.
 
     `space` is "box", the cube of instant-ngp; "all", without end around what the cameras look at;
-    or "auto", the latter if no training picture is transparent. `split` is a file of names (see
+    or "auto": see `assemble.space_of`. `split` is a file of names (see
     `splits.read_lists`), by default the lists `test_filenames` and so on of the file. Without any,
     pictures 0, split_every, 2 * split_every ... by name are the test split, the others train.
 
@@ -101,7 +101,10 @@ def load(
     lists = read_lists(root, split, record, path)
     splits = divide(read_views(root, record, path, log), split_every, lists, path, log)
     pictures = describe_splits(splits, downscale, log)
-    space, cameras = space_of(space, pictures), [view.camera for view in splits["train"]]
+    space, cameras = (
+        space_of(space, pictures, background),
+        [view.camera for view in splits["train"]],
+    )
     around = space == "all" and aabb_scale is None
     box = box_of_cameras(cameras) if around else capture_box(path, record, aabb_scale)
     if space == "box" and aabb_scale is None and record.get("aabb_scale", 1) > 1:

@@ -197,10 +197,16 @@ def test_in_all_of_space_the_box_is_the_middle_half_of_the_cube(folder, log):
     assert transforms.load(folder, log=log).unit_length == pytest.approx(2 * 8, rel=1e-3)
 
 
-def test_a_background_is_what_pictures_without_transparency_have(folder, log):
+def test_a_background_is_what_is_neither_transparent_nor_plain(folder, log):
     assert transforms.load(folder, log=log).space == "all"
     Image.fromarray(picture(1)).save(folder / "images" / "001.png")
     assert transforms.load(folder, log=log).space == "box"
+    white = np.full((6, 8, 3), 250, np.uint8)
+    white[2:4, 3:5] = 0
+    for k in range(10):
+        Image.fromarray(white).save(folder / "images" / f"{k:03}.png")
+    assert transforms.load(folder, log=log).space == "box"
+    assert transforms.load(folder, background="black", log=log).space == "all"
     with pytest.raises(SteerbenchError, match=r"scene.space: .* auto or box or all, got 'no'"):
         transforms.load(folder, space="no", log=log)
 
