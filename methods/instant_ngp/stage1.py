@@ -150,5 +150,4 @@ def train_field(setup: Setup, scene: Scene, budget: Budget, log: Log) -> Trained
     grid, field.gradients = new_grid(scene, setup.device), None
     with checkpoint.restoring(finished):
         restore_field(field, grid, tensors)
-    how = setup.training.sampling(budget, scene.space == "all")
-    return TrainedField(field, grid, how, *cost)
+    return TrainedField(field, grid, setup.training.sampling(budget), *cost)

@@ -70,10 +70,10 @@ class TrainingOptions(PixelOptions):
         check_stop(self.stop)
         expect(self.thin >= 0, "thin", "an optical depth of 0 or more", self.thin)
 
-    def sampling(self, budget: Budget, contracted: bool) -> Sampling:
+    def sampling(self, budget: Budget) -> Sampling:
         """How rays are marched in a training within `budget`, and later to render its result."""
         if self.march_step is None:
-            return Sampling(step=suitable_step(budget.steps, contracted))
+            return Sampling(step=suitable_step(budget.steps))
         return Sampling(step=self.march_step * STEP)
 
 
@@ -198,9 +198,7 @@ class FieldTraining(PixelTraining):
         samples = math.ceil(options.share * budget.samples)
         super().__init__(scene, field.device, budget.steps, samples, options, seed)
         self.field, self.grid = field, new_grid(scene, field.device)
-        self.sampling = replace(
-            options.sampling(budget, scene.space == "all"), stop=options.stop, thin=options.thin
-        )
+        self.sampling = replace(options.sampling(budget), stop=options.stop, thin=options.thin)
         self.rays = options.rays or self.rays
         self.optimiser = FieldOptimiser(field)
 

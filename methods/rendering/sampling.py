@@ -13,7 +13,7 @@ FAINT = 0.1
 than a tenth of what the early stop may cause."""
 
 
-def suitable_step(steps: int, contracted: bool = False) -> float:
+def suitable_step(steps: int) -> float:
     """World length of the ray-marching step that suits a training of `steps` steps.
 
     With the same number of samples, longer steps allow more rays. This pays until the detail of the
@@ -22,8 +22,6 @@ def suitable_step(steps: int, contracted: bool = False) -> float:
     the release. It never exceeds a cell of the density grid, which a longer step would miss.
     Measured up to 3,000 steps of 32,768 samples: docs/log.md, "The step that a training needs".
     """
-    if contracted:  # there is matter all along a ray: docs/log.md, "Captures with a background"
-        return 1 / RESOLUTION
     return min(STEP * (20_000 / steps) ** (1 / 3), 1 / RESOLUTION)
 
 

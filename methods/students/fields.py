@@ -81,7 +81,7 @@ class FieldStudent(Student):
 
     def sampling(self, budget: Budget) -> Sampling:
         """How its rays are sampled in training: as those of its teacher."""
-        return self.teacher.training.sampling(budget, self.contracted)
+        return self.teacher.training.sampling(budget)
 
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> StudentTraining:
         self.occupancy = self.occupied(teacher)

@@ -299,7 +299,7 @@ def test_a_scene_beside_a_data_set_is_refused(tmp_path, word):
 @pytest.mark.parametrize("text", ["/data/chair", "/a b,c (d)/it's", "/x=1/${y}#2", "~/Jürgen"])
 def test_any_folder_can_be_named_in_a_command(text):
     config = composed(["scene=blender", setting("scene.path", text)])
-    assert config.scene._get_node("path")._value() == text
+    assert config.scene.path == text
 
 
 @pytest.mark.parametrize("quote", ["", "'", '"'])

@@ -108,9 +108,7 @@ def test_the_learning_rate_falls_from_the_first_to_the_last_step(ball_scene):
 
 def test_the_step_of_the_rays_suits_the_length_of_the_training_or_is_given():
     def step(steps: int, march_step: float | None = None) -> float:
-        return (
-            field_options(march_step=march_step).sampling(replace(BUDGET, steps=steps), False).step
-        )
+        return field_options(march_step=march_step).sampling(replace(BUDGET, steps=steps)).step
 
     assert step(20_000) == STEP  # as long as the release trains
     assert step(1000) / step(8000) == pytest.approx(2)
