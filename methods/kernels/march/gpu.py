@@ -233,7 +233,7 @@ def _march(
                 room = tl.minimum(_room(px, x, free, width), _room(py, y, free, width))
                 room = tl.maximum(tl.minimum(room, _room(pz, z, free, width)), 0.0)
                 speed = tl.maximum(tl.abs(dx), tl.maximum(tl.abs(dy), tl.abs(dz)))
-                leave = t + room / tl.maximum(_steepness(px, py, pz, room) * speed, 1e-38)
+                leave = t + room / tl.maximum(_steepness(px, py, pz, room) * speed, 1e-37)
                 ahead = (_drawn_in((leave - sx) / sy) - sz) / step
             else:
                 leave = _leave_slab(ox, sx, x, free, width)
