@@ -262,6 +262,8 @@ def tight(space: Box, train: Pictures) -> Box:
         hull = hull_box(cameras, train, part)
         if hull and (hull.lower > part.lower).all() and (hull.upper < part.upper).all():
             found = hull
+        elif found is not space:
+            break
         part = Box((part.lower + middle) / 2, (part.upper + middle) / 2)
     return found
 

@@ -83,9 +83,9 @@ def load(
     """Read the capture folder `path`; for `downscale` and `background` see `blender.load`.
 
     `space` is "box", the cube of instant-ngp; "all", without end around what the cameras look at;
-    or "auto": see `assemble.space_of`. `split` is a file of names (see
-    `splits.read_lists`), by default the lists `test_filenames` and so on of the file. Without any,
-    pictures 0, split_every, 2 * split_every ... by name are the test split, the others train.
+    or "auto": see `assemble.space_of`. `split` is a file of names (see `splits.read_lists`), by
+    default the lists `test_filenames` and so on of the file. Without any, pictures 0, split_every,
+    2 * split_every ... by name are the test split, the others train.
 
     `aabb_scale` is the side of the box relative to that of instant-ngp, x * 0.33 + 0.5, whose
     numbers `scale` and `offset` replace; by default the value in the file, or 1; where that is
@@ -101,14 +101,13 @@ def load(
     lists = read_lists(root, split, record, path)
     splits = divide(read_views(root, record, path, log), split_every, lists, path, log)
     pictures = describe_splits(splits, downscale, log)
-    space, cameras = (
-        space_of(space, pictures, background),
-        [view.camera for view in splits["train"]],
-    )
-    around = space == "all" and aabb_scale is None
-    box = box_of_cameras(cameras) if around else capture_box(path, record, aabb_scale)
-    if space == "box" and aabb_scale is None and record.get("aabb_scale", 1) > 1:
-        box = tight(box, pictures["train"])
+    space = space_of(space, pictures, background)
+    if space == "all" and aabb_scale is None:
+        box = box_of_cameras([view.camera for view in splits["train"]])
+    else:
+        box = capture_box(path, record, aabb_scale)
+        if aabb_scale is None and record.get("aabb_scale", 1) > 1:
+            box = tight(box, pictures["train"])
     scene = assemble(
         root.name, pictures, box, background=background, space=space, camera_files=[path]
     )

@@ -112,9 +112,12 @@ class GaussianTraining(loop.Training):
         if options.similarity:
             loss = loss + options.similarity * (1 - ssim(picture, target, backend=self.backend))
         # Gaussians that are not needed fade. Far ones are large, and go far.
-        before, far = gaussians.means.detach().clone(), self._distances()
+        scales, before = gaussians.log_scales.exp(), gaussians.means.detach()
+        if self.endless:
+            before, far = before.clone(), self._distances()
+            scales = scales / far
         costs = options.opacity_cost * gaussians.opacities.mean()
-        costs = costs + options.scale_cost * (gaussians.log_scales.exp() / far).mean()
+        costs = costs + options.scale_cost * scales.mean()
         (loss + costs).backward()
         errors = loop.look(self, {"": functional.mse_loss(picture, target)}, {"picture": picture})
         rate = options.means * options.final_means**share
@@ -132,9 +135,7 @@ class GaussianTraining(loop.Training):
         return errors
 
     def _distances(self) -> Tensor:
-        """n of the means where all of space is rendered, see `contraction`, at least 1: [N, 1]."""
-        if not self.endless:
-            return self.background.new_ones(1)
+        """n of the means, see `contraction`, at least 1: [N, 1]."""
         away = (self.gaussians.means.detach() - 0.5).abs().amax(dim=1, keepdim=True)
         return (away / HALF).clamp(min=1)
 

@@ -5,6 +5,9 @@ t_k = t_0 + (k + phase) step / norm(d), with phase 1/2 (midpoint rule) or a jitt
 Sample k exists if the cell at o + t_k d is occupied and t_k is in the ray's window. The set of
 samples does not depend on how empty space is skipped, so that all backends return the same samples;
 a window removes samples but moves none.
+
+Where the grid is of contracted space, rays start at the camera, the steps are those of
+`contraction`, and the cell is that of the contracted position.
 """
 
 import math
@@ -49,7 +52,8 @@ def march(
     extent: Extent | None = None,
     backend: str = "auto",
 ) -> Samples:
-    """Sample R `rays` inside the unit cube. Not differentiable.
+    """Sample R `rays` inside the unit cube, or in all of space if it is contracted into the cube.
+    Not differentiable.
 
     A ray has no samples if it misses the cube, is not finite, or has a direction that is zero, so
     short that t overflows, or so long that a step in t is below `LEAST_STEP`.

@@ -16,7 +16,7 @@ from torch import Tensor
 from methods.kernels.cpu import arrays, check_float32, f32, i32, jit, slope, u64
 from methods.kernels.march import LEAST_STEP, Segments, longest_ray
 from methods.kernels.march.contraction import BEYOND, Course
-from methods.kernels.march.reference import clip
+from methods.kernels.march.reference import clip, course_of
 from methods.kernels.types import Extent, Occupancy, Samples, offsets_of
 
 CHUNK = 128  # rays that are marched together; their numbers stay in the first-level cache
@@ -58,18 +58,10 @@ def march(segments: Segments, occupancy: Occupancy, extent: Extent | None) -> Sa
     given = arrays(origins, directions, segments.window, segments.jitter, segments.start)
     grid = arrays(occupancy.words.flatten(), occupancy.clearance.flatten(), occupancy.bounds)
     found = arrays(scratch, owners, counts, resume)
-    if occupancy.contracted:
-        course = Course.of(segments.rays, step)
-        _, far, _, alive = clip(segments, course)
-        where = arrays(course.middle, course.reach, course.first, course.length, far)
-        start = torch.where(alive, segments.start, -1).int().numpy()
-        ways, width = (*where, start), course.width
-    else:
-        ways, width = tuple(np.empty(0, np.float32) for _ in range(5)), step
-        ways = (*ways, given[4])
-    contracted = occupancy.contracted
-    size = occupancy.resolution
-    _find(tuple(given), ways, tuple(grid), size, f32(width), most, contracted, tuple(found))
+    course = course_of(segments, occupancy)
+    ways, width = _ways(segments, course), f32(step if course is None else course.width)
+    contracted, size = course is not None, occupancy.resolution
+    _find(tuple(given), ways, tuple(grid), size, width, most, contracted, tuple(found))
     offsets = offsets_of(counts)
     total = int(offsets[-1])
     t, positions = torch.empty(total), torch.empty(total, 3)
@@ -79,6 +71,16 @@ def march(segments: Segments, occupancy: Occupancy, extent: Extent | None) -> Sa
     if contracted:
         _contract(*ways[:4], *arrays(t, ray, positions, delta))
     return Samples(t, delta, offsets, ray, positions, resume)
+
+
+def _ways(segments: Segments, course: Course | None) -> tuple[np.ndarray, ...]:
+    """What `_begin_contracted` reads of the rays; without a `course`, nothing of the same types."""
+    if course is None:
+        return (*[np.empty(0, np.float32)] * 5, np.empty(0, np.int32))
+    _, far, _, alive = clip(segments, course)
+    start = torch.where(alive, segments.start, -1).int()
+    where = course.middle, course.reach, course.first, course.length, far, start
+    return tuple(arrays(*where))
 
 
 @jit()

@@ -14,7 +14,7 @@ from methods.kernels.dispatch import interpreted
 from methods.kernels.gpu import check_types, launch, vector
 from methods.kernels.march import Segments
 from methods.kernels.march.contraction import Course
-from methods.kernels.march.reference import clip, slopes
+from methods.kernels.march.reference import clip, course_of, slopes
 from methods.kernels.types import BRICK, Extent, Occupancy, Samples, offsets_of
 
 BLOCK = 128 if interpreted() else 32
@@ -24,12 +24,14 @@ many as for few."""
 
 def count(segments: Segments, occupancy: Occupancy) -> Tensor:
     """How many samples a ray has, [R] int64."""
-    counts, _ = _counted(_arguments(segments, occupancy))
+    course = course_of(segments, occupancy)
+    counts, _ = _counted(_arguments(segments, occupancy, course))
     return counts
 
 
 def march(segments: Segments, occupancy: Occupancy, extent: Extent | None) -> Samples:
-    arguments = _arguments(segments, occupancy)
+    course = course_of(segments, occupancy)
+    arguments = _arguments(segments, occupancy, course)
     counts, resume = _counted(arguments)
     if extent is None:
         (extent,) = Extent.of_each(counts[None])
@@ -38,18 +40,15 @@ def march(segments: Segments, occupancy: Occupancy, extent: Extent | None) -> Sa
     ray = torch.empty(total, dtype=torch.int32, device=device)
     t, positions = (torch.empty(*shape, device=device) for shape in ((total,), (total, 3)))
     _launch(arguments, counts, resume, offsets, ray, t, positions)
-    delta = torch.full_like(t, segments.step)
-    if occupancy.contracted:
-        delta = Course.of(segments.rays, segments.step).lengths(ray, t)
+    delta = torch.full_like(t, segments.step) if course is None else course.lengths(ray, t)
     return Samples(t, delta, offsets, ray, positions, resume, longest=extent.longest)
 
 
-def _arguments(segments: Segments, occupancy: Occupancy) -> list[Any]:
+def _arguments(segments: Segments, occupancy: Occupancy, course: Course | None) -> list[Any]:
     """The arguments of `_march` for rays and grid; the last one is R."""
     origins, directions = segments.rays.origins, segments.rays.directions
     window, jitter = segments.window, segments.jitter
     check_types(torch.float32, origins=origins, directions=directions, window=window, jitter=jitter)
-    course = Course.of(segments.rays, segments.step) if occupancy.contracted else None
     near, far, step_t, alive = clip(segments, course)
     # Clamped to the cube: a window may lie outside it, beyond the range of integers.
     lowest = torch.minimum(torch.maximum(window[:, 0], near), far)

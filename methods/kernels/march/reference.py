@@ -51,7 +51,7 @@ class _Steps:
 
     @classmethod
     def of(cls, segments: Segments, occupancy: Occupancy) -> _Steps:
-        course = Course.of(segments.rays, segments.step) if occupancy.contracted else None
+        course = course_of(segments, occupancy)
         near, far, length, alive = clip(segments, course)
         most = longest_ray(segments.step)
         if alive.device.type == "cpu" and course is None:  # a GPU would make the host wait
@@ -81,6 +81,11 @@ class _Steps:
             counts = kept.sum(dim=1)
             last = (kept * (k + 1)).amax(dim=1) if len(k) else counts
             yield kept, counts, torch.where(counts == limit, last, -1).int()
+
+
+def course_of(segments: Segments, occupancy: Occupancy) -> Course | None:
+    """The steps of rays in contracted space; None if space is not."""
+    return Course.of(segments.rays, segments.step) if occupancy.contracted else None
 
 
 def clip(segments: Segments, course: Course | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
