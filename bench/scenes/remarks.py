@@ -12,7 +12,7 @@ LOSES = 0.9  # a lens is said to cut a picture if a smaller share of it is left 
 
 
 class Remarks:
-    """Of each kind, the first is told, and how many more there are."""
+    """Collects remarks on a file. `tell` says the first of each kind, and how many more follow."""
 
     def __init__(self) -> None:
         self._kinds: dict[str, list[str]] = {}
