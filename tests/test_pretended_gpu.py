@@ -174,8 +174,8 @@ class Asking(nn.Module):
         super().__init__()
         self.factor = nn.Parameter(torch.ones(1))
 
-    def forward(self, x: Tensor) -> tuple[Tensor]:
-        return (x * self.factor.item(),)
+    def forward(self, x: Tensor) -> Tensor:
+        return x * self.factor.item()
 
 
 def test_planted_a_wait_in_a_network_is_found(gpu, tmp_path, quiet_log):

@@ -1,7 +1,8 @@
 """Engines run the trained network of a 2D renderer, each at the precisions that it supports.
 
-An engine turns a network, and sample inputs from real frames, into a function on the same tensors.
-Kernels, reprojection and the field do not use an engine.
+An engine turns a network, which maps pictures [B, C, H, W] to pictures, and sample inputs from real
+frames into a function that does the same. Of a picture, only C is always the same. Kernels,
+reprojection and the field do not use an engine.
 """
 
 import importlib
@@ -13,21 +14,20 @@ from types import ModuleType
 from typing import ClassVar, Literal
 
 import torch
+from torch import Tensor, nn
 
 from bench.errors import Unavailable, explained, install_command
 from bench.provenance import digest, libraries
 from bench.sharing import missing
 from bench.types import Log
 from methods.engines.network import Built as Built
-from methods.engines.network import Inputs as Inputs
-from methods.engines.network import Network as Network
 
 Precision = Literal["fp32", "bf16", "fp16", "int8"]
 
 Calibration = Literal["frames", "none"]
 """Source of the ranges of 8-bit activations: real frames, or none: see `largest`."""
 
-Samples = Callable[[], Sequence[Inputs]]
+Samples = Callable[[], Sequence[Tensor]]
 """Returns the inputs of a network in several frames. Called only if a build needs them."""
 
 Folder = Callable[[], Path]
@@ -99,7 +99,7 @@ class Engine(ABC):
         }
 
     @abstractmethod
-    def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
+    def build(self, network: nn.Module, samples: Samples, folder: Folder, log: Log) -> Built:
         """Build `network`, which is on the device where it will run, or load an earlier build of it
         from `folder`. `samples` are inputs of `self.samples` frames; others may differ in size."""
 

@@ -17,7 +17,7 @@ from methods.engines.openvino_engine import OpenVino
 from methods.engines.tensorrt_engine import TensorRt
 from methods.engines.torch_engine import TorchEngine
 
-KINDS = (TorchEngine, OpenVino, TensorRt)
+KINDS: tuple[type[Engine], ...] = (TorchEngine, OpenVino, TensorRt)
 
 
 class EngineFigures(NamedTuple):

@@ -13,15 +13,9 @@ from torch.nn import functional
 
 from bench.case import Case, Cell
 from bench.console import ConsoleLog
-from methods.engines import Engine, Inputs, Network
-from methods.engines.openvino_engine import OpenVino
-from methods.engines.tensorrt_engine import TensorRt
-from methods.engines.torch_engine import TorchEngine
+from methods.engines.auto import KINDS
 
-ENGINES: tuple[type[Engine], ...] = (TorchEngine, OpenVino, TensorRt)
-CELLS: list[Cell] = [
-    (engine.name, precision) for engine in ENGINES for precision in engine.precisions
-]
+CELLS: list[Cell] = [(kind.name, precision) for kind in KINDS for precision in kind.precisions]
 TOLERANCE = {"fp32": 1e-5, "bf16": 0.03, "fp16": 0.03, "int8": 0.1}
 SHARE = (
     "of the root mean square: fp32 adds hundreds of products in another order; below, numbers are "
@@ -34,7 +28,7 @@ SIDE = 32  # pixels along a side of a picture
 REACH = 6  # pixels that the first one reaches: 1, then 2 of half size, then 1
 
 
-class _Hourglass(Network):
+class _Hourglass(nn.Module):
     """All that a U-Net does: convolutions, ReLUs, pooling, pixels shuffled, channels joined."""
 
     def __init__(self) -> None:
@@ -44,14 +38,11 @@ class _Hourglass(Network):
         self.widen = nn.Conv2d(2 * WIDTH, 4 * WIDTH, 3, padding=1)
         self.leave = nn.Conv2d(2 * WIDTH, 3, 3, padding=1)
 
-    def forward(self, x: Tensor) -> Inputs:
+    def forward(self, x: Tensor) -> Tensor:
         full = self.enter(x).relu()
         half = self.narrow(functional.max_pool2d(full, 2)).relu()
         wide = functional.pixel_shuffle(self.widen(half), 2)
-        return (self.leave(torch.cat((wide, full), 1).relu()),)
-
-    def products(self, *inputs: Tensor) -> int:
-        raise NotImplementedError
+        return self.leave(torch.cat((wide, full), 1).relu())
 
 
 def cases() -> list[Case]:
@@ -77,7 +68,7 @@ def cases() -> list[Case]:
     ]
 
 
-def _network() -> Network:
+def _network() -> nn.Module:
     """An untrained network; always the same weights."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
@@ -91,12 +82,12 @@ def _random_inputs(seed: int) -> Tensor:
 
 
 @cache
-def _built(engine: str, device: str, precision: Any) -> Callable[..., Inputs]:
+def _built(engine: str, device: str, precision: Any) -> Callable[[Tensor], Tensor]:
     """The network as an engine runs it, calibrated on random pictures. Raises `Unavailable` if the
     engine, or its precision, does not exist on `device`."""
-    chosen = next(kind for kind in ENGINES if kind.name == engine)(precision)
+    chosen = next(kind for kind in KINDS if kind.name == engine)(precision)
     chosen.check(torch.device(device))
-    views = [(_random_inputs(seed).to(device),) for seed in range(4)]
+    views = [_random_inputs(seed).to(device) for seed in range(4)]
     with tempfile.TemporaryDirectory() as folder:
         log = ConsoleLog(Path(folder), quiet=True)
         network = _network().to(device)
@@ -106,8 +97,7 @@ def _built(engine: str, device: str, precision: Any) -> Callable[..., Inputs]:
 @torch.no_grad()
 def _output(cell: Sequence[str], inputs: Tensor) -> Tensor:
     """The output for `inputs` of an engine, on a device, in a precision, as float64."""
-    (output,) = _built(*cell)(inputs.to(cell[1]))
-    return output.cpu().double().clone()
+    return _built(*cell)(inputs.to(cell[1])).cpu().double().clone()
 
 
 def _apart(got: Tensor, want: Tensor) -> float:
@@ -119,8 +109,8 @@ def _apart(got: Tensor, want: Tensor) -> float:
 def _error(value: float, *cell: str) -> float:
     inputs = torch.full_like(_random_inputs(0), value)
     with torch.no_grad():
-        (want,) = _network()(inputs)
-    return _apart(_output(cell, inputs), want.double())
+        want = _network()(inputs).double()
+    return _apart(_output(cell, inputs), want)
 
 
 def _not_finite(*cell: str) -> float:

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from bench.errors import Unavailable
 from bench.types import Log
 from methods import engines
-from methods.engines import Built, Calibration, Engine, Folder, Inputs, Network, Precision, Samples
+from methods.engines import Built, Calibration, Engine, Folder, Precision, Samples
 
 # Disables the telemetry of OpenVINO and NNCF; both work without this package.
 sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
@@ -52,7 +52,7 @@ class OpenVino(Engine):
         computed = super().computed(device)
         return computed.replace("+fp32", "+bf16") if self._half else computed
 
-    def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
+    def build(self, network: nn.Module, samples: Samples, folder: Folder, log: Log) -> Built:
 
         def write(path: Path) -> None:
             model = self._channels_last(self._convert(network, samples()))
@@ -65,15 +65,14 @@ class OpenVino(Engine):
         size = sum(op.data.nbytes for op in weights)
         return Built(_Compiled(self._openvino, model, self._dtype), size, self._dtype)
 
-    def _convert(self, network: Network, samples: Sequence[Inputs]) -> Any:
+    def _convert(self, network: nn.Module, samples: Sequence[Tensor]) -> Any:
         # Only C is fixed: frames may have another size than the samples.
-        shapes = [[-1, x.shape[1], -1, -1] for x in samples[0]]
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # from the tracer, and about argument checks
             model = self._openvino.convert_model(
                 deepcopy(network),
                 example_input=samples[0],
-                input=shapes,
+                input=[[-1, samples[0].shape[1], -1, -1]],
                 extension=[self._pixel_shuffle()],
             )
         return model if self._nncf is None else self._quantised(model, samples, self._nncf)
@@ -91,22 +90,20 @@ class OpenVino(Engine):
         return ConversionExtension("aten::pixel_shuffle", convert)
 
     def _channels_last(self, model: Any) -> Any:
-        """`model` with pictures in and out channels last, those that go in of `_dtype`, as its
+        """`model` with pictures in and out channels last, what goes in of `_dtype`, as its
         convolutions have them: the CPU need not convert them."""
         preprocess, layout = self._openvino.preprocess, self._openvino.Layout
         outside = preprocess.PrePostProcessor(model)
         kind = self._openvino.Type.bf16 if self._half else self._openvino.Type.f32
-        for place in range(len(model.inputs)):
-            outside.input(place).tensor().set_layout(layout("NHWC")).set_element_type(kind)
-            outside.input(place).model().set_layout(layout("NCHW"))
-        for place in range(len(model.outputs)):
-            outside.output(place).tensor().set_layout(layout("NHWC"))
-            outside.output(place).model().set_layout(layout("NCHW"))
+        for end in (outside.input(), outside.output()):
+            end.tensor().set_layout(layout("NHWC"))
+            end.model().set_layout(layout("NCHW"))
+        outside.input().tensor().set_element_type(kind)
         return outside.build()
 
-    def _quantised(self, model: Any, samples: Sequence[Inputs], nncf: Any) -> Any:
+    def _quantised(self, model: Any, samples: Sequence[Tensor], nncf: Any) -> Any:
         logging.getLogger("nncf").setLevel(logging.ERROR)
-        frames = nncf.Dataset(samples, lambda inputs: [x.numpy() for x in inputs])
+        frames = nncf.Dataset(samples, Tensor.numpy)
         options = {
             "preset": nncf.QuantizationPreset.MIXED,  # activations are not symmetric
             "subset_size": len(samples),
@@ -154,11 +151,10 @@ class _Compiled:
         compiled = openvino.Core().compile_model(model, "CPU", settings)
         self._request = compiled.create_infer_request()
 
-    def __call__(self, *inputs: Tensor) -> Inputs:
-        tensors = [self._tensor(x.movedim(1, -1).to(self._dtype).contiguous()) for x in inputs]
-        found = self._request.infer(tensors, share_inputs=True, share_outputs=True)
-        outputs = (torch.from_numpy(found[place]) for place in range(len(found)))
-        return tuple(x.movedim(-1, 1) for x in outputs)
+    def __call__(self, picture: Tensor) -> Tensor:
+        given = self._tensor(picture.movedim(1, -1).to(self._dtype).contiguous())
+        found = self._request.infer([given], share_inputs=True, share_outputs=True)
+        return torch.from_numpy(found[0]).movedim(-1, 1)
 
     def _tensor(self, x: Tensor) -> Any:
         """`x` for OpenVINO, in the same memory; numpy has no bfloat16."""

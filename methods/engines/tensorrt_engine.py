@@ -20,9 +20,11 @@ from torch import Tensor, nn
 from bench.errors import SteerbenchError, Unavailable
 from bench.types import Log
 from methods import engines
-from methods.engines import Built, Calibration, Engine, Folder, Inputs, Network, Precision, Samples
+from methods.engines import Built, Calibration, Engine, Folder, Precision, Samples
 
 OPSET = 17
+
+INPUT, OUTPUT = "input0", "output0"  # names in an exported network
 
 PRODUCTS = ("Conv", "Gemm", "MatMul")
 """Operators to quantise. Sums and activations in 8 bits would cost quality and save nothing."""
@@ -58,14 +60,13 @@ class TensorRt(Engine):
         """As of any engine, and the model of the GPU: plans are valid for one."""
         return super().key() | {"gpu": torch.cuda.get_device_name()}
 
-    def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
+    def build(self, network: nn.Module, samples: Samples, folder: Folder, log: Log) -> Built:
         import onnx
 
         path = folder() / "network.onnx"
 
         def write(path: Path) -> None:
-            seen = [tuple(x.cpu() for x in inputs) for inputs in samples()]
-            plain: nn.Module = deepcopy(network).cpu()
+            seen, plain = [picture.cpu() for picture in samples()], deepcopy(network).cpu()
             if self.precision == "fp16":
                 plain = _Halved(plain)
             exact = path if self.precision != "int8" else path.with_name("exported.onnx")
@@ -80,34 +81,28 @@ class TensorRt(Engine):
 
 
 class _Halved(nn.Module):
-    """A network in float16, with inputs and outputs in float32."""
+    """A network in float16, with input and output in float32."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
         self.network = network.half()
 
-    def forward(self, *inputs: Tensor) -> Inputs:
-        return tuple(x.float() for x in self.network(*(x.half() for x in inputs)))
+    def forward(self, picture: Tensor) -> Tensor:
+        return self.network(picture.half()).float()
 
 
-def _names(kind: str, count: int) -> list[str]:
-    """Names of `count` inputs or outputs (the `kind`) of an exported network, in order."""
-    return [f"{kind}{place}" for place in range(count)]
-
-
-def _export(module: nn.Module, sample: Inputs, path: Path) -> None:
+def _export(module: nn.Module, sample: Tensor, path: Path) -> None:
     """Write an ONNX model of `module`, for pictures of any size."""
     import onnx
 
     with torch.no_grad(), warnings.catch_warnings():
-        outputs = len(module(*sample))
         warnings.simplefilter("ignore")  # the exporter's own deprecations
         torch.onnx.export(
             module,
-            sample,
+            (sample,),
             path,
-            input_names=_names("input", len(sample)),
-            output_names=_names("output", outputs),
+            input_names=[INPUT],
+            output_names=[OUTPUT],
             opset_version=OPSET,
             dynamo=False,
         )
@@ -119,17 +114,14 @@ def _export(module: nn.Module, sample: Inputs, path: Path) -> None:
     onnx.save(model, path)
 
 
-def _quantise(exported: Path, samples: Sequence[Inputs], path: Path, *, uncalibrated: bool) -> None:
+def _quantise(exported: Path, samples: Sequence[Tensor], path: Path, *, uncalibrated: bool) -> None:
     """Quantise the products of a model to 8 bits, with ranges from `samples` or with fixed ones."""
     from onnxruntime import quantization
     from onnxruntime.quantization import shape_inference
 
     prepared = path.with_name("prepared.onnx")
     shape_inference.quant_pre_process(exported, prepared, skip_symbolic_shape=True)
-    frames = iter(
-        dict(zip(_names("input", len(inputs)), (x.numpy() for x in inputs), strict=True))
-        for inputs in samples
-    )
+    frames = iter([{INPUT: picture.numpy()} for picture in samples])
     symmetric = {"ActivationSymmetric": True, "QuantizeBias": False}
     quantization.quantize_static(
         prepared,
@@ -165,7 +157,7 @@ def _fixed_ranges(prepared: Path) -> dict[str, Any]:
 
 
 class _Plans:
-    """The plans of a model, one for each size of its inputs. `exact`: compute float32 in float32,
+    """The plans of a model, one for each size of its input. `exact`: compute float32 in float32,
     not in TF32."""
 
     def __init__(self, model: Path, *, exact: bool, log: Log) -> None:
@@ -173,19 +165,18 @@ class _Plans:
 
         self._tensorrt, self._logger = tensorrt, tensorrt.Logger(tensorrt.Logger.ERROR)
         self._model, self._exact, self._log = model, exact, log
-        self._executions: dict[tuple[torch.Size, ...], _Execution] = {}
+        self._executions: dict[torch.Size, _Execution] = {}
 
-    def __call__(self, *inputs: Tensor) -> Inputs:
-        shapes = tuple(x.shape for x in inputs)
-        if shapes not in self._executions:
-            name = "-".join("x".join(map(str, shape)) for shape in shapes)
-            path = self._model.with_name(f"{name}.plan")
-            engines.keep(path, lambda new: self._build(shapes, new), self._log)
-            self._executions[shapes] = _Execution(self._tensorrt, path, self._logger)
-        return self._executions[shapes](*inputs)
+    def __call__(self, picture: Tensor) -> Tensor:
+        shape = picture.shape
+        if shape not in self._executions:
+            path = self._model.with_name(f"{'x'.join(map(str, shape))}.plan")
+            engines.keep(path, lambda new: self._build(shape, new), self._log)
+            self._executions[shape] = _Execution(self._tensorrt, path, self._logger)
+        return self._executions[shape](picture)
 
-    def _build(self, shapes: tuple[torch.Size, ...], path: Path) -> None:
-        """Write the plan for inputs of these `shapes`."""
+    def _build(self, shape: torch.Size, path: Path) -> None:
+        """Write the plan for an input of this `shape`."""
         self._log.info(f"building for TensorRT, which may take minutes: {path.stem}")
         trt = self._tensorrt
         builder = trt.Builder(self._logger)
@@ -198,8 +189,7 @@ class _Plans:
         if self._exact:
             config.clear_flag(trt.BuilderFlag.TF32)
         profile = builder.create_optimization_profile()
-        for place, shape in enumerate(shapes):
-            profile.set_shape(network.get_input(place).name, *3 * [tuple(shape)])  # least to most
+        profile.set_shape(INPUT, *3 * [tuple(shape)])  # least to most
         config.add_optimization_profile(profile)
         plan = builder.build_serialized_network(network, config)
         if plan is None:
@@ -217,22 +207,18 @@ class _Execution:
         engine = tensorrt.Runtime(logger).deserialize_cuda_engine(path.read_bytes())
         if engine is None:
             raise SteerbenchError(f"TensorRT cannot load its plan: remove {path} and run again")
-        self._context = engine.create_execution_context()
-        self._tensors, self._stream = engine.num_io_tensors, torch.cuda.Stream()
+        self._context, self._stream = engine.create_execution_context(), torch.cuda.Stream()
 
-    def __call__(self, *inputs: Tensor) -> Inputs:
-        inputs, context = tuple(x.contiguous() for x in inputs), self._context
-        named = dict(zip(_names("input", len(inputs)), inputs, strict=True))
-        accepted = [context.set_input_shape(name, tuple(x.shape)) for name, x in named.items()]
-        outputs = _names("output", self._tensors - len(inputs)) if all(accepted) else []
-        for name in outputs:
-            shape = tuple(context.get_tensor_shape(name))
-            named[name] = torch.empty(shape, device=inputs[0].device)
-        accepted += [context.set_tensor_address(name, x.data_ptr()) for name, x in named.items()]
-        current = torch.cuda.current_stream()
+    def __call__(self, picture: Tensor) -> Tensor:
+        picture, context, current = picture.contiguous(), self._context, torch.cuda.current_stream()
+        accepted = context.set_input_shape(INPUT, tuple(picture.shape))
+        shape = tuple(context.get_tensor_shape(OUTPUT)) if accepted else ()
+        output = torch.empty(shape, device=picture.device)
+        for name, x in ((INPUT, picture), (OUTPUT, output)):
+            accepted &= context.set_tensor_address(name, x.data_ptr())
         self._stream.wait_stream(current)
-        if not all(accepted) or not context.execute_async_v3(self._stream.cuda_stream):
-            shapes = ", ".join(str(list(x.shape)) for x in inputs)
-            raise SteerbenchError(f"TensorRT cannot run a network on {shapes}; it says why above")
+        if not accepted or not context.execute_async_v3(self._stream.cuda_stream):
+            size = list(picture.shape)
+            raise SteerbenchError(f"TensorRT cannot run a network on {size}; it says why above")
         current.wait_stream(self._stream)
-        return tuple(named[name] for name in outputs)
+        return output

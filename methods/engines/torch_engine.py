@@ -9,11 +9,11 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from bench.errors import Unavailable
 from bench.types import Log
-from methods.engines import Built, Engine, Folder, Inputs, Network, Samples
+from methods.engines import Built, Engine, Folder, Samples
 from methods.kernels import multiplies_bf16
 
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
@@ -37,12 +37,12 @@ class TorchEngine(Engine):
         emulated = self.precision == "bf16" and not multiplies_bf16(device.type)
         return "bf16 in fp32" if emulated else super().computed(device)
 
-    def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
+    def build(self, network: nn.Module, samples: Samples, folder: Folder, log: Log) -> Built:
         dtype = DTYPES[self.precision]
 
-        def run(*inputs: Tensor) -> Inputs:
-            with _arithmetic(inputs[0].device, dtype):
-                return network(*inputs)
+        def run(picture: Tensor) -> Tensor:
+            with _arithmetic(picture.device, dtype):
+                return network(picture)
 
         size = sum(weight.numel() for weight in network.parameters()) * dtype.itemsize
         on_cpu = next(network.parameters()).device.type == "cpu"
@@ -58,34 +58,32 @@ def _arithmetic(device: torch.device, dtype: torch.dtype) -> AbstractContextMana
     return nullcontext()
 
 
-Replay = tuple[Callable[[], Any], Inputs]
-"""A function that replays another, and the output tensors, which every replay overwrites."""
+Replay = tuple[Callable[[], Any], Tensor]
+"""A function that replays another, and the output tensor, which every replay overwrites."""
 
 
 class Replayed:
     """Replays `run`; it is recorded for every input size when that size first occurs. The next
-    call, of any size, overwrites the outputs, because all recordings share memory. `run` computes
+    call, of any size, overwrites the output, because all recordings share memory. `run` computes
     on a CUDA GPU, without waiting for it."""
 
-    def __init__(self, run: Callable[..., Inputs]) -> None:
+    def __init__(self, run: Callable[[Tensor], Tensor]) -> None:
         self._run = run
-        self._recordings: dict[tuple[torch.Size, ...], tuple[Inputs, Replay]] = {}
+        self._recordings: dict[torch.Size, tuple[Tensor, Replay]] = {}
         self._stream: torch.cuda.Stream | None = None  # on the first call's device
         self._pool: Any = None
 
-    def __call__(self, *inputs: Tensor) -> Inputs:
-        with torch.cuda.device_of(inputs[0]):
-            sizes = tuple(x.shape for x in inputs)
-            if sizes not in self._recordings:
-                copies = tuple(x.clone() for x in inputs)
-                self._recordings[sizes] = copies, self.record(lambda: self._run(*copies))
-            held, (replay, outputs) = self._recordings[sizes]
-            for own, x in zip(held, inputs, strict=True):
-                own.copy_(x)
+    def __call__(self, picture: Tensor) -> Tensor:
+        with torch.cuda.device_of(picture):
+            if picture.shape not in self._recordings:
+                copy = picture.clone()
+                self._recordings[picture.shape] = copy, self.record(lambda: self._run(copy))
+            held, (replay, output) = self._recordings[picture.shape]
+            held.copy_(picture)
             replay()
-        return outputs
+        return output
 
-    def record(self, run: Callable[[], Inputs]) -> Replay:
+    def record(self, run: Callable[[], Tensor]) -> Replay:
         """Record a graph. All share one memory pool, because no two are replayed at once."""
         if self._stream is None:
             self._stream, self._pool = torch.cuda.Stream(), torch.cuda.graph_pool_handle()
@@ -96,5 +94,5 @@ class Replayed:
         torch.cuda.current_stream().wait_stream(self._stream)
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph, pool=self._pool, stream=self._stream):
-            outputs = run()
-        return graph.replay, outputs
+            output = run()
+        return graph.replay, output

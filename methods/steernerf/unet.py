@@ -10,7 +10,7 @@ from torch.nn import functional
 from torch.nn.functional import max_pool2d, pixel_shuffle
 
 from bench.types import NullProbe, Probe
-from methods.engines.network import Built, Network
+from methods.engines.network import Built
 from methods.kernels.types import expect
 from methods.rendering.frame import FeatureFrame
 from methods.steernerf.buffer import Points
@@ -62,7 +62,7 @@ class UNet(nn.Module):
             inputs = functional.pad(inputs, (0, -width % DIVISOR, 0, -height % DIVISOR))
         probe.count("products", self.network.products(inputs))
         with probe.stage("network"):
-            (corrections,) = (self.engine.run if self.engine else self.network)(inputs)  # Eq. 11
+            corrections = (self.engine.run if self.engine else self.network)(inputs)  # Eq. 11
         corrections = corrections[..., :height, :width].permute(0, 2, 3, 1)
         drawn = zip(observations, corrections, strict=True)
         return _stacked([self._picture(shown, correction) for shown, correction in drawn])
@@ -107,7 +107,7 @@ class UNet(nn.Module):
         return picture
 
 
-class _Layers(Network):
+class _Layers(nn.Module):
     """The layers of `ReconstructionNet_v4`, with `width` channels at full resolution."""
 
     def __init__(self, inputs: int, width: int) -> None:
@@ -127,7 +127,7 @@ class _Layers(Network):
             if x.dim() == 4:  # as the inputs lie
                 x.data = x.data.contiguous(memory_format=torch.channels_last)
 
-    def forward(self, inputs: Tensor) -> tuple[Tensor]:
+    def forward(self, inputs: Tensor) -> Tensor:
         """[B, C, H, W] to [B, 3, H, W]; H and W are multiples of `DIVISOR`."""
         full = self.enter(self.first(inputs)).relu()
         half = self.at_half(max_pool2d(full, 2))
@@ -136,11 +136,11 @@ class _Layers(Network):
         half = self.half_again(self.merge_half(torch.cat((wide, half), 1)).relu())
         wide = pixel_shuffle(self.widen_half(half), 2)
         full = self.merge_full(torch.cat((wide, full), 1)).relu()
-        return (self.last(self.leave(full).relu()),)
+        return self.last(self.leave(full).relu())
 
-    def products(self, *inputs: Tensor) -> int:
+    def products(self, inputs: Tensor) -> int:
         """Multiplications by weights: every kernel counts once per pixel at its resolution."""
-        batch, _, *size = inputs[0].shape
+        batch, _, *size = inputs.shape
         half = dict.fromkeys(("at_half", "merge_half", "half_again", "widen_half"), 4)
         fewer = {**half, "narrow": 16, "at_quarter": 16, "widen_quarter": 16}
         weights = ((name.split(".")[0], x) for name, x in self.named_parameters() if x.dim() > 1)

@@ -11,7 +11,7 @@ from bench.clock import FrameRecord, StageClock
 from bench.metrics import psnr
 from bench.motion import preceding, viewing_target
 from bench.types import Camera, Frame, Log, NullProbe, Probe, Scene, composite
-from methods.engines import Built, Inputs
+from methods.engines import Built
 from methods.engines.auto import EngineFigures
 from methods.steernerf.buffer import Buffer
 from methods.steernerf.options import JointOptions, Rendering
@@ -32,13 +32,13 @@ class TrainingViews:
     seed: int
     log: Log
 
-    def inputs(self, count: int) -> list[Inputs]:
+    def inputs(self, count: int) -> list[Tensor]:
         """The inputs of the network in `count` views, as an engine gets them: drawn whole."""
-        renderer, recorded = self.pipeline.renderer, list[Inputs]()
+        renderer, recorded = self.pipeline.renderer, list[Tensor]()
 
-        def record(*inputs: Tensor) -> Inputs:
-            recorded.append(tuple(x.clone() for x in inputs))  # the next frame overwrites them
-            return renderer.network(*inputs)
+        def record(inputs: Tensor) -> Tensor:
+            recorded.append(inputs.clone())  # the next frame overwrites it
+            return renderer.network(inputs)
 
         renderer.engine = None  # the network itself draws the frames before
         for _, camera, buffer in self._spread(count, "frames to build the network on"):

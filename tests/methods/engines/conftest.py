@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor, nn
 
 from bench.types import Log
-from methods.engines import Built, Engine, Inputs, Network
+from methods.engines import Built, Engine
 from tests.methods.engines import tensorrt_double
 
 
@@ -17,12 +18,12 @@ def build(tmp_path: Path, quiet_log: Log) -> Callable[..., Built]:
     """Builds a network with an engine from the inputs of some frames, in a folder."""
 
     def built(
-        engine: Engine, network: Network, samples: Sequence[Inputs] | None, folder: str = ""
+        engine: Engine, network: nn.Module, samples: Sequence[Tensor] | None, folder: str = ""
     ) -> Built:
         place = tmp_path / folder
         place.mkdir(exist_ok=True)
 
-        def frames() -> Sequence[Inputs]:
+        def frames() -> Sequence[Tensor]:
             assert samples is not None, "the frames are not needed again"
             return samples
 

@@ -14,7 +14,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-import onnx
 import onnxruntime
 
 __version__ = "11.4.0"
@@ -40,9 +39,6 @@ class Network:
     """What a parser reads into."""
 
     model: bytes
-
-    def get_input(self, index: int) -> SimpleNamespace:
-        return SimpleNamespace(name=onnx.load_from_string(self.model).graph.input[index].name)
 
 
 class Builder:
@@ -110,10 +106,6 @@ class CudaEngine:
         self._limits, self._session = limits, onnxruntime.InferenceSession(model)
         self._shapes: dict[str, tuple[int, ...]] = {}
         self._addresses: dict[str, int] = {}
-
-    @property
-    def num_io_tensors(self) -> int:
-        return len(self._session.get_inputs()) + len(self._session.get_outputs())
 
     def create_execution_context(self) -> CudaEngine:
         return self

@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from torch import Tensor, nn
 
 from bench.errors import Unavailable
-from methods.engines import Inputs, Network
 from methods.engines.openvino_engine import OpenVino, _capabilities
 from methods.engines.torch_engine import Replay, Replayed, TorchEngine
 from methods.steernerf.unet import UNet
@@ -29,20 +29,19 @@ was seen in (int8), before each of half a dozen layers; single layers are kept h
 CPU = torch.device("cpu")
 
 
-def unet() -> tuple[Network, list[Inputs]]:
+def unet() -> tuple[nn.Module, list[Tensor]]:
     """The U-Net, and inputs of one size."""
     torch.manual_seed(1000)
     renderer = shaken(UNet(6, 1, 4, width=64)).requires_grad_(False)
     generator = torch.Generator().manual_seed(0)
-    return renderer.network, [(torch.rand(1, 12, 36, 44, generator=generator),) for _ in range(3)]
+    return renderer.network, list(torch.rand(3, 1, 12, 36, 44, generator=generator))
 
 
-def assert_close(got: Inputs, want: Inputs, tolerance: float) -> None:
+def assert_close(got: Tensor, want: Tensor, tolerance: float) -> None:
     """Within `tolerance`, as a share of the root mean square."""
-    for some, exact in zip(got, want, strict=True):
-        assert some.shape == exact.shape
-        error = (some.cpu().float() - exact).square().mean().sqrt()
-        assert error < tolerance * exact.square().mean().sqrt()
+    assert got.shape == want.shape
+    error = (got.cpu().float() - want).square().mean().sqrt()
+    assert error < tolerance * want.square().mean().sqrt()
 
 
 @pytest.mark.parametrize(("kind", "precision"), ENGINES)
@@ -51,15 +50,15 @@ def test_an_engine_computes_what_the_network_does(kind, precision, build):
     built = build(kind(precision), network, inputs)
     with torch.no_grad():
         for some in inputs:
-            assert_close(built.run(*some), network(*some), TOLERANCE[precision])
+            assert_close(built.run(some), network(some), TOLERANCE[precision])
 
 
 @pytest.mark.parametrize("precision", ["fp32", "int8"])
 def test_pictures_may_differ_in_size_from_the_samples_and_from_one_another(precision, build):
     """And are what the network computes."""
-    network, ((picture,), *_) = unet()
+    network, (picture, *_) = unet()
     for _ in range(2):  # built, and found again
-        built = build(OpenVino(precision), network, [(picture,), (picture[..., :32, :40],)])
+        built = build(OpenVino(precision), network, [picture, picture[..., :32, :40]])
         for height, width in ((36, 44), (28, 40), (36, 24)):
             cropped = picture[..., :height, :width]
             with torch.no_grad():
@@ -102,29 +101,23 @@ def test_rows_say_what_torch_multiplies_in_bfloat16(products, computed, monkeypa
 
 
 class ReplayedHere(Replayed):
-    """Records on a CPU: to replay is to compute again, from the same inputs to the same outputs."""
+    """Records on a CPU: to replay is to compute again, from the same input to the same output."""
 
     recorded = 0
 
-    def record(self, run: Callable[[], Inputs]) -> Replay:
+    def record(self, run: Callable[[], Tensor]) -> Replay:
         self.recorded += 1
-        outputs = tuple(torch.full_like(x, torch.nan) for x in run())
-
-        def replay() -> None:
-            for held, x in zip(outputs, run(), strict=True):
-                held.copy_(x)
-
-        return replay, outputs
+        output = torch.full_like(run(), torch.nan)
+        return lambda: output.copy_(run()), output
 
 
-def test_a_replay_gives_the_outputs_of_the_network_and_leaves_the_inputs_alone():
+def test_a_replay_gives_the_output_of_the_network_and_leaves_the_input_alone():
     network, pictures = unet()
     replayed = ReplayedHere(network)
-    for (whole,) in pictures:
+    for whole in pictures:
         for picture in (whole, whole[..., :28, :40].contiguous()):
             before = picture.clone()
-            for got, want in zip(replayed(picture), network(picture), strict=True):
-                assert torch.equal(got, want)
+            assert torch.equal(replayed(picture), network(picture))
             assert torch.equal(picture, before)
     assert replayed.recorded == 2  # sizes
 
@@ -133,8 +126,7 @@ def test_a_replay_gives_the_outputs_of_the_network_and_leaves_the_inputs_alone()
 @pytest.mark.parametrize("precision", TorchEngine.precisions)
 def test_a_gpu_replays_the_outputs_of_the_network(precision, build):
     network, inputs = unet()
-    wanted = [network(*some) for some in inputs]
-    seen = [tuple(x.cuda() for x in some) for some in inputs]
+    wanted, seen = [network(some) for some in inputs], [some.cuda() for some in inputs]
     built = build(TorchEngine(precision), network.to("cuda"), seen)
     for some, want in zip(seen, wanted, strict=True):
-        assert_close(built.run(*some), want, TOLERANCE.get(precision, 0.03))
+        assert_close(built.run(some), want, TOLERANCE.get(precision, 0.03))

@@ -19,16 +19,16 @@ from tests.methods.engines.test_engines import TOLERANCE, assert_close, unet
 
 @pytest.mark.parametrize("precision", TensorRt.precisions)
 def test_pictures_of_each_size_have_a_plan_which_is_found_again(precision, double, tmp_path, build):
-    module, ((picture,), *_) = unet()
+    module, (picture, *_) = unet()
     crops = [picture[..., :height, :width] for height, width in ((36, 44), (28, 40), (36, 24))]
     # The tolerance is of half a dozen layers; the U-Net has 19, whose roundings add up as their
     # square root.
     tolerance = math.sqrt(19 / 6) * TOLERANCE.get(precision, 2**-8)
-    for samples in ([(picture,)], None):
+    for samples in ([picture], None):
         built = build(TensorRt(precision), module, samples)
         for crop in 2 * crops:
             got = built.run(crop)
-            assert all(x.dtype == torch.float32 for x in got)
+            assert got.dtype == torch.float32
             assert_close(got, module(crop), tolerance)
     assert tensorrt_double.Builder.built == 3
     plans = {path.name for path in tmp_path.glob("*.plan")}
@@ -54,7 +54,7 @@ def test_float32_is_not_computed_in_tf32(double, build, monkeypatch):
     monkeypatch.setattr(clear, lambda config, flag: cleared.append((precision, flag)))
     for precision in TensorRt.precisions:
         network, inputs = unet()
-        build(TensorRt(precision), network, inputs, precision).run(*inputs[0])
+        build(TensorRt(precision), network, inputs, precision).run(inputs[0])
     tf32 = tensorrt_double.BuilderFlag.TF32
     assert cleared == [("fp32", tf32), ("int8", tf32)]  # int8: of what is not quantised
 
@@ -73,7 +73,7 @@ def test_what_tensorrt_refuses_is_said(broken, message, double, tmp_path, build,
     network, inputs = unet()
     built = build(TensorRt("fp32"), network, inputs)
     with pytest.raises(SteerbenchError, match=message):
-        built.run(*inputs[0])
+        built.run(inputs[0])
     kept = broken.startswith(("Runtime", "CudaEngine"))
     assert len(list(tmp_path.glob("*.plan"))) == kept
 

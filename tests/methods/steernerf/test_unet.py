@@ -39,7 +39,7 @@ def test_it_computes_what_the_released_network_computes(frames):
             layer.weight.copy_((spread * (hashed(size, number) - 0.5)).view_as(layer.weight))
             layer.bias.copy_(0.1 * (hashed(layer.out_channels, number + 100) - 0.5))
         inputs = hashed(6 * (frames + 1) * 16 * 24, 200).view(1, -1, 16, 24).float()
-        (output,) = network(inputs)
+        output = network(inputs)
     wanted = torch.from_numpy(RELEASE[f"unet.{frames + 1}.out"])
     # 19 layers, each of sums of up to 1,728 products: their errors add up like sqrt(1728) roundings
     # of float32 a layer, of numbers as large as the largest output.
@@ -116,7 +116,7 @@ def test_a_pixel_has_the_features_of_its_points_and_every_fourth_the_present_one
     height, width, scale, features = 2, 3, 4, 5
     shown = observe(height, width, channels=features, frames=2, scale=scale)
     seen, renderer = [], unet(features, frames, scale)
-    renderer.engine = Built(lambda x: seen.append(x) or (x[:, :3],), 0)
+    renderer.engine = Built(lambda x: seen.append(x) or x[:, :3], 0)
     renderer([shown])
     (got,) = seen[0].permute(0, 2, 3, 1)
     at_pixel = [dict(zip(p.pixel.tolist(), p.values, strict=True)) for p in shown.preceding]
@@ -135,7 +135,7 @@ def test_a_pixel_has_the_features_of_its_points_and_every_fourth_the_present_one
 def test_features_of_16_bits_are_rounded_before_the_network_is_shown_them():
     seen, renderer = [], unet(6, 2, 4)
     for dtype in (torch.float32, torch.bfloat16):
-        renderer.engine = Built(lambda x: seen.append(x) or (x[:, :3],), 0, dtype)
+        renderer.engine = Built(lambda x: seen.append(x) or x[:, :3], 0, dtype)
         renderer([observe()])
     assert seen[1].dtype == torch.bfloat16
     assert torch.equal(seen[1], seen[0].bfloat16())
@@ -144,7 +144,7 @@ def test_features_of_16_bits_are_rounded_before_the_network_is_shown_them():
 def test_only_the_part_without_its_border_is_corrected():
     """Where the part ends with the picture, there is no border."""
     renderer, shown = unet(6, 0, 4), observe(12, 20, frames=0)
-    renderer.engine = Built(lambda x: (torch.full_like(x[:, :3], 0.25),), 0)
+    renderer.engine = Built(lambda x: torch.full_like(x[:, :3], 0.25), 0)
     part = replace(shown, part=(slice(0, 8), slice(8, 16)))
     added = renderer([part])[0] - renderer([shown])[0] + 0.25
     drawn = torch.zeros(48, 80, dtype=torch.bool)

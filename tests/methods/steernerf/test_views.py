@@ -23,7 +23,7 @@ def test_engines_are_compared_in_the_same_frames_with_the_true_pictures(ball_sce
 
     def white(inputs):
         given.append(inputs.clone())
-        return (torch.ones_like(network(inputs)[0]),)
+        return torch.ones_like(network(inputs))
 
     exact, wrong = views.compare([Built(network, 0), Built(white, 0)])
     assert views.pipeline.renderer.engine is None  # the next frame before is drawn by the network
@@ -42,9 +42,9 @@ def test_engines_are_compared_in_the_same_frames_with_the_true_pictures(ball_sce
 def test_what_a_network_is_built_on_is_what_it_is_shown_whatever_ran_before(ball_scene, quiet_log):
     views = views_of(ball_scene, quiet_log)
     first = views.inputs(2)
-    views.pipeline.renderer.engine = Built(lambda *inputs: pytest.fail("asked"), 0)
+    views.pipeline.renderer.engine = Built(lambda inputs: pytest.fail("asked"), 0)
     again = views.inputs(2)
-    assert all(torch.equal(a, b) for (a,), (b,) in zip(first, again, strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
 
 
 def test_a_frame_is_recorded_as_in_training_behind_as_many_as_the_buffer_holds_and_one_more(
@@ -58,10 +58,7 @@ def test_a_frame_is_recorded_as_in_training_behind_as_many_as_the_buffer_holds_a
         return features(self, view, preceding, rendering, probe)
 
     monkeypatch.setattr(Pipeline, "features", counted)
-    frames, again, other = (
-        [inputs for (inputs,) in views_of(ball_scene, quiet_log, seed).inputs(3)]
-        for seed in (0, 0, 1)
-    )
+    frames, again, other = (views_of(ball_scene, quiet_log, seed).inputs(3) for seed in (0, 0, 1))
     assert [preceding for _, preceding in rendered] == 9 * [0, 1, 1]
     train = ball_scene.splits["train"].cameras
     views = [train[place].c2w for place in (0, 8, 16)]
