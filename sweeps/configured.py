@@ -233,7 +233,7 @@ def check_settings(
         elif not fits(value, hints.get(name, Any)):
             literal = get_origin(hints[name]) is Literal
             wanted = " or ".join(map(str, get_args(hints[name]))) if literal else ""
-            wanted = wanted or _as_written(parameters[name].annotation)
+            wanted = wanted or _as_written(hints[name])
             raise unexpected(f"{prefix}{name}", wanted, repr(value))
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
@@ -15,7 +15,8 @@ from methods.diver.model import CornerModel, Decoder
 from methods.diver.training import DiverLessons, DiverTraining
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.corner_gather import CORNERS
-from methods.kernels.types import Occupancy, Pixels, expect
+from methods.kernels.settings import Fraction, Only
+from methods.kernels.types import Occupancy, Pixels
 from methods.rendering.compaction import to_host
 from methods.rendering.frame import Render
 from methods.students.method import IN_FP32, Student
@@ -83,15 +84,19 @@ class Baked:
         return pixels
 
 
+def _whole(resolution: int) -> bool:
+    return 16 <= resolution <= 512 and not resolution % 16  # looked up in bricks of bricks
+
+
 @dataclass(kw_only=True, eq=False)
 class Diver(Student):
     """Corner features of sparse voxels, integrated along rays and decoded by a small network; its
     settings are explained in `sweeps/configs/method/diver.yaml`."""
 
     training: DiverLessons
-    resolution: int
+    resolution: Annotated[int, Only("a multiple of 16 up to 512", _whole)]
     stored: Stored
-    faint: float
+    faint: Fraction
 
     kind, model, computed = "diver", ("resolution",), IN_FP32
     contracts = False
@@ -106,14 +111,6 @@ class Diver(Student):
         axes={"G": Axis("{} voxels a side", "method.resolution", (128, 192, 256))},
         chosen=("stored", "faint", "stop"),
     )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        size = self.resolution
-        whole = 16 <= size <= 512 and not size % 16  # cells are looked up in bricks of bricks
-        expect(whole, "resolution", "a multiple of 16 up to 512", size)
-        expect(self.stored in ("bf16", "fp32"), "stored", "bf16 or fp32", self.stored)
-        expect(0 <= self.faint < 1, "faint", "a weight of 0 or more and less than 1", self.faint)
 
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> DiverTraining:
         generator = torch.Generator().manual_seed(self.teacher.seed)

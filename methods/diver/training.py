@@ -12,7 +12,8 @@ from methods.diver.model import CornerModel
 from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import STOP, composite, visible, weights
-from methods.kernels.types import Pixels, expect
+from methods.kernels.settings import Count, Fraction, NotNegative, Positive, Share
+from methods.kernels.types import Pixels
 from methods.kernels.voxel_walk import Crossings, walk
 from methods.rendering.field import pad
 from methods.students.networks import encode_directions
@@ -26,19 +27,11 @@ class DiverLessons(PixelOptions):
     """How to train the model, as `sweeps/configs/method/diver.yaml` explains; `rate` is that of the
     decoder."""
 
-    corner_rate: float
-    sparsity: float
-    prune_at: float
-    prune_below: float
-    prune_rays: int
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        expect(self.corner_rate > 0, "corner_rate", "more than 0", self.corner_rate)
-        expect(self.sparsity >= 0, "sparsity", "0 or more", self.sparsity)
-        expect(self.prune_rays >= 1, "prune_rays", "1 or more", self.prune_rays)
-        expect(0 <= self.prune_at <= 1, "prune_at", "a share in [0, 1]", self.prune_at)
-        expect(0 <= self.prune_below < 1, "prune_below", "a weight in [0, 1)", self.prune_below)
+    corner_rate: Positive
+    sparsity: NotNegative
+    prune_at: Share
+    prune_below: Fraction
+    prune_rays: Count
 
 
 class DiverTraining(PixelTraining):

@@ -15,8 +15,7 @@ from methods.gaussians import ply
 from methods.gaussians.model import Gaussians, rounded, stored_bytes
 from methods.gaussians.training import Fitting, GaussianTraining, on_surfaces, spacing
 from methods.instant_ngp.stage1 import OnField, train_field
-from methods.kernels.composite import check_stop
-from methods.kernels.types import expect
+from methods.kernels.settings import Count, Degree, Steps, Stop
 from methods.rendering.frame import FeatureFrame
 from methods.training import checkpoint, loop
 
@@ -27,12 +26,12 @@ class GaussianSplatting(OnField):
     and `precision` are those of the field that they start from."""
 
     fitting: Fitting
-    count: int
-    steps: int | None  # None: `budget.renderer_steps`
-    degree: int
+    count: Count
+    steps: Steps  # None: `budget.renderer_steps`
+    degree: Degree
     checkpoint: str | None
     stored: Literal["fp32", "int8"]
-    stop: float
+    stop: Stop
     name: str
 
     study = Study(
@@ -50,11 +49,6 @@ class GaussianSplatting(OnField):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        expect(self.count >= 1, "count", "1 or more", self.count)
-        expect(self.steps is None or self.steps >= 1, "steps", "1 or more, or none", self.steps)
-        expect(self.stored in ("fp32", "int8"), "stored", "fp32 or int8", self.stored)
-        expect(self.degree in range(4), "degree", "0 to 3", self.degree)
-        check_stop(self.stop)
         self.reads = [] if self.checkpoint is None else [Path(self.checkpoint)]
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:

@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.kernels.composite import STOP
 from methods.kernels.march.contraction import HALF
-from methods.kernels.types import expect
+from methods.kernels.settings import Checked, Count, Only, Positive
 from methods.rendering.frame import render_rays
 from methods.training import checkpoint, loop
 
@@ -40,7 +41,7 @@ STEEPNESS, FAINT = 100.0, 0.005
 
 
 @dataclass(frozen=True)
-class Fitting:
+class Fitting(Checked):
     """How to train Gaussians, as `sweeps/configs/method/gaussians.yaml` explains; the learning rate
     of the means is in scene units."""
 
@@ -54,17 +55,12 @@ class Fitting:
     opacity_cost: float
     scale_cost: float
     noise: float
-    every: int
+    every: Count
     relocate_from: float
     relocate_to: float
     half: float
-    opacity: float
-    size: float
-
-    def __post_init__(self) -> None:
-        expect(0 < self.opacity < 1, "opacity", "more than 0 and less than 1", self.opacity)
-        expect(self.size > 0, "size", "more than 0", self.size)
-        expect(self.every > 0, "every", "1 or more", self.every)
+    opacity: Annotated[float, Only("more than 0 and less than 1", lambda x: 0 < x < 1)]
+    size: Positive
 
 
 class GaussianTraining(loop.Training):

@@ -9,7 +9,7 @@ from bench.study import Study, turned
 from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.instant_ngp.stage1 import OnField, train_field
-from methods.kernels.composite import check_stop
+from methods.kernels.settings import Stop
 from methods.rendering.frame import everywhere, render_frame
 
 
@@ -18,7 +18,7 @@ class InstantNgp(OnField):
     """Instant-NGP as a `bench.types.Method`: the field of a `Setup`, rendered with rays that end at
     the transmittance `stop`, less than 1."""
 
-    stop: float
+    stop: Stop
 
     name = "ngp"
     study = Study(
@@ -34,10 +34,6 @@ class InstantNgp(OnField):
         parts=dict.fromkeys(("rays", "march", "composite"), "field"),
         chosen=("stop",),
     )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_stop(self.stop)
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         with torch_threads(budget.threads):

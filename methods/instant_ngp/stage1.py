@@ -15,6 +15,7 @@ from methods.instant_ngp.training import FieldTraining, TrainingOptions, new_gri
 from methods.kernels import multiplies_bf16, resolve
 from methods.kernels.dispatch import by_kernel
 from methods.kernels.encode import HashGrid
+from methods.kernels.settings import Checked
 from methods.kernels.types import Occupancy
 from methods.rendering.occupancy import DensityGrid
 from methods.rendering.sampling import Sampling
@@ -89,7 +90,7 @@ class Setup:
 
 
 @dataclass(kw_only=True, eq=False)
-class OnField:
+class OnField(Checked):
     """Base of methods whose settings are those of a field, see `Setup`, and others."""
 
     grid: HashGrid
@@ -102,6 +103,7 @@ class OnField:
     memory = 0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         where = self.backend, self.device, self.seed
         self.setup = Setup.resolved(self.grid, self.training, self.precision, *where)
         self.train_s = 0.0

@@ -5,6 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -13,62 +14,55 @@ from bench.types import Budget, Rays, Scene, SteerbenchError
 from methods.instant_ngp.field import HashField
 from methods.instant_ngp.pixels import REFRESHED, ErrorMap, PixelBatches
 from methods.kernels.adam import AdamState, hash_adam_
-from methods.kernels.composite import check_stop
 from methods.kernels.encode import SampleGradients
-from methods.kernels.types import Pixels, expect
+from methods.kernels.settings import (
+    Checked,
+    Fraction,
+    Length,
+    NotNegative,
+    Only,
+    Positive,
+    SomeShare,
+    Stop,
+)
+from methods.kernels.types import Pixels
 from methods.rendering.batch import opacity_entropy, render_batch
 from methods.rendering.occupancy import EVERY, MIN_VIEWS, STEP, DensityGrid, learnable_cells
-from methods.rendering.sampling import Sampling, check_step, suitable_step
+from methods.rendering.sampling import Sampling, suitable_step
 from methods.training import checkpoint, loop
 
 MIN_RAYS = 64  # minimum number of rays in a step
+Enough = Annotated[int, Only(f"{MIN_RAYS} or more", lambda x: x >= MIN_RAYS)]
 
 GRID_YOUTH_STEPS = 256
 """Up to this step the density grid is visited four times as much: most of it is still unknown."""
 
 
 @dataclass(frozen=True)
-class PixelOptions:
+class PixelOptions(Checked):
     """How to train on random pixels."""
 
-    rate: float  # initial learning rate
-    final_rate: float  # share of it left at the end of the cosine schedule
-    opacity_entropy: float  # weight of -o ln o, which drives an opacity to 0 or 1
+    rate: Positive  # initial learning rate
+    final_rate: SomeShare  # share of it left at the end of the cosine schedule
+    opacity_entropy: NotNegative  # weight of -o ln o, which drives an opacity to 0 or 1
     # Composite RGBA pictures on a random colour per ray instead of the scene's background, so that
     # no density can pass for background.
     random_background: bool
-    max_rays: int  # maximum number of rays in a step
-    by_error: float  # share of the rays that an `ErrorMap` draws; the rest see all alike
-
-    def __post_init__(self) -> None:
-        expect(self.rate > 0, "rate", "more than 0", self.rate)
-        expect(0 < self.final_rate <= 1, "final_rate", "a share in (0, 1]", self.final_rate)
-        expect(self.opacity_entropy >= 0, "opacity_entropy", "0 or more", self.opacity_entropy)
-        expect(self.max_rays >= MIN_RAYS, "max_rays", f"{MIN_RAYS} or more", self.max_rays)
-        expect(0 <= self.by_error < 1, "by_error", "a share in [0, 1)", self.by_error)
+    max_rays: Enough  # maximum number of rays in a step
+    by_error: Fraction  # of the rays, that an `ErrorMap` draws; the rest see all alike
 
 
 @dataclass(frozen=True)
 class TrainingOptions(PixelOptions):
     """How to train a field in stage 1; `rate` is that of table and networks."""
 
-    march_step: float | None  # of the rays, in diagonals of the cube / 1024; None: `suitable_step`
-    share: float  # samples with a gradient in a step, as a share of the budget's
-    grid_samples: int  # cells visited in an update of the density grid
-    rays: int | None  # in every step; None: as many as give `share` of the samples
-    stop: float  # transmittance at which a ray ends
-    thin: float  # see `Sampling`
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.march_step is not None:
-            check_step("march_step", self.march_step)
-        expect(0 < self.share <= 1, "share", "a share in (0, 1], of the samples", self.share)
-        expect(self.grid_samples >= 2, "grid_samples", "2 or more", self.grid_samples)
-        if self.rays is not None:
-            expect(self.rays >= MIN_RAYS, "rays", f"{MIN_RAYS} or more", self.rays)
-        check_stop(self.stop)
-        expect(self.thin >= 0, "thin", "an optical depth of 0 or more", self.thin)
+    march_step: Length | None  # of the rays, in diagonals of the cube / 1024; None: `suitable_step`
+    share: SomeShare  # samples with a gradient in a step, as a share of the budget's
+    # Cells visited in an update of the density grid.
+    grid_samples: Annotated[int, Only("2 or more", lambda x: x >= 2)]
+    rays: Enough | None  # in every step; None: as many as give `share`
+    stop: Stop  # transmittance at which a ray ends
+    thin: NotNegative  # see `Sampling`
 
     def sampling(self, budget: Budget) -> Sampling:
         """How rays are marched in a training within `budget`, and later to render its result."""

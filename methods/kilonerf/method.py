@@ -3,6 +3,7 @@ trained on photos (Section 3.2)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -10,7 +11,7 @@ from torch.nn import functional
 
 from bench.types import Budget, Scene
 from methods.instant_ngp.stage1 import TrainedField
-from methods.kernels.types import expect
+from methods.kernels.settings import Count, NotNegative, Only
 from methods.kilonerf.field import Grid, KiloField, Pieces, place_networks
 from methods.students.fields import FieldLessons, FieldStudent, StudentTraining
 from methods.students.method import IN_FP32
@@ -26,13 +27,8 @@ LEAK = 0.01
 class KiloLessons(FieldLessons):
     """How to train the networks, as `sweeps/configs/method/kilonerf.yaml` explains."""
 
-    points_each: int
-    view_cost: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        expect(self.points_each >= 1, "points_each", "1 or more", self.points_each)
-        expect(self.view_cost >= 0, "view_cost", "0 or more", self.view_cost)
+    points_each: Count
+    view_cost: NotNegative
 
 
 class KiloTraining(StudentTraining):
@@ -74,13 +70,9 @@ class KiloNerf(FieldStudent):
     32."""
 
     training: KiloLessons
-    networks: int
+    networks: Annotated[int, Only(f"1 to {MOST}", lambda x: 1 <= x <= MOST)]
 
     kind, model, computed = "kilonerf", ("networks",), IN_FP32
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        expect(1 <= self.networks <= MOST, "networks", f"1 to {MOST}", self.networks)
 
     def new_field(self) -> KiloField:
         """Make the networks of the grid that was placed or restored last."""

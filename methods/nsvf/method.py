@@ -2,16 +2,20 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 
 from bench.types import Budget, Scene
 from methods.instant_ngp.stage1 import TrainedField
+from methods.kernels.settings import Length, Only
 from methods.kernels.types import BRICK, Occupancy, expect
 from methods.nsvf.field import EMBEDDING, NsvfField
-from methods.rendering.sampling import Sampling, check_step
+from methods.rendering.sampling import Sampling
 from methods.students.fields import FieldLessons, FieldStudent, StudentTraining
 from methods.students.voxels import occupied_voxels
+
+WHOLE = Only(f"a multiple of {BRICK**2}", lambda x: x > 0 and not x % BRICK**2)
 
 
 @dataclass(kw_only=True, eq=False)
@@ -19,16 +23,13 @@ class Nsvf(FieldStudent):
     """A neural sparse voxel field with voxels where the field that it starts from is occupied."""
 
     training: FieldLessons
-    resolution: int  # voxels along a side of the cube, a multiple of 16
-    step: float  # length of a step of the rays in voxels, in training and rendering
+    resolution: Annotated[int, WHOLE]  # voxels along a side of the cube
+    step: Length  # length of a step of the rays in voxels, in training and rendering
 
     kind, model = "nsvf", ("resolution", "step")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_step("step", self.step)
-        size = self.resolution
-        expect(size > 0 and not size % BRICK**2, "resolution", f"a multiple of {BRICK**2}", size)
         channels, as_many = self.teacher.grid.channels, f"{EMBEDDING} channels (levels x features)"
         expect(channels == EMBEDDING, "teacher.grid", as_many, channels)
 

@@ -16,7 +16,8 @@ from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import STOP, composite, visible
-from methods.kernels.types import Occupancy, Pixels, expect
+from methods.kernels.settings import Count, NotNegative
+from methods.kernels.types import Occupancy, Pixels
 from methods.kernels.voxel_walk import walk
 from methods.plenoctree.kernels.voxel_light import render_voxels, shade_voxels
 from methods.plenoctree.octree import Extraction, Octree, extract
@@ -35,13 +36,8 @@ class OctreeLessons(PixelOptions):
     the harmonics; `samples` are more than those of a field, each of which changes the whole
     network."""
 
-    density_rate: float
-    samples: int
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        expect(self.density_rate >= 0, "density_rate", "0 or more", self.density_rate)
-        expect(self.samples >= 1, "samples", "1 or more", self.samples)
+    density_rate: NotNegative
+    samples: Count
 
 
 class OctreeTraining(PixelTraining):
@@ -126,10 +122,6 @@ class PlenOctree(Student):
         axes={"G": Axis("{}³ leaves", SIDE, (128, 256, 512))},
         chosen=("stored", "stop"),
     )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        expect(self.stored in ("fp16", "fp32"), "stored", "fp16 or fp32", self.stored)
 
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> OctreeTraining:
         setup = self.teacher

@@ -8,6 +8,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from bench.types import Rays, SteerbenchError
 from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.composite import STOP, weights
+from methods.kernels.settings import Checked, Count, Degree, NotNegative, Only
 from methods.kernels.spherical import spherical_harmonics
 from methods.kernels.types import Occupancy, expect
 from methods.kernels.voxel_walk import BRICK, Crossings, Voxels
@@ -85,28 +87,27 @@ def _half(values: Tensor) -> Tensor:
     return values.clamp(-most, most).half().float()
 
 
+def _whole(resolution: int) -> bool:
+    return RESOLUTION <= resolution <= 2048 and not resolution % RESOLUTION
+
+
 @dataclass(frozen=True)
-class Extraction:
+class Extraction(Checked):
     """How leaves are found and filled, as `sweeps/configs/method/plenoctree.yaml` explains."""
 
-    resolution: int
-    degree: int
-    least_weight: float
-    rays: int
-    points: int
+    resolution: Annotated[int, Only(f"a multiple of {RESOLUTION} up to 2048", _whole)]
+    degree: Degree
+    least_weight: NotNegative
+    rays: Count
+    points: Count
     directions: int
-    most_leaves: int
+    most_leaves: Count
 
     def __post_init__(self) -> None:
-        size, terms = self.resolution, (self.degree + 1) ** 2
-        whole = RESOLUTION <= size <= 2048 and not size % RESOLUTION
-        expect(whole, "resolution", f"a multiple of {RESOLUTION} up to 2048", size)
-        expect(self.degree in range(4), "degree", "0 to 3", self.degree)
+        super().__post_init__()
+        terms = (self.degree + 1) ** 2
         needed = f"at least {terms}, as many as degree {self.degree} has harmonics"
         expect(self.directions >= terms, "directions", needed, self.directions)
-        for name in ("rays", "points", "most_leaves"):
-            expect(getattr(self, name) >= 1, name, "1 or more", getattr(self, name))
-        expect(self.least_weight >= 0, "least_weight", "0 or more", self.least_weight)
 
 
 @torch.no_grad()

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from methods.kernels.composite import STOP
-from methods.kernels.types import expect
 from methods.rendering.occupancy import RESOLUTION, STEP
 
 FAINT = 0.1
@@ -23,11 +22,6 @@ def suitable_step(steps: int) -> float:
     Measured up to 3,000 steps of 32,768 samples: docs/log.md, "The step that a training needs".
     """
     return min(STEP * (20_000 / steps) ** (1 / 3), 1 / RESOLUTION)
-
-
-def check_step(name: str, length: float) -> None:
-    """Raise ValueError unless the `length` of a step is more than 0."""
-    expect(length > 0, name, "a length of more than 0", length)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.engines import Built, Engine
 from methods.engines.auto import Auto, EngineFigures
 from methods.instant_ngp.stage1 import OnField, train_field
+from methods.kernels.settings import Steps
 from methods.kernels.types import expect
 from methods.steernerf.buffer import Buffer
 from methods.steernerf.options import JointOptions, ModelOptions, Rendering
@@ -46,7 +47,7 @@ class SteerNerf(OnField):
     renderer: partial[UNet]
     joint: JointOptions
     engine: Engine | Auto
-    steps: int | None
+    steps: Steps
     after: float
     name: str
 
@@ -83,7 +84,6 @@ class SteerNerf(OnField):
         frames, mode = self.model.frames, self.rendering.range.mode
         possible = "off without preceding frames (L = 0)"
         expect(frames > 0 or mode == "off", "rendering.range.mode", possible, mode)
-        expect(self.steps is None or self.steps >= 1, "steps", "1 or more, or none", self.steps)
         self.stage2 = Stage2(self.model, self.renderer, self.joint, self.after)
         super().__post_init__()
         self.engine.check(self.setup.device)

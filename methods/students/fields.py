@@ -15,7 +15,8 @@ from torch.nn import functional
 from bench.types import Budget, Log, Probe, Rays, Scene
 from methods.instant_ngp.stage1 import TrainedField
 from methods.instant_ngp.training import PixelOptions, PixelTraining
-from methods.kernels.types import Occupancy, Pixels, expect
+from methods.kernels.settings import Share, SomeShare
+from methods.kernels.types import Occupancy, Pixels
 from methods.rendering.batch import render_batch
 from methods.rendering.field import ROUND_SAMPLES, Field
 from methods.rendering.frame import Render, everywhere
@@ -36,13 +37,8 @@ class FieldLessons(PixelOptions):
 
     # Share of the steps, at the beginning, that compare densities and colours at random points of
     # occupied cells with the teacher's.
-    points: float
-    share: float  # samples with a gradient in a step, as a share of the budget's
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        expect(0 <= self.points <= 1, "points", "a share from 0 to 1", self.points)
-        expect(0 < self.share <= 1, "share", "a share in (0, 1], of the samples", self.share)
+    points: Share
+    share: SomeShare  # samples with a gradient in a step, as a share of the budget's
 
 
 class StudentField(nn.Module, Field):

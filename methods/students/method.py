@@ -17,8 +17,8 @@ from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
 from methods.instant_ngp.training import PixelOptions
-from methods.kernels.composite import check_stop
-from methods.kernels.types import Occupancy, expect
+from methods.kernels.settings import Checked, Steps, Stop
+from methods.kernels.types import Occupancy
 from methods.rendering.frame import Render, render_frame
 from methods.training import checkpoint, loop
 
@@ -27,15 +27,15 @@ IN_FP32 = {"field_precision": "fp32"}
 
 
 @dataclass(kw_only=True, eq=False)
-class Student(ABC):
+class Student(Checked, ABC):
     """Base of the methods that start from the Instant-NGP field that all methods share. `train_s`
     counts the training of the field, the initialisation of the model and its own training."""
 
     teacher: Setup  # the field that it starts from, and where it runs
     training: PixelOptions  # how the model is trained
-    stop: float  # transmittance at which a ray ends when rendering, less than 1
+    stop: Stop  # transmittance at which a ray ends when rendering, less than 1
     name: str  # as shown in result rows
-    steps: int | None  # of its own training; None: `budget.renderer_steps`
+    steps: Steps  # of its own training; None: `budget.renderer_steps`
 
     memory = 0
     kind: ClassVar[str]  # name of its trained stage, for example "nerf"
@@ -50,8 +50,7 @@ class Student(ABC):
     )
 
     def __post_init__(self) -> None:
-        check_stop(self.stop)
-        expect(self.steps is None or self.steps >= 1, "steps", "1 or more, or none", self.steps)
+        super().__post_init__()
         self.train_s = 0.0
 
     @abstractmethod
@@ -102,7 +101,7 @@ class Student(ABC):
         self.train_peak_bytes = max(teacher.train_peak_bytes, peak)
         self.background = scene.background.to(self.teacher.device)
 
-    def reset(self) -> None:  # noqa: B027 (no student has anything to forget)
+    def reset(self) -> None:
         """Do nothing: every frame stands alone."""
 
     def settings(self) -> dict[str, str]:

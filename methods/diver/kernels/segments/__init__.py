@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from bench.types import Rays, check_shape
-from methods.kernels.composite import check_stop
 from methods.kernels.corner_gather import CORNERS
 from methods.kernels.dispatch import implementation
+from methods.kernels.settings import TRANSMITTANCE
 from methods.kernels.types import Intervals, Pixels, check_rays
 from methods.kernels.voxel_walk import Crossings, Voxels
 
@@ -75,7 +75,7 @@ def render_segments(
     with at most the weight `faint` have an opacity but no colour. Not differentiable. `towards` [R,
     H] is what the direction of a ray adds to the output of `layers.geometry`. Also returns how many
     segments of each ray lie in front of its end, and have a colour: [R] int32."""
-    check_stop(stop)
+    TRANSMITTANCE.check("stop", stop)
     hidden, features = layers.hidden.shape
     check_shape("rows", corners.rows, len(corners.voxels), CORNERS)
     check_shape("table", corners.table, None, features)

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from bench.types import Rays, check_shape
-from methods.kernels.composite import STOP, check_stop
+from methods.kernels.composite import STOP
 from methods.kernels.dispatch import implementation
+from methods.kernels.settings import TRANSMITTANCE
 from methods.kernels.shade import check_harmonics
 from methods.kernels.types import Pixels, check_rays
 from methods.kernels.voxel_walk import Voxels
@@ -37,7 +38,7 @@ def render_voxels(
     """Render R `rays`, which end at the transmittance `stop`, without a background; voxels with at
     most the weight `faint` count for opacity but are not shaded. Not differentiable. Returns the
     pixels and, for each ray, the numbers of crossed and of shaded voxels: [R] int32."""
-    check_stop(stop)
+    TRANSMITTANCE.check("stop", stop)
     check_rays(rays)
     check_shape("density", light.density, len(voxels))
     check_harmonics("harmonics", light.harmonics, len(voxels))
