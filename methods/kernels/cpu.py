@@ -25,11 +25,12 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 from torch import Tensor
+from torch.nn import functional
 
 from bench.provenance import digest
 from methods.kernels.types import PARALLEL
 
-f32, i32, u32 = np.float32, np.int32, np.uint32
+f32, f64, i32, u32 = np.float32, np.float64, np.int32, np.uint32
 
 u64 = np.uint64
 """Type of an index that cannot count from the end; numba tests every other computed index."""
@@ -91,6 +92,12 @@ def flat(*tensors: Tensor) -> list[np.ndarray]:
     return [array.reshape(-1) for array in arrays(*tensors)]
 
 
+def whole_lanes(tensor: Tensor) -> Tensor:
+    """The last dimension filled up with zeros to a multiple of `LANES`."""
+    idle = -tensor.shape[-1] % LANES
+    return functional.pad(tensor, (0, idle)) if idle else tensor
+
+
 class _Kept(FunctionCache):
     """The machine code of a function, in a folder that is named after the digest of all files that
     it comes from; numba's own cache looks at one file. Folders of other code are removed."""
@@ -149,6 +156,12 @@ def slope(direction):
     """Change of t per length along an axis; 0 for a ray that does not move along it."""
     inverse = f32(1) / direction
     return inverse if abs(direction) >= PARALLEL else f32(0)
+
+
+@jit()
+def three(rows, row):
+    """The three numbers of a row."""
+    return rows[row, 0], rows[row, 1], rows[row, 2]
 
 
 @jit()

@@ -23,13 +23,12 @@ def launch(
             kernel[grid](*arguments, enable_fp_fusion=False, **options)
 
 
-def check_types(*served: torch.dtype, **tensors: Tensor) -> None:
-    """Raise ValueError unless every tensor has one of the `served` types."""
+def check_float32(**tensors: Tensor) -> None:
+    """Raise ValueError unless all are of float32."""
     for name, tensor in tensors.items():
-        if tensor.dtype not in served:
-            expected = " or ".join(str(dtype).removeprefix("torch.") for dtype in served)
+        if tensor.dtype != torch.float32:
             raise ValueError(
-                f"backend 'gpu' expects {name} of {expected}, got {tensor.dtype}: use "
+                f"backend 'gpu' expects {name} of float32, got {tensor.dtype}: use "
                 "backend='reference'"
             )
 

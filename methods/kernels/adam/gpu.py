@@ -16,7 +16,7 @@ from methods.kernels import adam
 from methods.kernels.adam import AdamState, corrections
 from methods.kernels.encode import HashGrid
 from methods.kernels.encode.gpu import table_gradient
-from methods.kernels.gpu import check_types, launch
+from methods.kernels.gpu import check_float32, launch
 
 BLOCK = tl.constexpr(1024)
 """Features per program, 8 per lane: that many concurrent loads hide their latency."""
@@ -34,7 +34,7 @@ def _step(
     table: Tensor, grad: Tensor, state: AdamState, rate: float, packed: Tensor | None
 ) -> None:
     given = {"table": table, "grad": grad, "first": state.first, "second": state.second}
-    check_types(torch.float32, **given)
+    check_float32(**given)
     for name, tensor in given.items():
         if not tensor.is_contiguous():
             raise ValueError(f"backend 'gpu' expects {name} to be contiguous")

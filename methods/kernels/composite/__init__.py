@@ -8,14 +8,9 @@ from torch import Tensor
 
 from bench.types import check_shape
 from methods.kernels.dispatch import implementation
-from methods.kernels.types import Intervals, Pixels, expect
+from methods.kernels.types import Intervals, Pixels
 
 STOP = 1e-4  # transmittance at which a ray ends: what lies behind changes a pixel by less than this
-
-
-def check_stop(stop: float) -> None:
-    """Raise ValueError unless 0 <= `stop` < 1; from 1 on, rays would end before they begin."""
-    expect(0 <= stop < 1, "stop", "a transmittance of 0 or more and less than 1", stop)
 
 
 def composite(
@@ -60,9 +55,7 @@ def weights(
 ) -> Tensor:
     """The weights [S] that `composite` gives to samples, computed without values. No gradient.
     `front` [R] is the transmittance in front of each ray's first sample; None: 1."""
-    front = _light(sigma, intervals, front)
-    kernel = implementation(__name__, backend, sigma.device)
-    return kernel.weights(sigma.detach(), intervals, stop, front)
+    return _light(sigma, intervals, stop, front, backend)[0]
 
 
 def visible(
@@ -76,18 +69,20 @@ def visible(
     """How many samples of each ray get a weight from `composite`, [R] int64, and the transmittance
     behind them, [R]. No gradient. They are the first samples of the ray; those behind have neither
     weight nor gradient. `front` is as for `weights`."""
-    front = _light(sigma, intervals, front)
-    kernel = implementation(__name__, backend, sigma.device)
-    return kernel.visible(sigma.detach(), intervals, stop, front)
+    _, counts, left = _light(sigma, intervals, stop, front, backend)
+    return counts, left
 
 
-def _light(sigma: Tensor, intervals: Intervals, front: Tensor | None) -> Tensor:
-    """Check the samples, and the transmittance in `front` of each ray or its default."""
+def _light(
+    sigma: Tensor, intervals: Intervals, stop: float, front: Tensor | None, backend: str
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What `weights` and `visible` return."""
     _check_samples(sigma, intervals)
     rays = len(intervals.offsets) - 1
     front = sigma.new_ones(rays) if front is None else front
     check_shape("front", front, rays)
-    return front
+    kernel = implementation(__name__, backend, sigma.device)
+    return kernel.light(sigma.detach(), intervals, stop, front)
 
 
 def _check_samples(sigma: Tensor, intervals: Intervals) -> None:

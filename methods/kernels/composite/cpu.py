@@ -11,11 +11,10 @@ import torch
 from numba import prange
 from torch import Tensor
 
-from methods.kernels.cpu import arrays, check_float32, f32, jit
+from methods.kernels.cpu import arrays, check_float32, f32, f64, jit
 from methods.kernels.types import Intervals, Pixels
 
 CHUNK = 64  # rays
-f64 = np.float64
 
 
 def composite(
@@ -26,21 +25,14 @@ def composite(
     return Pixels(*_Composite.apply(sigma, values, *samples, stop, carry))
 
 
-def weights(sigma: Tensor, intervals: Intervals, stop: float, front: Tensor) -> Tensor:
-    weight = torch.empty_like(sigma, memory_format=torch.contiguous_format)
-    samples = arrays(sigma, intervals.delta, intervals.offsets)
-    _weights(*samples, f32(stop), *arrays(front, weight))
-    return weight
-
-
-def visible(
+def light(
     sigma: Tensor, intervals: Intervals, stop: float, front: Tensor
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
+    weights, left = torch.zeros(len(sigma)), torch.empty(len(front))
     counts = torch.empty(len(front), dtype=torch.int64)
-    left = torch.empty(len(front))
     samples = arrays(sigma, intervals.delta, intervals.offsets, front)
-    _visible(*samples, f32(stop), *arrays(counts, left))
-    return counts, left
+    _light(*samples, f32(stop), *arrays(weights, counts, left))
+    return weights, counts, left
 
 
 class _Composite(torch.autograd.Function):
@@ -98,26 +90,14 @@ def _forward(sigma, values, t, delta, offsets, stop, front, out, depth_sum, alph
 
 
 @jit(parallel=True)
-def _weights(sigma, delta, offsets, stop, front, weight):
-    rays = len(offsets) - 1
-    for chunk in prange((rays + CHUNK - 1) // CHUNK):
-        for ray in range(chunk * CHUNK, min(rays, (chunk + 1) * CHUNK)):
-            transmittance = f64(front[ray])
-            for i in range(offsets[ray], offsets[ray + 1]):
-                part = 0.0
-                if transmittance > stop:
-                    part = transmittance * _opacity(sigma[i], delta[i])
-                weight[i] = part
-                transmittance -= part
-
-
-@jit(parallel=True)
-def _visible(sigma, delta, offsets, front, stop, counts, left):
+def _light(sigma, delta, offsets, front, stop, weights, counts, left):
     for ray in prange(len(offsets) - 1):
         transmittance = f64(front[ray])
         i = offsets[ray]
         while i < offsets[ray + 1] and transmittance > stop:
-            transmittance -= transmittance * _opacity(sigma[i], delta[i])
+            weight = transmittance * _opacity(sigma[i], delta[i])
+            weights[i] = weight
+            transmittance -= weight
             i += 1
         counts[ray], left[ray] = i - offsets[ray], transmittance
 

@@ -4,14 +4,12 @@ Within a block, transmittance is the exponential of a cumulative sum. A ray ends
 block behind which it is opaque.
 """
 
-from typing import Any
-
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from methods.kernels.gpu import check_types, launch, opacity
+from methods.kernels.gpu import check_float32, launch, opacity
 from methods.kernels.types import Intervals, Pixels
 
 BLOCK = tl.constexpr(64)  # samples
@@ -23,29 +21,18 @@ def composite(
     sigma: Tensor, values: Tensor, intervals: Intervals, stop: float, carry: Pixels | None
 ) -> Pixels:
     t, delta = intervals.t, intervals.delta
-    check_types(torch.float32, sigma=sigma, values=values, t=t, delta=delta)
+    check_float32(sigma=sigma, values=values, t=t, delta=delta)
     return Pixels(*_TritonComposite.apply(sigma, values, t, delta, intervals.offsets, stop, carry))
 
 
-def weights(sigma: Tensor, intervals: Intervals, stop: float, front: Tensor) -> Tensor:
-    weight = torch.zeros_like(sigma, memory_format=torch.contiguous_format)
-    _launch(sigma, intervals, front, stop, weight, None, None)
-    return weight
-
-
-def visible(
+def light(
     sigma: Tensor, intervals: Intervals, stop: float, front: Tensor
-) -> tuple[Tensor, Tensor]:
-    counts = intervals.offsets.new_zeros(len(front))
-    left = torch.empty_like(front, memory_format=torch.contiguous_format)
-    _launch(sigma, intervals, front, stop, None, counts, left)
-    return counts, left
-
-
-def _launch(sigma: Tensor, intervals: Intervals, front: Tensor, *rest: Any) -> None:
-    check_types(torch.float32, sigma=sigma, delta=intervals.delta, front=front)
-    samples = (x.contiguous() for x in (sigma, intervals.delta, intervals.offsets, front))
-    launch(_light, (len(front),), *samples, *rest, num_warps=1)
+) -> tuple[Tensor, Tensor, Tensor]:
+    check_float32(sigma=sigma, delta=intervals.delta, front=front)
+    samples = [x.contiguous() for x in (sigma, intervals.delta, intervals.offsets, front)]
+    found = torch.zeros_like(samples[0]), samples[2].new_zeros(len(front)), samples[3].clone()
+    launch(_light, (len(front),), *samples, stop, *found, num_warps=1)
+    return found
 
 
 class _TritonComposite(torch.autograd.Function):
@@ -118,8 +105,7 @@ def _forward(
 
 
 @triton.jit
-def _light(sigma, delta, offsets, front, stop, weight, counts, left):
-    """Write either the weights or the other two."""
+def _light(sigma, delta, offsets, front, stop, weights, counts, left):
     ray = tl.program_id(0).to(tl.int64)
     first, end = tl.load(offsets + ray), tl.load(offsets + ray + 1)
     light, count = tl.load(front + ray), tl.zeros([], tl.int64)
@@ -127,15 +113,12 @@ def _light(sigma, delta, offsets, front, stop, weight, counts, left):
     while (first < end) & (light > stop):
         i = first + tl.arange(0, BLOCK)
         found, lit, behind, light = _block(sigma, delta, first, i, i < end, light, stop)
-        if weight is not None:
-            tl.store(weight + i, found, mask=i < end)
-        else:
-            count += tl.sum(lit.to(tl.int64), 0)
-            last = tl.min(tl.where(lit, behind, last), 0)
+        tl.store(weights + i, found, mask=i < end)
+        count += tl.sum(lit.to(tl.int64), 0)
+        last = tl.min(tl.where(lit, behind, last), 0)
         first += BLOCK
-    if weight is None:
-        tl.store(counts + ray, count)
-        tl.store(left + ray, last)
+    tl.store(counts + ray, count)
+    tl.store(left + ray, last)
 
 
 @triton.jit

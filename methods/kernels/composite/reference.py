@@ -11,7 +11,7 @@ def composite(
 ) -> Pixels:
     slots = _padded_rays(intervals)
     front = sigma.new_ones(len(slots[0])) if carry is None else 1 - carry.alpha
-    weight = _padded_weights(sigma, intervals.delta, slots, stop, front)
+    weight, _, _ = _padded_weights(sigma, intervals.delta, slots, stop, front)
     sums = (
         (weight[..., None] * _padded(values, slots)).sum(dim=1),
         (weight * _padded(intervals.t, slots)).sum(dim=1),
@@ -20,23 +20,18 @@ def composite(
     return Pixels(*(sums if carry is None else map(torch.add, carry.columns, sums)))
 
 
-def weights(sigma: Tensor, intervals: Intervals, stop: float, front: Tensor) -> Tensor:
+def light(
+    sigma: Tensor, intervals: Intervals, stop: float, front: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     slots, starts = _padded_rays(intervals), intervals.offsets[:-1]
-    weight = _padded_weights(sigma, intervals.delta, slots, stop, front)
+    weight, lit, tau = _padded_weights(sigma, intervals.delta, slots, stop, front)
     ray = torch.arange(len(starts), device=sigma.device).repeat_interleave(
         intervals.offsets.diff(), output_size=len(sigma)
     )
-    return weight[ray, torch.arange(len(sigma), device=sigma.device) - starts[ray]]
-
-
-def visible(
-    sigma: Tensor, intervals: Intervals, stop: float, front: Tensor
-) -> tuple[Tensor, Tensor]:
-    slots = _padded_rays(intervals)
-    tau = _padded(_thickness(sigma, intervals.delta), slots)
-    seen = (front[:, None] * _transmittance(tau) > stop) & slots[0]
+    weights = weight[ray, torch.arange(len(sigma), device=sigma.device) - starts[ray]]
+    seen = lit & slots[0]
     left = front * torch.exp(-torch.where(seen, tau, 0).sum(dim=1))
-    return seen.sum(dim=1), left
+    return weights, seen.sum(dim=1), left
 
 
 def _padded_rays(intervals: Intervals) -> tuple[Tensor, Tensor]:
@@ -59,10 +54,12 @@ def _padded(samples: Tensor, slots: tuple[Tensor, Tensor]) -> Tensor:
 
 def _padded_weights(
     sigma: Tensor, delta: Tensor, slots: tuple[Tensor, Tensor], stop: float, front: Tensor
-) -> Tensor:
-    tau = _padded(_thickness(sigma, delta), slots)  # [R, N]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Weights [R, N] of samples, which of them get light, and their optical thickness."""
+    tau = _padded(_thickness(sigma, delta), slots)
     transmittance = front[:, None] * _transmittance(tau)
-    return torch.where(transmittance > stop, transmittance * -torch.expm1(-tau), 0)
+    lit = transmittance > stop
+    return torch.where(lit, transmittance * -torch.expm1(-tau), 0), lit, tau
 
 
 def _thickness(sigma: Tensor, delta: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ import triton.language as tl
 from torch import Tensor
 
 from methods.kernels.encode import PRIMES, HashGrid
-from methods.kernels.gpu import check_types, launch
+from methods.kernels.gpu import check_float32, launch
 
 BLOCK = tl.constexpr(256)  # samples
 PRIME_Y, PRIME_Z = tl.constexpr(PRIMES[1]), tl.constexpr(PRIMES[2])
@@ -22,7 +22,7 @@ PRIME_Y, PRIME_Z = tl.constexpr(PRIMES[1]), tl.constexpr(PRIMES[2])
 def encode(positions: Tensor, table: Tensor, grid: HashGrid, packed: Tensor | None) -> Tensor:
     if positions.requires_grad:
         raise ValueError("backend 'gpu' gives no gradient for positions: use backend='reference'")
-    check_types(torch.float32, positions=positions, table=table)
+    check_float32(positions=positions, table=table)
     return _TritonEncode.apply(positions.contiguous(), table, grid, packed)
 
 

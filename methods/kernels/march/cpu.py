@@ -13,7 +13,7 @@ import torch
 from numba import prange
 from torch import Tensor
 
-from methods.kernels.cpu import arrays, check_float32, f32, i32, jit, slope, u64
+from methods.kernels.cpu import arrays, check_float32, f32, f64, i32, jit, slope, u64
 from methods.kernels.march import LEAST_STEP, Segments, longest_ray
 from methods.kernels.march.contraction import BEYOND, Course
 from methods.kernels.march.reference import clip, course_of
@@ -25,7 +25,6 @@ VECTOR = 32
 """Loops run over a multiple of so many columns, so that vectors leave none over. What they find in
 columns without a ray is not read."""
 
-f64 = np.float64
 INF = f32(np.inf)
 ZEROS, ONES = (f32(0),) * 3, (f32(1),) * 3
 LEAST = f32(LEAST_STEP)

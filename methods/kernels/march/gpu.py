@@ -11,7 +11,7 @@ import triton.language as tl
 from torch import Tensor
 
 from methods.kernels.dispatch import interpreted
-from methods.kernels.gpu import check_types, launch, vector
+from methods.kernels.gpu import check_float32, launch, vector
 from methods.kernels.march import Segments
 from methods.kernels.march.contraction import Course
 from methods.kernels.march.reference import clip, course_of, slopes
@@ -48,7 +48,7 @@ def _arguments(segments: Segments, occupancy: Occupancy, course: Course | None) 
     """The arguments of `_march` for rays and grid; the last one is R."""
     origins, directions = segments.rays.origins, segments.rays.directions
     window, jitter = segments.window, segments.jitter
-    check_types(torch.float32, origins=origins, directions=directions, window=window, jitter=jitter)
+    check_float32(origins=origins, directions=directions, window=window, jitter=jitter)
     near, far, step_t, alive = clip(segments, course)
     # Clamped to the cube: a window may lie outside it, beyond the range of integers.
     lowest = torch.minimum(torch.maximum(window[:, 0], near), far)

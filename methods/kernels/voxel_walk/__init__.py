@@ -12,17 +12,14 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from bench.types import Rays, check_shape
 from methods.kernels.dispatch import implementation
-from methods.kernels.types import Intervals, check_rays, expect
+from methods.kernels.types import Intervals, check_rays, clearance, expect
 
 BRICK = 8  # cells along the side of a brick
 
 MAX_RESOLUTION = 2048  # maximum number of cells along a side; the map of its bricks takes 64 MiB
-
-MAX_CLEARANCE = 32  # upper limit of a clearance in bricks; beyond it a ray takes another step
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,15 +66,8 @@ class Voxels:
 
     @cached_property
     def clearance(self) -> Tensor:
-        """Chebyshev distance in bricks to the nearest non-empty brick: [G/8, G/8, G/8] uint8. 0 in
-        a non-empty brick, at most `MAX_CLEARANCE`."""
-        near = (self.bricks >= 0)[None, None].float()
-        clearance = torch.zeros_like(near)
-        for _ in range(min(self.resolution // BRICK, MAX_CLEARANCE)):
-            clearance += near == 0
-            for size in ((3, 1, 1), (1, 3, 1), (1, 1, 3)):  # maximum over a cube, axis by axis
-                near = functional.max_pool3d(near, size, 1, [n // 2 for n in size])
-        return clearance[0, 0].to(torch.uint8)
+        """`types.clearance` of the bricks that are not empty: [G/8, G/8, G/8]."""
+        return clearance(self.bricks >= 0)
 
     @cached_property
     def masks(self) -> Tensor:

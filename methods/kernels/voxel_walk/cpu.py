@@ -12,14 +12,13 @@ import torch
 from numba import prange
 
 from bench.types import Rays
-from methods.kernels.cpu import arrays, check_float32, f32, i32, jit, slope
+from methods.kernels.cpu import arrays, check_float32, f32, f64, i32, jit, slope
 from methods.kernels.voxel_walk import Crossings, Voxels
 
 CHUNK = 64  # rays
 BLOCK = 1 << 12
 """Rays walked at a time; the next ones reuse memory that is then already in the cache."""
 
-f64 = np.float64
 INF = f32(np.inf)
 
 

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from numba import prange
 from torch import Tensor
-from torch.nn import functional
 
 from bench.types import Rays
 from methods.diver.kernels.segments import Corners, Layers
@@ -23,10 +22,13 @@ from methods.kernels.cpu import (
     arrays,
     check_float32,
     f32,
+    f64,
     jit,
     multiply,
     prefetch,
     sigmoid,
+    three,
+    whole_lanes,
 )
 from methods.kernels.types import Pixels
 from methods.kernels.voxel_walk import Crossings, Voxels
@@ -39,8 +41,6 @@ BATCH = 8 * ROWS  # segments whose colours are computed together
 
 GAUSS = f32(0.5 / math.sqrt(3))
 """Distance of the two nodes of the Gauss-Legendre rule from the middle of a segment of length 1."""
-
-f64 = np.float64
 
 
 def segment_weights(rays: Rays, crossings: Crossings, voxels: Voxels) -> Tensor:
@@ -58,9 +58,11 @@ def render_segments(
     parts = [
         layers.hidden.T,
         layers.hidden_bias,
-        *_whole_lanes(layers.density, layers.density_bias),
+        whole_lanes(layers.density.T),
+        whole_lanes(layers.density_bias),
         layers.geometry.T,
-        *_whole_lanes(layers.colour, layers.colour_bias),
+        whole_lanes(layers.colour.T),
+        whole_lanes(layers.colour_bias),
     ]
     given, table, voxels = (rays.origins, rays.directions, towards), corners.table, corners.voxels
     if table.dtype == torch.bfloat16:
@@ -83,12 +85,6 @@ def render_segments(
         tuple(arrays(*pixels.columns, crossed, shaded)),
     )
     return pixels, crossed, shaded
-
-
-def _whole_lanes(weights: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
-    """A layer of fewer than `LANES` outputs with zeros for the others: [H, LANES], [LANES]."""
-    idle = LANES - len(bias)
-    return functional.pad(weights.T, (0, idle)), functional.pad(bias, (0, idle))
 
 
 @jit(fastmath=FAST)
@@ -134,11 +130,6 @@ def _local(origin, direction, t, resolution, corner):
 
 
 @jit()
-def _three(values, row):
-    return values[row, 0], values[row, 1], values[row, 2]
-
-
-@jit()
 def _weights_between(origin, direction, near, far, resolution, corner):
     """Mean weights in the voxel that begins at `corner`, on a ray from t = `near` to `far`."""
     (ox, oy, oz), (dx, dy, dz), (x, y, z) = origin, direction, corner
@@ -157,8 +148,8 @@ def _segment_weights(origins, directions, ray, near, far, coordinates, voxel, re
     total = len(near)
     for chunk in prange((total + SEGMENTS - 1) // SEGMENTS):
         for i in range(chunk * SEGMENTS, min(total, (chunk + 1) * SEGMENTS)):
-            origin, direction = _three(origins, ray[i]), _three(directions, ray[i])
-            corner = _three(coordinates, voxel[i])
+            origin, direction = three(origins, ray[i]), three(directions, ray[i])
+            corner = three(coordinates, voxel[i])
             found = _weights_between(origin, direction, near[i], far[i], resolution, corner)
             _put(weights, i, found)
 
@@ -215,7 +206,7 @@ def _render(given, maps, voxels, resolution, parts, bounds, out):
         buffers = np.empty(BATCH * size, np.float32), np.empty(BATCH * LANES, np.float32)
         sums = np.zeros((CHUNK, 3))
         for ray in range(first, end):
-            origin, direction = _three(origins, ray), _three(directions, ray)
+            origin, direction = three(origins, ray), three(directions, ray)
             depth, transmittance = 0.0, 1.0
             start, steps, colours = f32(0), 0, 0
             while start < np.inf and not transmittance <= stop:
@@ -230,7 +221,7 @@ def _render(given, maps, voxels, resolution, parts, bounds, out):
                     for row in eight_of(corners, voxel[i]):
                         prefetch(table, row * inputs)
                 for i in range(count):
-                    corner = _three(coordinates, voxel[i])
+                    corner = three(coordinates, voxel[i])
                     weights = _weights_between(
                         origin, direction, near[i], far[i], resolution, corner
                     )

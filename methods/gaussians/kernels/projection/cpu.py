@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bench.types import Camera
 from methods.gaussians.kernels.projection import BLUR, FRUSTUM, LEAST_ALPHA, NEAR, Ellipses
-from methods.kernels.cpu import arrays, check_float32, f32, jit
+from methods.kernels.cpu import arrays, check_float32, f32, jit, three
 
 ZERO, ONE, TWO = f32(0), f32(1), f32(2)
 BLUR32, NEAR32, INFINITE = f32(BLUR), f32(NEAR), f32(np.inf)
@@ -52,11 +52,6 @@ def _view(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     limits = FRUSTUM * 0.5 * camera.width / camera.fx, FRUSTUM * 0.5 * camera.height / camera.fy
     intrinsics = np.array((camera.fx, camera.fy, camera.cx, camera.cy, *limits), np.float32)
     return np.ascontiguousarray(pose[:, :3].T), np.ascontiguousarray(pose[:, 3]), intrinsics
-
-
-@jit()
-def _row(matrix, row):
-    return matrix[row, 0], matrix[row, 1], matrix[row, 2]
 
 
 @jit()
@@ -132,7 +127,7 @@ def _forward(given, world, origin, view, out):
 def _project(block, size, world, origin, view):
     """Rows of the block: means, scales, quaternions and reach; centres, conics, depth, extents."""
     fx, fy, cx, cy, limit_x, limit_y = view
-    w0, w1, w2 = _row(world, 0), _row(world, 1), _row(world, 2)
+    w0, w1, w2 = three(world, 0), three(world, 1), three(world, 2)
     centre = origin[0], origin[1], origin[2]
     for i in range(size):  # one array and no branch: LLVM makes vectors of it
         z, inverse, u, v, tx, ty = _place(block, i, w0, w1, w2, centre, limit_x, limit_y)
@@ -183,8 +178,8 @@ def _differentiate(block, size, world, origin, view):
     conics; gradients of means, scales and quaternions.
     """
     fx, fy, _, _, limit_x, limit_y = view
-    w0, w1, w2 = _row(world, 0), _row(world, 1), _row(world, 2)
-    c0, c1, c2 = _row(world.T, 0), _row(world.T, 1), _row(world.T, 2)
+    w0, w1, w2 = three(world, 0), three(world, 1), three(world, 2)
+    c0, c1, c2 = three(world.T, 0), three(world.T, 1), three(world.T, 2)
     centre = origin[0], origin[1], origin[2]
     for i in range(size):  # one array and no branch: LLVM makes vectors of it
         _, inverse, u, v, tx, ty = _place(block, i, w0, w1, w2, centre, limit_x, limit_y)

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from numba import prange
 from torch import Tensor
-from torch.nn import functional
 
 from methods.kernels.cpu import (
     LANES,
@@ -23,6 +22,7 @@ from methods.kernels.cpu import (
     prefetch,
     prefetch_row,
     tall,
+    whole_lanes,
 )
 from methods.kilonerf.kernels.grouped_mlp import HIDDEN, POSITION_FREQUENCIES, Networks
 
@@ -101,19 +101,13 @@ def colours(geometry: Tensor, encoded: Tensor, networks: Networks) -> Tensor:
     return raw.sigmoid_()
 
 
-def _whole_vectors(tensor: Tensor) -> Tensor:
-    """The last dimension filled up with zeros to a multiple of `LANES`."""
-    idle = -tensor.shape[-1] % LANES
-    return functional.pad(tensor, (0, idle)) if idle else tensor
-
-
 class _Linear(torch.autograd.Function):
     """Computes outputs and input gradients in whole vectors, and cuts off the excess."""
 
     @staticmethod
     def forward(ctx, inputs, weights, biases, offsets, relu):
         outputs = weights.shape[2]
-        weights, biases = _whole_vectors(weights), _whole_vectors(biases)
+        weights, biases = whole_lanes(weights), whole_lanes(biases)
         out = torch.empty(len(inputs), weights.shape[2])
         _linear(*arrays(inputs, weights, biases, offsets), relu, out.numpy())
         ctx.save_for_backward(inputs, weights, offsets, out)
@@ -124,7 +118,7 @@ class _Linear(torch.autograd.Function):
     def backward(ctx, grad):
         inputs, weights, offsets, out = ctx.saved_tensors
         outputs, wanted = grad.shape[1], ctx.needs_input_grad[0]
-        grad = _whole_vectors(grad)
+        grad = whole_lanes(grad)
         grads = torch.empty(weights.shape), torch.empty(len(weights), out.shape[1])
         channels = inputs.shape[1]
         grad_inputs = torch.empty(len(inputs) if wanted else 0, channels + -channels % LANES)

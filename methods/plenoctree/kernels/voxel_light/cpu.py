@@ -17,6 +17,7 @@ from methods.kernels.cpu import (
     arrays,
     check_float32,
     f32,
+    f64,
     jit,
     prefetch,
     prefetch_row,
@@ -41,7 +42,6 @@ NEAR = 64
 
 AHEAD = 16  # voxels between the one that is asked for and the one that is read
 
-f64 = np.float64
 ONE, TWO, THREE = u64(1), u64(2), u64(3)
 
 
