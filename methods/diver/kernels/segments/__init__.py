@@ -3,9 +3,8 @@ corners in the mean of the features, and pixels (DIVeR: Wu et al. 2022, Sections
 
 The features of a segment are the mean of their trilinear interpolant along it. A small network
 decodes them: they pass a ReLU and a hidden layer. One output is the density, integrated over the
-segment already; the others, with the direction of the ray, give its colour. Wrong shapes raise
-ValueError, as do with backend="cpu" other numbers than float32, and layers whose width is no
-multiple of 16.
+segment already; the others, with the direction of the ray, give its colour. With backend="cpu",
+layers whose width is no multiple of 16 raise ValueError.
 """
 
 from dataclasses import dataclass

@@ -4,7 +4,6 @@ alpha_i = min(LARGEST_ALPHA, o_i exp(-(A x^2 + 2 B x y + C y^2) / 2)), 0 below L
 T_i = prod_{j<i} (1 - alpha_j),  w_i = T_i alpha_i,
 values = sum w_i c_i,  depth_sum = sum w_i z_i,  alpha = sum w_i
 at the centre of every pixel, with (x, y) relative to the centre of the ellipse, in depth order.
-Wrong shapes raise ValueError, as do other numbers than float32 with backend="cpu".
 """
 
 from torch import Tensor

@@ -2,8 +2,7 @@
 
 A Gaussian with rotation R and scales s has the covariance V = (R diag s) (R diag s)^T. Seen by a
 camera with rotation W, its ellipse has the covariance V' = J W V W^T J^T + BLUR I, where J is the
-derivative of the projection at its centre. Wrong shapes raise ValueError, as do other numbers than
-float32 with backend="cpu".
+derivative of the projection at its centre.
 """
 
 from dataclasses import dataclass

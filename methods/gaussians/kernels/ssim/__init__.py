@@ -17,8 +17,7 @@ def ssim(picture: Tensor, target: Tensor, *, backend: str = "auto") -> Tensor:
     """Mean structural similarity of two pictures [H, W, 3] in [0, 1]; a scalar.
 
     The mean is over all pixels and channels; beyond the border both pictures are black.
-    Differentiable in `picture`. Wrong shapes raise ValueError, as do with backend="cpu" a `target`
-    that needs a gradient, and other numbers than float32.
+    Differentiable in `picture`. With backend="cpu" a `target` that needs a gradient is refused.
     """
     check_shape("picture", picture, None, None, 3)
     check_shape("target", target, *picture.shape)

@@ -6,8 +6,7 @@ samples are computed. All networks have the layers of KiloNeRF (Figure 2):
 hidden = relu(mid(relu(in(encoding of the position)))), density = density(hidden),
 colour = sigmoid(colour(relu(direction(feature(hidden), encoding of the direction))))
 
-`feature` is not followed by a ReLU. The density has no activation here. Wrong shapes raise
-ValueError, as do other numbers than float32 with backend="cpu".
+`feature` is not followed by a ReLU. The density has no activation here.
 """
 
 from collections.abc import Mapping

@@ -1,8 +1,7 @@
 """Colours of voxels that hold a density and spherical harmonics: pixels, and samples to train on.
 
 A voxel has the opacity 1 - exp(-sigma delta) over a length delta, and shows sigmoid(sum_k c_k
-Y_k(d)) in direction d (Yu et al. 2021, Eq. 1 to 3). Wrong shapes raise ValueError, as do other
-numbers than float32 with backend="cpu".
+Y_k(d)) in direction d (Yu et al. 2021, Eq. 1 to 3).
 """
 
 from dataclasses import dataclass
