@@ -15,7 +15,7 @@ from methods.diver.model import CornerModel, Decoder
 from methods.diver.training import DiverLessons, DiverTraining
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.corner_gather import CORNERS
-from methods.kernels.settings import Fraction, Only
+from methods.kernels.settings import Fraction, multiple
 from methods.kernels.types import Occupancy, Pixels
 from methods.rendering.compaction import to_host
 from methods.rendering.frame import Render
@@ -84,17 +84,13 @@ class Baked:
         return pixels
 
 
-def _whole(resolution: int) -> bool:
-    return 16 <= resolution <= 512 and not resolution % 16  # looked up in bricks of bricks
-
-
 @dataclass(kw_only=True, eq=False)
 class Diver(Student):
     """Corner features of sparse voxels, integrated along rays and decoded by a small network; its
     settings are explained in `sweeps/configs/method/diver.yaml`."""
 
     training: DiverLessons
-    resolution: Annotated[int, Only("a multiple of 16 up to 512", _whole)]
+    resolution: Annotated[int, multiple(16, 512)]  # cells are looked up in bricks of bricks
     stored: Stored
     faint: Fraction
 

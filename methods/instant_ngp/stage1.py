@@ -69,9 +69,8 @@ class Setup:
 
     def suited(self, scene: Scene) -> Setup:
         """This setup with the hash table that `scene` needs, if it leaves that to the scene."""
-        return (
-            replace(self, grid=self.grid.of(scene)) if isinstance(self.grid, SuitedGrid) else self
-        )
+        grid = self.grid.of(scene) if isinstance(self.grid, SuitedGrid) else self.grid
+        return replace(self, grid=grid)
 
     def key(self, scene: Scene, budget: Budget) -> dict[str, object]:
         """Everything the trained field depends on."""

@@ -21,6 +21,16 @@ class Only:
         expect(value is None or self.holds(value), name, self.expected, value)
 
 
+def between(least: int, most: int) -> Only:
+    """A whole number in a range."""
+    return Only(f"{least} to {most}", lambda x: least <= x <= most)
+
+
+def multiple(step: int, most: int) -> Only:
+    """A multiple of `step`, more than 0."""
+    return Only(f"a multiple of {step} up to {most}", lambda x: 0 < x <= most and not x % step)
+
+
 class Checked:
     """Base of dataclasses of settings: those whose types are `Annotated` with `Only` are checked.
     Errors put `prefix` before their names."""
@@ -45,5 +55,5 @@ Share = Annotated[float, Only("a share in [0, 1]", lambda x: 0 <= x <= 1)]
 SomeShare = Annotated[float, Only("a share in (0, 1]", lambda x: 0 < x <= 1)]
 Fraction = Annotated[float, Only("0 or more and less than 1", lambda x: 0 <= x < 1)]
 Count = Annotated[int, Only("1 or more", lambda x: x >= 1)]
-Degree = Annotated[int, Only("0 to 3", lambda x: x in range(4))]
+Degree = Annotated[int, between(0, 3)]
 Steps = Annotated[int | None, Only("1 or more, or none", lambda x: x >= 1)]

@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from bench.types import Budget, Scene
 from methods.instant_ngp.stage1 import TrainedField
-from methods.kernels.settings import Count, NotNegative, Only
+from methods.kernels.settings import Count, NotNegative, between
 from methods.kilonerf.field import Grid, KiloField, Pieces, place_networks
 from methods.students.fields import FieldLessons, FieldStudent, StudentTraining
 from methods.students.method import IN_FP32
@@ -70,7 +70,7 @@ class KiloNerf(FieldStudent):
     32."""
 
     training: KiloLessons
-    networks: Annotated[int, Only(f"1 to {MOST}", lambda x: 1 <= x <= MOST)]
+    networks: Annotated[int, between(1, MOST)]
 
     kind, model, computed = "kilonerf", ("networks",), IN_FP32
 

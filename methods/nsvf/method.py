@@ -8,14 +8,12 @@ import torch
 
 from bench.types import Budget, Scene
 from methods.instant_ngp.stage1 import TrainedField
-from methods.kernels.settings import Length, Only
-from methods.kernels.types import BRICK, Occupancy, expect
+from methods.kernels.settings import Length, multiple
+from methods.kernels.types import BRICK, LARGEST_SIDE, Occupancy, expect
 from methods.nsvf.field import EMBEDDING, NsvfField
 from methods.rendering.sampling import Sampling
 from methods.students.fields import FieldLessons, FieldStudent, StudentTraining
 from methods.students.voxels import occupied_voxels
-
-WHOLE = Only(f"a multiple of {BRICK**2}", lambda x: x > 0 and not x % BRICK**2)
 
 
 @dataclass(kw_only=True, eq=False)
@@ -23,7 +21,7 @@ class Nsvf(FieldStudent):
     """A neural sparse voxel field with voxels where the field that it starts from is occupied."""
 
     training: FieldLessons
-    resolution: Annotated[int, WHOLE]  # voxels along a side of the cube
+    resolution: Annotated[int, multiple(BRICK**2, LARGEST_SIDE)]  # voxels along a side of the cube
     step: Length  # length of a step of the rays in voxels, in training and rendering
 
     kind, model = "nsvf", ("resolution", "step")

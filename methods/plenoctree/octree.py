@@ -17,7 +17,7 @@ from bench.types import Rays, SteerbenchError
 from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.composite import STOP, weights
-from methods.kernels.settings import Checked, Count, Degree, NotNegative, Only
+from methods.kernels.settings import Checked, Count, Degree, NotNegative, multiple
 from methods.kernels.spherical import spherical_harmonics
 from methods.kernels.types import Occupancy, expect
 from methods.kernels.voxel_walk import BRICK, Crossings, Voxels
@@ -87,15 +87,11 @@ def _half(values: Tensor) -> Tensor:
     return values.clamp(-most, most).half().float()
 
 
-def _whole(resolution: int) -> bool:
-    return RESOLUTION <= resolution <= 2048 and not resolution % RESOLUTION
-
-
 @dataclass(frozen=True)
 class Extraction(Checked):
     """How leaves are found and filled, as `sweeps/configs/method/plenoctree.yaml` explains."""
 
-    resolution: Annotated[int, Only(f"a multiple of {RESOLUTION} up to 2048", _whole)]
+    resolution: Annotated[int, multiple(RESOLUTION, 2048)]
     degree: Degree
     least_weight: NotNegative
     rays: Count

@@ -15,6 +15,7 @@ from methods.kernels.settings import (
     Share,
     SomeShare,
     Stop,
+    between,
 )
 from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import Sampling
@@ -24,11 +25,9 @@ from methods.rendering.sampling import Sampling
 class ModelOptions(Checked):
     """What a SteerNeRF is trained for: changing any of it requires training again."""
 
-    # K, number of features of the field; the first three are RGB.
-    channels: Annotated[int, Only("3 to 256", lambda x: 3 <= x <= 256)]
-    frames: Annotated[int, Only("0 to 64", lambda x: 0 <= x <= 64)]  # L, preceding ones
-    # s; the field is rendered at 1/s of the resolution.
-    scale: Annotated[int, Only("1 to 64", lambda x: 1 <= x <= 64)]
+    channels: Annotated[int, between(3, 256)]  # K features of the field; the first three are RGB
+    frames: Annotated[int, between(0, 64)]  # L, number of preceding frames
+    scale: Annotated[int, between(1, 64)]  # s; the field is rendered at 1/s of the resolution
     step: Length  # of the march at low resolution, in diagonals of the cube / 1024
     stop: Stop  # transmittance at which a ray ends
     feature_background: float  # what features beyond RGB are composited on

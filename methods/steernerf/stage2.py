@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -15,7 +16,7 @@ from bench.types import Budget, Log, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.instant_ngp.training import FieldOptimiser, restore_field
 from methods.kernels import multiplies_bf16
-from methods.kernels.types import expect
+from methods.kernels.settings import Checked, Only
 from methods.rendering.batch import opacity_entropy
 from methods.rendering.occupancy import EVERY
 from methods.steernerf.distillation import distilled_views
@@ -29,23 +30,21 @@ from methods.training.muon import Muon
 MARKS = (0.125, 0.25, 0.5)
 """Shares of the steps after which the weights are saved as well: an ablation becomes a curve."""
 
+SAVED = Only(f"{', '.join(map(str, MARKS))} or 1", lambda x: x in (*MARKS, 1))
+
 MUON = 5
 """Muon's learning rate, in those of Adam: the root mean square of its updates is then Adam's
 rate."""
 
 
 @dataclass(frozen=True)
-class Stage2:
+class Stage2(Checked):
     """What is trained in stage 2, and how."""
 
     model: ModelOptions  # the settings it is trained for
     renderer: partial[UNet]  # makes the 2D renderer for K, L and s
     joint: JointOptions  # how it is trained
-    after: float  # share of the steps whose weights are used, 1 or one of `MARKS`
-
-    def __post_init__(self) -> None:
-        marks = ", ".join(map(str, MARKS))
-        expect(self.after in (*MARKS, 1), "after", f"{marks} or 1", self.after)
+    after: Annotated[float, SAVED]  # share of the steps whose weights are used
 
     def key(self, budget: Budget) -> dict[str, object]:
         """Everything that the training depends on, besides the field of stage 1."""
