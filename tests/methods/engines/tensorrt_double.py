@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import json
+import math
 from collections.abc import Sequence
 from enum import Enum, IntEnum
 from pathlib import Path
@@ -17,8 +18,6 @@ import numpy as np
 import onnxruntime
 
 __version__ = "11.4.0"
-
-ONNX_TYPES = {"tensor(float)": np.float32}
 
 
 class Logger:
@@ -120,26 +119,19 @@ class CudaEngine:
         return True
 
     def get_tensor_shape(self, name: str) -> tuple[int, ...]:
-        zeros = {x: np.zeros(self._shapes[x], kind) for x, kind in self._kinds().items()}
+        zeros = {x: np.zeros(shape, np.float32) for x, shape in self._shapes.items()}
         return self._session.run([name], zeros)[0].shape
 
     def execute_async_v3(self, stream_handle: int) -> bool:
-        kinds = self._kinds().items()
-        arrays = {x: self._memory(x, self._shapes[x], kind) for x, kind in kinds}
-        names = [x.name for x in self._session.get_outputs()]
-        for name, value in zip(names, self._session.run(names, arrays), strict=True):
-            self._memory(name, value.shape, value.dtype)[...] = value
+        given = {name: self._memory(name, shape) for name, shape in self._shapes.items()}
+        (output,) = self._session.get_outputs()
+        (value,) = self._session.run([output.name], given)
+        self._memory(output.name, value.shape)[...] = value
         return True
 
-    def _kinds(self) -> dict[str, type[np.generic]]:
-        return {x.name: ONNX_TYPES[x.type] for x in self._session.get_inputs()}
-
-    def _memory(
-        self, name: str, shape: tuple[int, ...], dtype: type[np.generic] | np.dtype
-    ) -> np.ndarray:
-        size = int(np.prod(shape)) * np.dtype(dtype).itemsize
-        raw = (ctypes.c_char * size).from_address(self._addresses[name])
-        return np.frombuffer(raw, dtype).reshape(shape)
+    def _memory(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
+        raw = (ctypes.c_float * math.prod(shape)).from_address(self._addresses[name])
+        return np.frombuffer(raw, np.float32).reshape(shape)
 
 
 class Stream:
