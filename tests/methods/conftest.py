@@ -56,6 +56,11 @@ class Work(NullProbe):
         self.done[name] += int(done)
 
 
+@pytest.fixture(scope="session", params=["reference", "cpu"])
+def backend(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
 @pytest.fixture(scope="session")
 def ball_scene() -> Scene:
     """24 training and 3 test pictures of a coloured ball on white."""

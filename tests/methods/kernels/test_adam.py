@@ -8,10 +8,7 @@ import torch
 from methods.kernels.adam import AdamState, hash_adam_, sparse_adam_
 from methods.kernels.encode import HashGrid, SampleGradients, encode, pack
 
-BACKENDS = ["reference", "cpu"]
 
-
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_an_entry_makes_the_steps_of_adam_at_which_it_has_a_gradient(backend: str) -> None:
     """As if it were alone, whatever the others do; torch leaves out what has no gradient."""
     generator = torch.Generator().manual_seed(0)
@@ -33,7 +30,6 @@ def test_an_entry_makes_the_steps_of_adam_at_which_it_has_a_gradient(backend: st
     assert state.steps.tolist() == [int(optimiser.state[x]["step"]) for x in entries]
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("features", [1, 2, 3])
 def test_the_step_of_collected_gradients_is_that_of_their_sum(backend: str, features: int) -> None:
     """To the bit, as both add up in the order of the samples; over parts, levels and steps."""

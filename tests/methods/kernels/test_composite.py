@@ -15,8 +15,6 @@ from methods.kernels.composite import composite, visible, weights
 from methods.kernels.composite.experiments import exact, slope
 from methods.kernels.types import Intervals, Pixels, offsets_of
 
-BACKENDS = ["reference", "cpu"]
-
 Inputs = tuple[Tensor, Tensor, Intervals]
 
 
@@ -68,7 +66,6 @@ def part(inputs: Inputs, index: Tensor, counts: list[int]) -> Inputs:
 CHANNELS_APART, RAYS_APART, SPLIT = "channels apart", "rays apart", "behind a front half"
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("how", [CHANNELS_APART, RAYS_APART, SPLIT])
 @hypothesis.given(
     counts=st.lists(st.integers(1, 64), min_size=1, max_size=12), seed=st.integers(0, 2**31)
@@ -100,7 +97,6 @@ def test_pixels_composited_in_parts_are_those_of_one_go(how, backend, counts, se
         assert error <= (0 if equal else 64 * most * U32), name
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_visible_samples_are_those_with_a_weight_which_is_the_gradient_of_their_value(backend):
     """Behind pixels in front, which stay as they were."""
     sigma, values, where = samples([40, 0, 1, 25], channels=1)

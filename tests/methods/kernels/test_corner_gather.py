@@ -21,7 +21,6 @@ def test_weights_have_a_gradient_by_the_reference_only():
         corner_gather(table, CORNERS, VOXEL, weights, backend="cpu")
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
 @pytest.mark.parametrize(
     ("read", "rest", "shape"),
     [

@@ -42,7 +42,6 @@ def test_gradients_in_float64() -> None:
     )
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
 @pytest.mark.parametrize("asked", [False, True])
 def test_gradients_of_samples_are_collected_whether_or_not_the_table_asks_for_its_own(
     backend: str, asked: bool
@@ -61,7 +60,6 @@ def test_gradients_of_samples_are_collected_whether_or_not_the_table_asks_for_it
     assert table.grad is None
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_a_position_that_is_not_a_number_spoils_its_own_features_alone(backend: str) -> None:
     table = random_table(GRID, torch.float32).requires_grad_()
     positions = torch.rand(70, 3, generator=torch.Generator().manual_seed(0))

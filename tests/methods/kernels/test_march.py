@@ -10,7 +10,6 @@ from methods.kernels.march import extents, march
 from methods.kernels.types import Occupancy
 
 STEP = math.sqrt(3) / 1024
-BACKENDS = ["reference", "cpu"]
 
 
 def full() -> Occupancy:
@@ -68,7 +67,6 @@ def test_samples_are_the_steps_in_occupied_cells(jitter):
     assert grid.holds(places).all()
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_extents_are_those_of_what_is_marched_and_change_nothing(backend):
     rays, grid = rays_through_the_cube(50), dust(4)
     samples = march(rays, grid, STEP, backend=backend)
@@ -83,7 +81,6 @@ def test_extents_are_those_of_what_is_marched_and_change_nothing(backend):
     assert extents(none, grid, STEP, 20, backend=backend) == []
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("limit", [1, 40, 1024])
 def test_a_window_leaves_samples_out_and_moves_none(backend, limit):
     grid = dust(4)
@@ -111,7 +108,6 @@ def test_a_window_leaves_samples_out_and_moves_none(backend, limit):
     assert torch.equal(positions, whole.positions[inside])
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_rays_that_miss_or_make_no_sense_have_no_samples(backend):
     nan, inf = math.nan, math.inf
     origins = torch.tensor([[2.0, 2, 2], [0.5, 0.5, 0.5], [nan, 0, 0], [0.5, 0.5, 0.5], [0.5] * 3])

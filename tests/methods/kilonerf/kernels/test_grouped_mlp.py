@@ -2,14 +2,11 @@
 
 import math
 
-import pytest
 import torch
 from torch import nn
 
 from bench.case import U32
 from methods.kilonerf.kernels.grouped_mlp import SHAPES, Networks, colours, densities
-
-both = pytest.mark.parametrize("backend", ["reference", "cpu"])
 
 
 def networks(count: int) -> tuple[Networks, list[dict[str, nn.Linear]]]:
@@ -26,7 +23,6 @@ def networks(count: int) -> tuple[Networks, list[dict[str, nn.Linear]]]:
     return few, modules
 
 
-@both
 def test_they_are_those_of_torch_one_by_one(backend):
     few, modules = networks(4)
     numbers = torch.tensor([2, -1, 0, 2, 3, 0, 2, -1, 2, 2, 2, 2, 2])
@@ -60,7 +56,6 @@ def test_the_hidden_channels_have_a_gradient_even_of_networks_that_stay():
     assert grads[0].any()
 
 
-@both
 def test_nan_stays_with_its_sample(backend):
     few, _ = networks(1)
     positions = torch.zeros(12, 3)
