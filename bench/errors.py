@@ -1,9 +1,12 @@
 """Errors for users. Not in `bench.types`, so that the command line need not load torch."""
 
+import importlib
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
 
 NAMED = 5  # an error names at most this many things and gives the number of the rest
 
@@ -68,6 +71,18 @@ def some(names: Sequence[str]) -> str:
 def install_command(extra: str) -> str:
     """The command that installs an `extra` of this project from its folder."""
     return f'pip install -c constraints.txt -e ".[{extra}]"'
+
+
+def optional(library: str, extra: str, needed_by: str, otherwise: str = "") -> Any:
+    """Import a `library` of an `extra`; raises Unavailable without it, which says what it is
+    `needed_by`, how to install it, and what can be done `otherwise`."""
+    try:
+        with warnings.catch_warnings():  # those of others about others
+            warnings.simplefilter("ignore")
+            return importlib.import_module(library)
+    except ImportError as error:
+        how = f"{install_command(extra)}{otherwise}"
+        raise Unavailable(f"{needed_by} needs {error.name or error}: {how}") from error
 
 
 @contextmanager

@@ -19,9 +19,10 @@ import numpy as np
 import pandas as pd
 
 from bench.errors import explained, unexpected
+from bench.records import read_json
 from bench.results import IMPORTED, STEADY, Measurement
 from bench.rows import row_table, score_rows, single
-from bench.scenes.files import describe, read_json
+from bench.scenes.files import describe
 from bench.types import Camera
 
 VERSION = "1.2.12"
@@ -111,7 +112,7 @@ def read_results(file: Path) -> tuple[Measurement, dict[str, Any]]:
     figures do not match their checksum.
     """
     file = file.resolve()
-    record = read_json(file.parent, file.name)
+    record = read_json(file)
     record.pop("metrics", None)  # means, of which one perfect frame makes the PSNR infinite
     try:
         json.dumps(record, allow_nan=False)

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from bench.cameras import move_camera
 from bench.errors import unexpected
+from bench.records import read_json
 from bench.scenes.export import data_camera
 from bench.scenes.files import (
     describe,
@@ -28,7 +29,6 @@ from bench.scenes.files import (
     numbers_of,
     opengl_pose,
     opengl_to_opencv,
-    read_json,
     rigid_pose,
     whole_number,
 )
@@ -69,7 +69,7 @@ def read_path(
     undone. What a user should know is added to `remarks`.
     Raises SteerbenchError if the file is damaged or has no cameras, or a pose is not rigid.
     """
-    record = read_json(file.parent, file.name, LISTED)
+    record = read_json(file, listed=LISTED)
     name = next((name for name in FORMS if name in record), None)
     if name is None:
         raise unexpected(file, READ, ", ".join(record) or "an empty object")
@@ -160,7 +160,7 @@ def _out_of_model(
         how = "if they are a model's, copy its file there, or trajectory.transforms=FILE"
         remarks.add(file, kind, how)
         return cameras
-    saved, forth = read_json(model.parent, model.name), torch.eye(4).double()
+    saved, forth = read_json(model), torch.eye(4).double()
     forth[:3] = matrix(saved.get("transform"), f"{model}: transform")
     forth[:3] *= number(saved.get("scale"), f"{model}: scale", 0)
     number(torch.linalg.det(forth).abs().item(), f"{model}: determinant", 0)

@@ -6,10 +6,7 @@ so that a package installed for a metric leaves the keys of trainings alone.
 """
 
 import math
-import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from types import ModuleType
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +14,7 @@ import torch
 from torch import Tensor
 
 from bench.cameras import pixel_grid, project, unproject
-from bench.errors import Unavailable, install_command, unexpected
+from bench.errors import optional, unexpected
 from bench.metrics import check_pair, declare_torchvision
 from bench.types import Camera, check_shape
 
@@ -28,6 +25,8 @@ NEEDS = {
     "jod": "the true pictures of consecutive frames",
 }
 """The further metrics of a path, and what a figure of each needs."""
+
+LEFT_OUT = ", or take it out of protocol.columns"
 
 OFFSETS = (1, 7)  # frames between the two of a warping error: what blinks, and what drifts
 SAME_SURFACE = 0.01
@@ -47,24 +46,9 @@ def flip(image: Tensor, reference: Tensor) -> float:
     return float(mean)
 
 
-def flip_package() -> ModuleType:
-    """Import `flip_evaluator`; raises Unavailable without it."""
-    with extra("flip", of="flip"):
-        import flip_evaluator
-    return flip_evaluator
-
-
-@contextmanager
-def extra(name: str, of: str) -> Iterator[None]:
-    """Around the import of an optional package: without it, raises Unavailable, which says which
-    extra of this project installs what the metric `of` needs."""
-    try:
-        with warnings.catch_warnings():  # those of others about others
-            warnings.simplefilter("ignore")
-            yield
-    except ImportError as error:
-        how = f"{install_command(name)}, or take it out of protocol.columns"
-        raise Unavailable(f"{of} needs {error.name}: {how}") from error
+def flip_package() -> Any:
+    """`flip_evaluator`; raises Unavailable without it."""
+    return optional("flip_evaluator", "flip", "flip", LEFT_OUT)
 
 
 class DepthView(NamedTuple):
@@ -123,8 +107,7 @@ def color_video_vdp(display: str) -> Any:
     Raises Unavailable without that package, SteerbenchError for an unknown display.
     """
     declare_torchvision()
-    with extra("cvvdp", of="jod"):
-        import pycvvdp
+    pycvvdp = optional("pycvvdp", "cvvdp", "jod", LEFT_OUT)
     try:
         return pycvvdp.cvvdp(display_name=display, quiet=True)
     except pycvvdp.vq_exception as error:

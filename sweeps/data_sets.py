@@ -8,8 +8,9 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from bench.errors import SteerbenchError
+from bench.records import read_json
 from bench.scenes.blender import camera_file
-from bench.scenes.files import data_folder, frames_of, read_json
+from bench.scenes.files import data_folder, frames_of
 from bench.scenes.lookup import find_all
 from bench.scenes.nsvf import picture_files
 from reports.outliers import REFERENCES
@@ -84,7 +85,7 @@ def _lack(folder: Path, layout: str) -> str:
             found: Sequence[Path | None] = picture_files(root)
         else:  # those named in the camera files
             names = [root / camera_file(split) for split in ("train", "test")]
-            frames = [one for path in names for one in frames_of(read_json(root, path.name), path)]
+            frames = [one for path in names for one in frames_of(read_json(path), path)]
             found = find_all(root, [frame["file_path"] for _, frame in frames])
     except SteerbenchError as error:
         return str(error)

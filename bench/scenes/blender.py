@@ -2,8 +2,9 @@
 
 from pathlib import Path
 
+from bench.records import read_json
 from bench.scenes.assemble import assemble, cube, describe_splits, hull_box, parse_box
-from bench.scenes.files import data_folder, read_json
+from bench.scenes.files import data_folder
 from bench.scenes.images import View
 from bench.scenes.transforms import read_views
 from bench.types import Log, Scene
@@ -53,6 +54,5 @@ def read_split(root: Path, split: str, log: Log) -> list[View]:
     path, optional = root / camera_file(split), split == "val"
     if optional and not path.exists():
         return []
-    record = read_json(root, path.name)
-    listed = read_views(root, record, path, log, every=True, optional=optional)
+    listed = read_views(root, read_json(path), path, log, every=True, optional=optional)
     return [view for _, view in listed if view]

@@ -4,7 +4,6 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bench.errors import Unavailable, install_command, unexpected
+from bench.errors import optional, unexpected
 from bench.scenes.assemble import (
     Box,
     assemble,
@@ -63,9 +62,7 @@ def load(
     """
     root = data_folder(path)
     folder = model_folder(root, model)
-    if not find_spec("pycolmap"):
-        how = install_command("colmap")
-        raise Unavailable(f"{folder}: models of COLMAP need pycolmap: {how}")
+    optional("pycolmap", "colmap", f"{folder}: a model of COLMAP")
     lists = read_lists(root, split, {}, folder)
     listed = read_views(root, images, folder, mask_folder(root, images, masks), log)
     splits = divide(listed, split_every, lists, folder, log)

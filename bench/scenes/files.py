@@ -12,7 +12,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bench import records
 from bench.errors import not_there, unexpected
 from bench.scenes.remarks import Remarks
 
@@ -27,15 +26,6 @@ def data_folder(path: str | Path) -> Path:
     if not root.is_dir():
         raise not_there(root, "a folder")
     return root.resolve()
-
-
-def read_text(root: Path, relative: str) -> str:
-    return records.read_text(root / relative)
-
-
-def read_json(root: Path, relative: str, listed: str = "") -> dict:
-    """The object in a file; a list is one whose field `listed` it is, where that is given."""
-    return records.read_json(root / relative, listed=listed)
 
 
 def entries_of(record: Mapping, name: str, path: Path) -> list[tuple[str, dict]]:

@@ -8,8 +8,9 @@ from pathlib import Path
 import torch
 
 from bench.errors import unexpected
+from bench.records import read_text
 from bench.scenes.assemble import MARGIN, Box, assemble, describe_splits
-from bench.scenes.files import data_folder, number, numbers, read_text, rigid_pose, whole_number
+from bench.scenes.files import data_folder, number, numbers, rigid_pose, whole_number
 from bench.scenes.images import View, fitted_camera, image_size
 from bench.scenes.lookup import found, in_any_case
 from bench.scenes.remarks import Remarks
@@ -41,7 +42,7 @@ def load(path: str | Path, *, downscale: int = 1, background: str = "white", log
         where = root / "pose" / f"{file.stem}.txt"
         where = in_any_case(where) or where
         camera_files.append(where)
-        rows, _ = read_matrix(where.parent, where.name)
+        rows, _ = read_matrix(where)
         camera = replace(of_all, c2w=rigid_pose(rows, str(where), remarks))
         view = View(f"rgb/{file.name}", file, camera)
         views.setdefault(SPLITS[file.name[0]], []).append(view)
@@ -60,7 +61,7 @@ def read_box(root: Path) -> Box:
     """The box of `bbox.txt` (x0 y0 z0 x1 y1 z1 and an unused voxel size), with a margin and,
     for two scenes, the further factor of `FURTHER`."""
     path = root / "bbox.txt"
-    values = [x for row in numbers(read_text(root, path.name), path) for x in row]
+    values = [x for row in numbers(read_text(path), path) for x in row]
     if len(values) not in (6, 7):
         raise unexpected(path, "x0 y0 z0 x1 y1 z1 and a voxel size", f"{len(values)} numbers")
     corners = [number(x, f"{path}: number {i + 1}") for i, x in enumerate(values[:6])]
@@ -77,7 +78,7 @@ def read_intrinsics(root: Path, picture: Path) -> Camera:
     above data that are not used. If it has a height and width, that is the size that it holds for.
     """
     path = root / "intrinsics.txt"
-    rows, size = read_matrix(root, path.name)
+    rows, size = read_matrix(path)
     first, *others = rows or [[]]
     if [len(row) for row in rows] in ([3] * 3, [4] * 3, [4] * 4):
         (fx, skew, cx, *_), (low, fy, cy, *_), last, *_ = rows
@@ -94,10 +95,10 @@ def read_intrinsics(root: Path, picture: Path) -> Camera:
     return fitted_camera(Camera(torch.empty(0), fx, fy, cx, cy, width, height), picture)
 
 
-def read_matrix(root: Path, relative: str) -> tuple[list[list[float]], list[float]]:
+def read_matrix(path: Path) -> tuple[list[list[float]], list[float]]:
     """The rows of numbers in a file, a matrix in one line as 3 or 4 of them; and, which NSVF skips,
     a line of two numbers."""
-    rows = numbers(read_text(root, relative), root / relative)
+    rows = numbers(read_text(path), path)
     sizes = [row for row in rows if len(row) == 2]
     rows = [row for row in rows if len(row) != 2]
     if len(rows) == 1 and (count := {9: 3, 12: 4, 16: 4}.get(len(rows[0]))):

@@ -13,7 +13,7 @@ import numpy as np
 from plyfile import PlyData, PlyParseError
 
 from bench.errors import unexpected
-from bench.scenes.files import read_text
+from bench.records import read_text
 from bench.scenes.lookup import found
 
 Entry = tuple[str, Sequence[Any]]
@@ -54,7 +54,7 @@ def read_points(file: Path) -> np.ndarray:
 
 def _lines(file: Path) -> Iterator[tuple[str, str]]:
     """The lines of a text but comments, and where they are."""
-    lines = read_text(file.parent, file.name).split("\n")
+    lines = read_text(file).split("\n")
     for number, line in enumerate(map(str.strip, lines), start=1):
         if not line.startswith("#"):
             yield f"{file}: line {number}", line

@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from bench.errors import unexpected
-from bench.scenes.files import describe, read_text, whole_number
+from bench.records import read_text
+from bench.scenes.files import describe, whole_number
 from bench.scenes.images import View
 from bench.scenes.lookup import bare, found, tidy
 from bench.types import Log
@@ -33,7 +34,7 @@ def read_lists(
         return (where, lists) if lists else None
     here = Path(str(split))
     file = here if here.is_file() else found(root, str(split), "scene.split", "a file of names")
-    lines = map(str.strip, read_text(file.parent, file.name).splitlines())
+    lines = map(str.strip, read_text(file).splitlines())
     names = [line for line in lines if line and not line.startswith("#")]
     if not names:
         raise unexpected(file, "names of pictures", "none")

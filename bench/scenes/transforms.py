@@ -12,6 +12,7 @@ from torch import Tensor
 
 from bench.cameras import scale_camera
 from bench.errors import unexpected
+from bench.records import read_json
 from bench.scenes.assemble import (
     Box,
     assemble,
@@ -29,7 +30,6 @@ from bench.scenes.files import (
     number,
     numbers_of,
     opengl_pose,
-    read_json,
     whole_number,
 )
 from bench.scenes.images import Fisheye, Lens, RadialTangential, View, fitted_camera, image_size
@@ -97,7 +97,7 @@ def load(
     Masks are those of `mask_path`, or instant-ngp's `dynamic_mask_NAME.png` beside a picture.
     """
     root = data_folder(path)
-    record, path = read_json(root, CAMERA_FILE), root / CAMERA_FILE
+    record = read_json(path := root / CAMERA_FILE)
     lists = read_lists(root, split, record, path)
     splits = divide(read_views(root, record, path, log), split_every, lists, path, log)
     pictures = describe_splits(splits, downscale, log)

@@ -1,14 +1,13 @@
 """`steerbench render`: renders every frame of a trajectory, as pictures and as a video."""
 
 import argparse
-import importlib
 import re
 import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from fractions import Fraction
 from pathlib import Path
-from types import ModuleType
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +15,7 @@ from omegaconf import DictConfig
 from PIL import Image
 
 from bench.console import ConsoleLog
-from bench.errors import SteerbenchError, Unavailable, explained, install_command
+from bench.errors import SteerbenchError, explained, optional
 from bench.metrics import as_bytes, quantise
 from bench.paths import write_path
 from bench.results import existing_store
@@ -45,7 +44,7 @@ def main(options: argparse.Namespace) -> int:
     if options.video:
         if trajectory.resolution == MIXED:
             raise SteerbenchError("--video: expected frames of one size, the path has several")
-        pyav(options.video)  # before any training
+        library_of(options.video)  # before any training
     methods = [trained(each, log, scene) for each in (config, *others)]
     cameras = [step.camera for step in trajectory.steps]
     drawn = "-".join(filter(None, [scene.name, *(one.name for one in methods), trajectory.name]))
@@ -92,13 +91,10 @@ def _drawn(method: Method, camera: Camera, index: int) -> np.ndarray:
     return as_bytes(quantise(frame.rgb.cpu()))
 
 
-def pyav(path: Path) -> ModuleType:
-    """The library that writes the video `path`; raises Unavailable if it is not installed."""
-    try:
-        return importlib.import_module("av")
-    except ImportError as error:
-        how = f"{install_command('video')}; without --video the pictures alone are written"
-        raise Unavailable(f"{path}: videos need PyAV: {how}") from error
+def library_of(video: Path) -> Any:
+    """The library that writes a video; raises Unavailable if it is not installed."""
+    otherwise = "; without --video the pictures alone are written"
+    return optional("av", "video", f"{video}: a video", otherwise)
 
 
 @contextmanager
@@ -109,7 +105,7 @@ def recorded(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
     Raises Unavailable without PyAV, and SteerbenchError if the file cannot be written or its ending
     is not that of a video.
     """
-    av = pyav(path)
+    av = library_of(path)
     try:
         with av.open(path, "w") as container:
             stream = container.add_stream("h264", rate=Fraction(fps).limit_denominator(1000))

@@ -6,7 +6,6 @@ The page is built on viser; it also has the knobs of the methods, and their figu
 from __future__ import annotations
 
 import argparse
-import importlib
 from collections.abc import Hashable, Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
@@ -14,7 +13,6 @@ from functools import partial
 from io import StringIO
 from itertools import chain, count
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,7 +22,7 @@ from torch.nn import functional
 
 from bench.cameras import pack_camera
 from bench.console import ConsoleLog
-from bench.errors import SteerbenchError, Unavailable, install_command
+from bench.errors import SteerbenchError, optional
 from bench.metrics import as_bytes, psnr
 from bench.paths import write_path
 from bench.study import study_of
@@ -258,12 +256,9 @@ class Viewer:
         return drawn[names.index(shown)].rgb if shown in names else first
 
 
-def viser() -> ModuleType:
+def viser() -> Any:
     """The library that serves the page; raises Unavailable if it is not installed."""
-    try:
-        return importlib.import_module("viser")
-    except ImportError as error:
-        raise Unavailable(f"view needs viser: {install_command('viewer')}") from error
+    return optional("viser", "viewer", "view")
 
 
 def _serve(host: str, port: int) -> ViserServer:
