@@ -43,12 +43,10 @@ class Published:
         return {name.split("/")[0] for name in self.hashes}
 
     def of(self, scene: str) -> dict[str, str]:
-        """The part of `hashes` that belongs to `scene`."""
         return {name: d for name, d in self.hashes.items() if name.startswith(f"{scene}/")}
 
 
 def published() -> list[Published]:
-    """All known published data sets."""
     content = tomllib.loads((LISTS / "published.toml").read_text(encoding="utf-8"))
     return [Published(name, **about) for name, about in content.items()]
 

@@ -333,7 +333,6 @@ def _draw(take: _Take, task: Task, index: int, first: Tensor | None, *, scored: 
 
 
 def _costs(record: FrameRecord) -> dict[str, float]:
-    """The figures of time and work of a frame."""
     return {
         "frame_ms": record.total_ns / 1e6,
         **({} if record.wall_ns is None else {"wall_ms": record.wall_ns / 1e6}),

@@ -60,8 +60,6 @@ class Turns:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A picture rendered by a method."""
-
     rgb: Tensor  # [H, W, 3] in [0, 1], on the CPU, rounded to 8 bits
     ms: float  # of the frame
     stages_ms: dict[str, float]  # of each stage without nested stages, longest first
@@ -79,7 +77,6 @@ class Painter:
         self._full_ms: dict[int, float] = {}  # of the latest frame, by its number of pixels
 
     def put(self, place: int, method: Method) -> None:
-        """Replace the method at `place`."""
         self.methods[place] = method
         self._sequence = None
         self._full_ms.clear()

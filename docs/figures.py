@@ -123,7 +123,6 @@ def _read(folder: Path) -> Made | None:
 
 
 def _code() -> str:
-    """A digest of all files below `CODE`."""
     digest = hashlib.sha256()
     for path in sorted(path for top in CODE for path in Path(top).rglob("*") if path.is_file()):
         if "__pycache__" not in path.parts:

@@ -248,7 +248,6 @@ def _quantity(each: Comparison) -> str:
 
 
 def _figures(each: Comparison) -> tuple[str, str, str]:
-    """The gap in the paper and here, and its interval."""
     metric, here = each.claim.metric, each.here
     ends = (told(metric, here.by + side * here.half) for side in (-1, 1))
     interval = " – ".join(ends) if here.half > 0 else ""
@@ -256,7 +255,6 @@ def _figures(each: Comparison) -> tuple[str, str, str]:
 
 
 def claim_table(comparisons: Sequence[Comparison]) -> Table:
-    """A table of `comparisons`, one line each."""
     lines = []
     for each in comparisons:
         metric = each.claim.metric

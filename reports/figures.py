@@ -154,14 +154,12 @@ class _Legend:
         self._markers = dict(zip(dict.fromkeys(others), cycle(MARKERS), strict=False))
 
     def style(self, number: int) -> dict[str, Any]:
-        """Of the line with this number."""
         first, other = self._of_lines[number]
         colour, marker = self._colours[first], self._markers[other]
         return {"marker": marker, "color": colour, "linestyle": "none"}
 
     @property
     def handles(self) -> list[Line2D]:
-        """What the legend shows."""
         styles = [(name, {"color": of, "marker": "o"}) for name, of in self._colours.items()]
         styles += [(name, {"color": "grey", "marker": of}) for name, of in self._markers.items()]
         return [Line2D([], [], linestyle="none", label=x, **style) for x, style in styles if x]
@@ -243,7 +241,6 @@ def quality_over_training(
 
 
 def _style(number: int) -> dict[str, Any]:
-    """Marker and colour of the line with this number."""
     marker, colour = MARKERS[number % len(MARKERS)], COLOURS[number % len(COLOURS)]
     return {"marker": marker, "color": colour, "linestyle": "none"}
 

@@ -37,7 +37,6 @@ class Lines:
 
     @property
     def runs(self) -> list[Run]:
-        """The runs of all lines."""
         return [run for line in self.lines for run in line.runs]
 
     def frame(self, metrics: Sequence[str]) -> pd.DataFrame:

@@ -39,14 +39,11 @@ FACTS = ("method", "scene", "budget", "precision", "seed")
 
 @dataclass(frozen=True)
 class Outlier:
-    """The key of a run that looks broken, and the reason."""
-
     key: str
     why: str
 
 
 def outliers(runs: Sequence[Run]) -> list[Outlier]:
-    """The outliers among `runs`, by all rules."""
     of_psnr = (*far_from_other_scenes(runs), *far_from_reference(runs), *int8_far_from_fp32(runs))
     return [*of_psnr, *stages_do_not_add_up(runs), *faster_with_more_pixels(runs)]
 
@@ -116,7 +113,6 @@ def faster_with_more_pixels(runs: Sequence[Run]) -> Iterator[Outlier]:
 
 
 def outlier_table(found: Sequence[Outlier], runs: Sequence[Run]) -> Table:
-    """A table of the outliers `found` that are among `runs`."""
     facts = {run.key: run.facts for run in runs}
     lines = tuple(
         (outlier.key, *(str(facts[outlier.key][name]) for name in FACTS), outlier.why)

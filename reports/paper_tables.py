@@ -151,7 +151,6 @@ class Shown:
 
     @property
     def measured(self) -> list[Repeated]:
-        """What was measured of its lines."""
         return [found for _, found in self.lines.values()]
 
     def published(self, metric: str) -> dict[str, float]:

@@ -83,7 +83,6 @@ class Figures:
 
     @classmethod
     def of(cls, run: Run, limits: Mapping[str, Limit] = LIMITS) -> Figures:
-        """The figures of `run` that have a limit."""
         values = {x: of for x, of in run.values.items() if x in limits and not math.isnan(of)}
         steady, frames = run.steady, {}
         for metric in values:
@@ -191,7 +190,6 @@ def _apart(old: float, new: float) -> float:
 
 
 def change_table(title: str, found: Sequence[Assertion]) -> Table:
-    """The changes `found`, a line each."""
     lines = []
     for change in found:
         interval = " – ".join(f"{end:+.4g}" for end in change.interval or ())

@@ -51,7 +51,6 @@ class Run:
 
     @property
     def frames(self) -> pd.DataFrame:
-        """One frame per row."""
         return self.read_frames()
 
     @property
@@ -199,12 +198,10 @@ class Repeated:
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """The keys of the stored runs behind the figures."""
         return tuple(run.key for run in self.measured)
 
     @property
     def conditions(self) -> tuple[object, ...]:
-        """See `Run.conditions`."""
         return self.runs[0].conditions if self.runs else ()
 
     def mean(self, metric: str) -> float | None:

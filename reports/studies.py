@@ -68,18 +68,16 @@ class Measured:
         return self.run.values.get(metric, math.nan)
 
     @property
-    def tail(self) -> float:
-        """How much longer the slowest frames take: 99th percentile over the median."""
-        return self.figure("frame_ms.p99") / self.figure("frame_ms.p50")
-
-    @property
     def work(self) -> dict[str, float]:
-        """The work of a frame by counter."""
         return {
             metric.removeprefix(WORK): value
             for metric, value in self.run.values.items()
             if metric.startswith(WORK) and not metric.endswith(DENSE)
         }
+
+
+Columns = Mapping[str, Callable[[Measured], str]]
+"""What a column says of a line, by its heading."""
 
 
 def pooled(found: Sequence[Measured]) -> list[Measured]:
@@ -119,7 +117,6 @@ def _paced(each: Measured, pace: float) -> Measured:
 
 
 def by_method(found: Iterable[Measured]) -> dict[str, list[Measured]]:
-    """The lines of each method, each once."""
     methods: dict[str, list[Measured]] = {}
     for each in found:
         methods.setdefault(each.line.method, []).append(each)
@@ -128,13 +125,24 @@ def by_method(found: Iterable[Measured]) -> dict[str, list[Measured]]:
 
 def accuracy(found: Sequence[Measured]) -> list[Part]:
     """Run time against error of all settings of a method, fastest first; the frontier is bold."""
+    columns: Columns = {
+        "ms / frame ↓": lambda line: decimal(line.ms, 1),
+        "of rounds": _of_rounds,
+        "PSNR, dB ↑": _psnr,
+        "lost, dB ↓": lambda line: decimal(line.lost, 2),
+        "PSNR to the first, dB ↑": _apart,
+        "better at no more time": lambda line: line.better.label if line.better else ON_FRONTIER,
+    }
     parts: list[Part] = []
     for method, lines in by_method(found).items():
         rated = on_frontier(lines)
-        plot = partial(frontier_plot, list(map(_point, rated)))
-        shows = f"{method}: error of a frame against its time, one point a setting"
-        parts.append(_accuracy_table(method, rated))
+        fastest_first = sorted(rated, key=lambda line: line.ms)
+        best = frozenset((row, 0) for row, x in enumerate(fastest_first) if x.better is None)
+        title = f"{method}: run time against error of a frame,"
+        parts.append(_table(title, "setting", columns, fastest_first, best))
         if sum(math.isfinite(line.figure("psnr")) for line in rated) > 1:
+            plot = partial(frontier_plot, list(map(_point, rated)))
+            shows = f"{method}: error of a frame against its time, one point a setting"
             parts.append(Picture(f"frontier-{method}", shows, plot))
     return parts
 
@@ -149,7 +157,6 @@ def on_frontier(lines: Sequence[Measured]) -> list[Measured]:
 
 
 def _point(line: Measured) -> dict[str, Any]:
-    """A line as `frontier_plot` reads it."""
     return {
         "setting": line.line.label,
         "knob": line.line.group,
@@ -163,47 +170,19 @@ def _point(line: Measured) -> dict[str, Any]:
     }
 
 
-def _accuracy_table(method: str, lines: Sequence[Measured]) -> Table:
-    lines = sorted(lines, key=lambda line: line.ms)
-    cells = tuple(
-        (
-            line.line.label,
-            decimal(line.ms, 1),
-            spread(line.fastest, line.slowest),
-            decimal(line.figure("psnr"), 2),
-            decimal(line.lost, 2),
-            _apart(line),
-            line.better.label if line.better else ON_FRONTIER,
-        )
-        for line in lines
-    )
-    columns = (
-        *("setting", "ms / frame ↓", "of rounds", "PSNR, dB ↑", "lost, dB ↓"),
-        *("PSNR to the first, dB ↑", "better at no more time"),
-    )
-    bold = frozenset((row, 0) for row, line in enumerate(lines) if line.better is None)
-    title = f"{method}: run time against error of a frame, {_where(lines)}"
-    return Table(title, columns, cells, bold, _sources(lines))
-
-
 def parity(found: Sequence[Measured]) -> list[Part]:
     """Every engine and precision beside the first, torch in fp32."""
-    columns = (*COMPARED, "p99 / p50 ↓", "worst pixel ↓", "network, ms ↓", "model, MB ↓")
-    parts: list[Part] = []
-    for method, lines in by_method(found).items():
-        cells = tuple(
-            (
-                *_compared(line),
-                decimal(line.tail, 2),
-                decimal(line.figure("worst_to_first"), 4),
-                decimal(line.run.parts.get("network"), 2),
-                megabytes(line.figure("size_bytes.total")),
-            )
-            for line in lines
-        )
-        title = f"{method}: engines and precisions, {_where(lines)}"
-        parts.append(Table(title, ("engine, precision", *columns), cells, sources=_sources(lines)))
-    return parts
+    columns: Columns = {
+        **COMPARED,
+        "p99 / p50 ↓": _tail,
+        "worst pixel ↓": lambda line: decimal(line.figure("worst_to_first"), 4),
+        "network, ms ↓": lambda line: decimal(line.run.parts.get("network"), 2),
+        "model, MB ↓": lambda line: megabytes(line.figure("size_bytes.total")),
+    }
+    return [
+        _table(f"{method}: engines and precisions,", "engine, precision", columns, lines)
+        for method, lines in by_method(found).items()
+    ]
 
 
 def skips(found: Sequence[Measured]) -> list[Part]:
@@ -211,39 +190,27 @@ def skips(found: Sequence[Measured]) -> list[Part]:
     of the last line."""
     parts: list[Part] = []
     for method, lines in by_method(found).items():
-        every = lines[-1].work
-        cells = tuple(
-            (
-                *_compared(line),
-                *(_shared(line.work.get(name, 0.0), of) for name, of in every.items()),
-            )
-            for line in lines
-        )
-        columns = ("skipped", *COMPARED, *(name.replace("_", " ") for name in every))
-        title = f"{method}: mean work of a frame, and its share of all; {_where(lines)}"
-        parts.append(Table(title, columns, cells, sources=_sources(lines)))
+        every = lines[-1].work.items()
+        shares = {name.replace("_", " "): partial(_shared, name, of) for name, of in every}
+        title = f"{method}: mean work of a frame, and its share of all;"
+        parts.append(_table(title, "skipped", {**COMPARED, **shares}, lines))
     return parts
 
 
 def breakdown(found: Sequence[Measured]) -> list[Part]:
     """The ms of a frame that each of its parts takes itself, and where the host waits for a GPU."""
     there = dict.fromkeys(part for line in found for part in line.run.parts)
-    parts = [*(part for part in there if part != OTHER), OTHER]
-    cells = tuple(
-        (
-            line.line.label,
-            *(decimal(line.run.parts.get(part, 0.0), 1) for part in parts),
-            decimal(line.ms, 1),
-            spread(line.fastest, line.slowest),
-            decimal(line.tail, 2),
-            decimal(1e3 / line.ms, 2),
-            decimal(line.figure("psnr"), 2),
-        )
-        for line in found
-    )
-    columns = ("", *parts, "frame ↓", "of rounds", "p99 / p50 ↓", "FPS ↑", "PSNR, dB ↑")
-    title = f"ms of a frame, and what of it each part takes itself; {_where(found)}"
-    tables: list[Part] = [Table(title, columns, cells, sources=_sources(found))]
+    columns: Columns = {
+        **{part: partial(_part_ms, part) for part in there if part != OTHER},
+        OTHER: partial(_part_ms, OTHER),
+        "frame ↓": lambda line: decimal(line.ms, 1),
+        "of rounds": _of_rounds,
+        "p99 / p50 ↓": _tail,
+        "FPS ↑": lambda line: decimal(1e3 / line.ms, 2),
+        "PSNR, dB ↑": _psnr,
+    }
+    title = "ms of a frame, and what of it each part takes itself;"
+    tables: list[Part] = [_table(title, "", columns, found)]
     for line in found:
         if waits := line.run.record["waits"]:
             total = decimal(sum(each["waits"] for each in waits), 1)
@@ -276,7 +243,7 @@ def _scaling_table(method: str, axes: Mapping[str, Sequence[Measured]]) -> Table
     for axis, lines in axes.items():
         for line in lines:
             of_line = (write(line.figure(name)) for name, (_, write) in figures.items())
-            cells.append((line.line.label, *of_line, decimal(line.tail, 2)))
+            cells.append((line.line.label, *of_line, _tail(line)))
             sources.append((line.run.key,))
         values = [line.line.value for line in lines]
         powers = (growth(values, [line.figure(name) for line in lines]) for name in figures)
@@ -291,19 +258,18 @@ VIEWS: Mapping[str, Callable[[Sequence[Measured]], list[Part]]] = {
 }
 """What each study shows of the lines that were measured, by the name of the study."""
 
-COMPARED = ("PSNR to the first, dB ↑", "PSNR, dB ↑", "lost, dB ↓", "frame, ms ↓", "of rounds")
 
-
-def _compared(line: Measured) -> tuple[str, ...]:
-    """The label, and the cells of the columns `COMPARED`."""
-    return (
-        line.line.label,
-        _apart(line),
-        decimal(line.figure("psnr"), 2),
-        decimal(line.lost, 3),
-        decimal(line.ms, 1),
-        spread(line.fastest, line.slowest),
-    )
+def _table(
+    title: str,
+    head: str,
+    columns: Columns,
+    lines: Sequence[Measured],
+    bold: frozenset[tuple[int, int]] = frozenset(),
+) -> Table:
+    """The `lines` below `head`, and what each of the `columns` says of them."""
+    cells = tuple((x.line.label, *(write(x) for write in columns.values())) for x in lines)
+    sources = tuple((line.run.key,) for line in lines)
+    return Table(f"{title} {_where(lines)}", (head, *columns), cells, bold, sources)
 
 
 def _apart(line: Measured) -> str:
@@ -312,8 +278,35 @@ def _apart(line: Measured) -> str:
     return "the same" if apart == math.inf else decimal(apart, 1)
 
 
-def _shared(part: float, whole: float) -> str:
-    return f"{amount(part)} ({share(part, whole)})"
+def _psnr(line: Measured) -> str:
+    return decimal(line.figure("psnr"), 2)
+
+
+def _of_rounds(line: Measured) -> str:
+    return spread(line.fastest, line.slowest)
+
+
+def _tail(line: Measured) -> str:
+    """How much longer the slowest frames take: 99th percentile over the median."""
+    return decimal(line.figure("frame_ms.p99") / line.figure("frame_ms.p50"), 2)
+
+
+def _part_ms(part: str, line: Measured) -> str:
+    return decimal(line.run.parts.get(part, 0.0), 1)
+
+
+def _shared(counter: str, of: float, line: Measured) -> str:
+    done = line.work.get(counter, 0.0)
+    return f"{amount(done)} ({share(done, of)})"
+
+
+COMPARED: Columns = {
+    "PSNR to the first, dB ↑": _apart,
+    "PSNR, dB ↑": _psnr,
+    "lost, dB ↓": lambda line: decimal(line.lost, 3),
+    "frame, ms ↓": lambda line: decimal(line.ms, 1),
+    "of rounds": _of_rounds,
+}
 
 
 def _where(lines: Sequence[Measured]) -> str:
@@ -321,10 +314,6 @@ def _where(lines: Sequence[Measured]) -> str:
     facts = ("scene", "trajectory", "resolution")
     several = [dict.fromkeys(str(line.run.facts[name]) for line in lines) for name in facts]
     return ", ".join(next(iter(of)) for of in several if len(of) == 1)
-
-
-def _sources(lines: Sequence[Measured]) -> tuple[tuple[str, ...], ...]:
-    return tuple((line.run.key,) for line in lines)
 
 
 def best_instead(cost: Sequence[float], error: Sequence[float]) -> list[int]:

@@ -32,7 +32,6 @@ class Metric:
 
     @property
     def heading(self) -> str:
-        """The head of its column."""
         return f"{self.name} {self.better}".rstrip()
 
 
@@ -73,7 +72,6 @@ class Table:
 
 
 def spread(low: float, high: float) -> str:
-    """The ends of a range."""
     return f"{decimal(low, 1)} – {decimal(high, 1)}"
 
 
@@ -183,7 +181,6 @@ def _time(rows: pd.DataFrame, suffix: str) -> Table:
 
 
 def _work(rows: pd.DataFrame, suffix: str) -> Table:
-    """The work done, beside the work of a method that skips nothing."""
     value = _values(rows, "work.")
     lines = []
     for name, done in value.items():

@@ -66,7 +66,6 @@ def _stored(store: Store) -> list[Entry]:
 
 
 def read(path: Path) -> tuple[Mapping[str, Limit], list[Entry]]:
-    """The limits and the runs of a baseline."""
     try:
         held = read_record(path)
         if held["schema"] != SCHEMA:

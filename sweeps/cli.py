@@ -187,7 +187,6 @@ def _arguments(about: Mapping[str, Any]) -> Iterator[tuple[list[str], dict[str, 
 
 
 def count(text: str, at_most: float = math.inf) -> int:
-    """A whole number of at least 1."""
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"expected 1 or more, got {text}")
     if int(text) > at_most:
@@ -196,7 +195,6 @@ def count(text: str, at_most: float = math.inf) -> int:
 
 
 def positive(text: str) -> float:
-    """A finite number above 0."""
     try:
         number = float(text)
     except ValueError:

@@ -55,7 +55,6 @@ class Settings:
 
 
 def checked_settings(config: DictConfig) -> Settings:
-    """The settings in `config`, checked."""
     names = [field.name for field in fields(Settings)]
     values = {name: config[name] for name in names if name in config}
     if values.get("frame_size") is not None:
@@ -149,7 +148,6 @@ def trajectory_of(config: DictConfig, scene: Scene, log: Log) -> Trajectory:
 
 
 def scene_digest(config: DictConfig) -> str:
-    """The digest of the scene that `config` describes."""
     return _digest(*_contents(config))
 
 

@@ -99,7 +99,6 @@ class Job:
 
     @cached_property
     def settings(self) -> dict[str, Any]:
-        """The settings that determine its run."""
         return described(self.config)
 
     @cached_property
@@ -109,7 +108,6 @@ class Job:
 
     @property
     def outputs(self) -> Path:
-        """The folder of the store."""
         return Path(self.config.outputs)
 
     @property

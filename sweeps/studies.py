@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
+from itertools import chain
 from typing import Any
 
 import torch
@@ -41,7 +42,6 @@ class Subject:
 
     @cached_property
     def config(self) -> DictConfig:
-        """The composed configuration, with Hydra's own."""
         return composed(self.words, return_hydra_config=True)
 
     @property
@@ -63,16 +63,17 @@ class Subject:
 
     @property
     def engine(self) -> str:
-        """The engine that is chosen."""
         return str(self.config.hydra.runtime.choices.engine)
 
-    def engines(self) -> list[Variant]:
-        """All engines at all precisions; torch in fp32, the standard, first."""
-        return [
-            Variant(f"{name}, {precision}", (f"engine={name}", f"precision={precision}"))
-            for name, kind in engine_kinds(self.words).items()
-            for precision in kind.precisions
-        ]
+    def engines(self) -> dict[str, list[Variant]]:
+        """All precisions of each engine; torch in fp32, the standard, comes first."""
+        return {
+            engine: [
+                Variant(f"{engine}, {precision}", (f"engine={engine}", f"precision={precision}"))
+                for precision in kind.precisions
+            ]
+            for engine, kind in engine_kinds(self.words).items()
+        }
 
     def varied(self, settings: Sequence[str]) -> DictConfig:
         """The configuration with further settings; values are set without composing it again."""
@@ -89,7 +90,6 @@ class Subject:
         return {**experiments.axes(self.name), **self.study.axes}
 
     def lines(self, group: str, variants: Sequence[Variant], **more: Any) -> Iterator[StudyLine]:
-        """The lines of a group."""
         for each in variants:
             yield StudyLine(self.name, group, each.name, each.settings, **more)
 
@@ -99,7 +99,7 @@ def accuracy(subject: Subject, only: Sequence[str], trained: bool) -> Iterator[S
     declares what that is, and nothing changed. All use the same training, but those of `trained`
     knobs."""
     study = subject.study
-    standard, *others = subject.engines() if subject.has_engine else [AS_IT_IS]
+    standard, *others = chain(*subject.engines().values()) if subject.has_engine else [AS_IT_IS]
     exact = (*standard.settings, *study.exact)
     first = [Variant("everything off", exact), AS_IT_IS] if exact else [AS_IT_IS]
     knobs: dict[str, Sequence[Variant]] = {**study.knobs, **({"engine": others} if others else {})}
@@ -114,11 +114,10 @@ def accuracy(subject: Subject, only: Sequence[str], trained: bool) -> Iterator[S
 
 def parity(subject: Subject, only: Sequence[str]) -> Iterator[StudyLine]:
     """Every engine and precision, beside torch in fp32."""
-    first, *_ = subject.engines()
-    for engine, kind in engine_kinds(subject.words).items():
-        words = [(f"engine={engine}", f"precision={precision}") for precision in kind.precisions]
-        own = [x for x in subject.engines() if x.settings in words and x != first]
-        yield from subject.lines(engine, [first, *own])
+    engines = subject.engines()
+    first, *_ = chain(*engines.values())
+    for engine, own in engines.items():
+        yield from subject.lines(engine, [first, *(x for x in own if x != first)])
 
 
 def skips(subject: Subject, only: Sequence[str]) -> Iterator[StudyLine]:
@@ -136,7 +135,7 @@ def breakdown(subject: Subject, only: Sequence[str]) -> Iterator[StudyLine]:
     """Each precision of the engine, or the method as it is without one; with and without skips."""
     variants = [Variant(subject.name)]
     if subject.has_engine:
-        own = [x for x in subject.engines() if f"engine={subject.engine}" in x.settings]
+        own = subject.engines().get(subject.engine, ())
         variants = [Variant(f"{subject.name}, {each.name}", each.settings) for each in own]
     off = tuple(f"{setting}=false" for setting in subject.study.skips.values())
     if off:

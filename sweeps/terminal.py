@@ -59,7 +59,6 @@ def show_run(run: Run, heading: str) -> None:
 
 
 def say_missing(runs: Sequence[Run]) -> None:
-    """Print why figures of `runs` are missing, each reason once."""
     from reports.runs import missing_figures  # loads torch
 
     for reason in missing_figures(runs):

@@ -70,7 +70,6 @@ def _markdown(found: list[list[Assertion]]) -> str:
 
 
 def _junit(found: list[list[Assertion]]) -> str:
-    """A test case for each run and metric."""
     suite = ET.Element("testsuite", name="steerbench check")
     for each in chain(*found):
         case = ET.SubElement(suite, "testcase", classname=each.run, name=each.metric)

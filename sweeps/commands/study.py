@@ -52,7 +52,6 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _measured(jobs: Sequence[StudyJob]) -> Iterator[Measured]:
-    """The lines that the store has."""
     runs = newest(jobs[0].store)
     for job in jobs:
         for run in runs.get(job.key, ()):

@@ -148,7 +148,6 @@ class Viewer:
             self._save(browser)
 
     def stop(self) -> None:
-        """Stop the server."""
         with redirect_stdout(StringIO()):
             self.server.stop()
 

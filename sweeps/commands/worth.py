@@ -23,7 +23,7 @@ from bench.measure import Task, measure
 from bench.types import Camera, Frame, Method, NullProbe, Probe, Scene
 from methods.kernels.dispatch import forced, kernel_calls
 from reports.tables import Table, decimal
-from sweeps.configured import build, checked_settings, protocol_of, scene_of, use_threads
+from sweeps.configured import build, checked_settings, protocol_of, scene_of, trained
 from sweeps.overrides import choices, composed, swept
 from sweeps.processes import device_lock
 from sweeps.terminal import print_rows, show
@@ -75,9 +75,8 @@ def _of_method(words: Sequence[str], options: argparse.Namespace) -> list[Row]:
     def wanted(calls: Collection[str]) -> set[str]:
         return {kernel for kernel in calls if options.filter in kernel.rpartition(".")[2]}
 
-    config = composed(words)
+    config = composed([*words, "exclusive=false"])  # its device is held here
     settings = checked_settings(config)
-    use_threads(settings)
     log = ConsoleLog(Path(settings.outputs))
     scene, budget = scene_of(config), build(config, "budget")
     path = build(config, "trajectory", scene)
@@ -86,18 +85,18 @@ def _of_method(words: Sequence[str], options: argparse.Namespace) -> list[Row]:
     with device_lock(settings.device, log), tempfile.TemporaryDirectory() as folder:
         quiet = ConsoleLog(Path(folder), quiet=True)
         with kernel_calls() as in_training:
-            method = _fitted(config, scene, folder)
+            method = trained(config, quiet, scene)
         with kernel_calls() as in_frames, torch.no_grad():
             method.reset()
             for step in path.steps[: method.memory + 1]:
                 method.render(step.camera, NullProbe())
         kernels = (AS_IT_IS, *sorted(wanted(in_frames)))
         # Each line has the same training, but frames before of its own.
-        lines = [Forced(_fitted(config, scene, folder), kernel) for kernel in kernels]
+        lines = [Forced(trained(config, quiet, scene), kernel) for kernel in kernels]
         rendered = measure(lines, task, quiet)
-        trained: dict[str, list[float]] = {one: [] for one in (AS_IT_IS, *wanted(in_training))}
+        times: dict[str, list[float]] = {one: [] for one in (AS_IT_IS, *wanted(in_training))}
         for _ in range(options.repeats):
-            for kernel, seconds in trained.items():
+            for kernel, seconds in times.items():
                 seconds.append(_training_s(config, scene, kernel))
     rows = (of.rows.set_index("metric")["value"] for of in rendered)
     frame_ms = {kernel: of["frame_ms"] for kernel, of in zip(kernels, rows, strict=True)}
@@ -107,26 +106,18 @@ def _of_method(words: Sequence[str], options: argparse.Namespace) -> list[Row]:
             "kernel": kernel.rpartition(".")[2],
             "frame_ms": frame_ms[AS_IT_IS],
             "frame_ms_reference": frame_ms.get(kernel),
-            "training_s": median(trained[AS_IT_IS]),
-            "training_s_reference": median(trained[kernel]) if kernel in trained else None,
+            "training_s": median(times[AS_IT_IS]),
+            "training_s_reference": median(times[kernel]) if kernel in times else None,
         }
         for kernel in sorted(wanted(in_frames | in_training))
     ]
-
-
-def _fitted(config: DictConfig, scene: Scene, folder: str) -> Method:
-    """The method, trained, or with its training from the store in `folder`."""
-    method: Method = build(config, "method")
-    torch.manual_seed(config.seed)
-    method.fit(scene, build(config, "budget"), ConsoleLog(Path(folder), quiet=True))
-    return method
 
 
 def _training_s(config: DictConfig, scene: Scene, kernel: str) -> float:
     """How many seconds a training takes."""
     with tempfile.TemporaryDirectory() as folder, by_reference(kernel):
         begun = time.perf_counter()
-        _fitted(config, scene, folder)
+        trained(config, ConsoleLog(Path(folder), quiet=True), scene)
         return time.perf_counter() - begun
 
 
@@ -145,7 +136,6 @@ class Forced:
         return getattr(self._method, name)
 
     def render(self, camera: Camera, probe: Probe) -> Frame:
-        """The frame of the method."""
         with by_reference(self._kernel):
             return self._method.render(camera, probe)
 

@@ -71,7 +71,6 @@ def put(
 
 
 def block(low: Triple, high: Triple, paint: Texture, gloss: float = 0.0) -> Part:
-    """A box between two corners."""
     x, y, z = ((b - a) / 2 for a, b in zip(low, high, strict=True))
     _, middle, _ = along(low, high)
     return put(Cuboid((x, y, z)), paint, middle, gloss=gloss)
