@@ -42,8 +42,6 @@ def export(scene: Scene, path: Trajectory, folder: Path, layout: str, log: Log) 
     splits = {"train": scene.splits["train"], "test": Split(cameras, _Truths(scene, path), names)}
     with explained(folder):
         LAYOUTS[layout](replace(scene, splits=splits), folder, log)
-        if layout == "nerfbaselines":
-            write_path(folder / "path.json", cameras, scene, nerfbaselines=True)
 
 
 class _Truths(Sequence[Tensor]):
@@ -115,6 +113,7 @@ def _nerfbaselines(scene: Scene, folder: Path, log: Log) -> None:
         "evaluation_protocol": "default",
     }
     (folder / "nb-info.json").write_text(json.dumps(info, indent=1))
+    write_path(folder / "path.json", scene.splits["test"].cameras, scene, nerfbaselines=True)
 
 
 LAYOUTS = {"blender": _blender, "colmap": _colmap, "nerfbaselines": _nerfbaselines}

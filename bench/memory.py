@@ -10,6 +10,7 @@ import re
 import resource
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 M_TRIM_THRESHOLD, M_MMAP_MAX, M_ARENA_MAX = -1, -4, -8  # of malloc.h
@@ -42,37 +43,30 @@ class MemoryMeter:
 
     def __init__(self, device: str) -> None:
         self.peak_bytes = 0  # the highest so far
-        self._device = device
         # With all that other code keeps; also for a device of another process.
         self.of_process = not re.fullmatch(r"cuda(:\d+)?", device)
         give_back()  # what was freed earlier, say in a training
-        if not self.of_process:
-            self.source = "peak allocated on the device while rendering"
-        elif _reset_high_water_mark():
-            self.source = "peak resident memory of the process while rendering"
-        else:
-            self.source = "peak resident memory of the process since it began"
-
-    def __enter__(self) -> None:
+        self._reset: Callable[[], object] = _reset_high_water_mark
+        self._peak: Callable[[], int] = _process_peak_bytes
         if self.of_process:
-            _reset_high_water_mark()
+            since = "while rendering" if self._reset() else "since it began"
+            self.source = f"peak resident memory of the process {since}"
         else:
             import torch  # not at the top: `keep_freed` is called before it is loaded
 
-            torch.cuda.reset_peak_memory_stats(self._device)
+            self._reset = partial(torch.cuda.reset_peak_memory_stats, device)
+            self._peak = partial(torch.cuda.max_memory_allocated, device)
+            self.source = "peak allocated on the device while rendering"
+
+    def __enter__(self) -> None:
+        self._reset()
 
     def __exit__(self, *exception: object) -> None:
         self.look()
 
     def look(self) -> int:
         """The highest peak so far, also within a region."""
-        if self.of_process:
-            peak = _process_peak_bytes()
-        else:
-            import torch
-
-            peak = torch.cuda.max_memory_allocated(self._device)
-        self.peak_bytes = max(self.peak_bytes, peak)
+        self.peak_bytes = max(self.peak_bytes, self._peak())
         return self.peak_bytes
 
 

@@ -11,7 +11,7 @@ SEED = "seed"  # in a grid, it makes no lines: they are means over their seeds
 
 
 def experiment(name: str, words: Sequence[str] = ()) -> Any:
-    """What the file of an experiment holds."""
+    """What the file of an experiment holds; `words` may name folders with further ones."""
     files = choices("experiment", words)
     if name not in files:
         tables = [each for each, file in files.items() if "table" in loaded(file)]
@@ -20,16 +20,8 @@ def experiment(name: str, words: Sequence[str] = ()) -> Any:
     return loaded(files[name])
 
 
-def grid(name: str, words: Sequence[str] = ()) -> dict[str, list[str]]:
-    """The settings that the experiment `name` varies, each with its values, as it declares them.
-
-    `words` may name folders with further experiments.
-    """
-    return grid_of(experiment(name, words))
-
-
-def grid_of(declared: Any) -> dict[str, list[str]]:
-    """The same of what `experiment` returned."""
+def grid(declared: Any) -> dict[str, list[str]]:
+    """The settings that an experiment varies, each with its values, by what its file holds."""
     params = declared.get("hydra", {}).get("sweeper", {}).get("params", {})
     several = swept([f"{name}={values}" for name, values in params.items()])
     return {name: several.get(name, [str(values)]) for name, values in params.items()}
@@ -42,6 +34,6 @@ def axes(method: str) -> dict[str, Axis]:
         declared = experiment(name)
         table = declared.get("table", {})
         if "axis" in table and {"override /method": method} in declared["defaults"]:
-            ((setting, values),) = grid_of(declared).items()
+            ((setting, values),) = grid(declared).items()
             found[table["axis"]] = Axis(table["label"], setting, tuple(sorted(map(int, values))))
     return found

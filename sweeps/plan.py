@@ -5,15 +5,14 @@ from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
 from pathlib import Path
-from typing import NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
 from bench.errors import SteerbenchError, Unavailable, unexpected
 from reports.paper_tables import CURVES, METHOD, SHARES, Line, PaperTable, point
+from sweeps import experiments
 from sweeps.configured import build
 from sweeps.data_sets import DataSet, data_set_of
-from sweeps.experiments import SEED, grid
 from sweeps.measurement import Job, turns_of
 from sweeps.overrides import changed, choices, composed, setting, swept, target_of, unquoted
 from sweeps.processes import on_gpu
@@ -54,8 +53,9 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
     all lines. SteerbenchError if a word gives several values to another setting than these two.
     """
     scenes = scenes_of(words, data)
-    words, seeds = _taken(words, SEED)
-    seeds = seeds or grid(table.name, words).get(SEED, [])
+    words, seeds = _taken(words, experiments.SEED)
+    declared = experiments.grid(experiments.experiment(table.name, words))
+    seeds = seeds or declared.get(experiments.SEED, [])
     single = data is None and len(scenes) == 1
     words = words if single else _taken(words, "scene")[0]
     fixed = [f"+experiment={table.name}", *words, *([f"scene={data.layout}"] if data else [])]
@@ -76,12 +76,11 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
 
     jobs = []
     wanted = list(_wanted(table))
-    if not precisions and any("precision" in each.line.job for each in wanted):
+    if not precisions and any("precision" in line.job for _, _, line, _ in wanted):
         raise SteerbenchError(
             f"engine: {table.name} has lines at several precisions, and this engine chooses one"
         )
-    for each in wanted:
-        line = each.line
+    for block, key, line, data_set in wanted:
         if "precision" in line.job and line.job["precision"] not in precisions:
             continue
         own_settings = {name: of for name, of in line.job.items() if name not in asked}
@@ -90,7 +89,7 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
         values = [word for word in settings if word not in groups]
         repeated = line.every_seed or METHOD not in line.job
         of_line = seeds or (usual if repeated else usual[:1])
-        of_block = [name for name in scenes if each.data_set in (data_set_of(name), "")]
+        of_block = [name for name in scenes if data_set in (data_set_of(name), "")]
         for seed, name in product(of_line, of_block):
             scene = "" if single else name
             place = [] if single or data else [f"scene={name}"]
@@ -104,9 +103,9 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
             command = ["steerbench", "run", *fixed, *own, "hydra.mode=RUN"]
             parts = (f"{table.name}: {line.label}", scene, f"seed {config.seed}")
             told = ", ".join(filter(None, parts))
-            timed = experiment.in_turns and each.block != CURVES
+            timed = experiment.in_turns and block != CURVES
             turns = turns_of(table.name, config) if timed else ""
-            where = {"table": table.name, "block": each.block, "line": each.key, "scene": scene}
+            where = {"table": table.name, "block": block, "line": key, "scene": scene}
             jobs.append(Planned(config, command, told, turns, label=line.label, **where))
     return jobs
 
@@ -125,24 +124,16 @@ def _engine_here(experiment: DictConfig) -> list[str]:
     return []
 
 
-class _Wanted(NamedTuple):
-    """A line with its key, in a block of a table whose figures are of a data set."""
-
-    block: str
-    key: str
-    line: Line
-    data_set: str
-
-
-def _wanted(table: PaperTable) -> Iterator[_Wanted]:
-    """The lines of a table's blocks, then the points of its curves, which are not timed."""
+def _wanted(table: PaperTable) -> Iterator[tuple[str, str, Line, str]]:
+    """The lines of a table's blocks, then the points of its curves, which are not timed: block,
+    key, line, and the data set of its figures."""
     for data_set, lines in table.blocks.items():
         for key, line in lines.items():
-            yield _Wanted(data_set, key, line, data_set)
+            yield data_set, key, line, data_set
     for (key, line), share in product(table.lines.items(), SHARES if table.curve else ()):
         job = {**line.job, AFTER: str(share), **OF_CURVES}
         mark = replace(line, label=f"{line.label}, after {share}", job=job)
-        yield _Wanted(CURVES, point(key, share), mark, table.data_sets[0])
+        yield CURVES, point(key, share), mark, table.data_sets[0]
 
 
 def scenes_of(words: Sequence[str], data: DataSet | None = None) -> list[str]:

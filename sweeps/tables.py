@@ -15,7 +15,7 @@ from reports.comparison import shown_as
 from reports.paper_tables import METHOD, Line, PaperTable
 from sweeps.configured import check_settings
 from sweeps.data_sets import FIRST
-from sweeps.experiments import SEED, experiment, grid_of
+from sweeps.experiments import SEED, experiment, grid
 from sweeps.overrides import choices
 
 
@@ -65,7 +65,7 @@ def _table(name: str, whole: Any, data_sets: Sequence[str]) -> PaperTable:
     if any("published" in of for of in said.values()) and not own["published_on"]:
         raise unexpected(f"{where}.published_on", "what `published` was measured on", "nothing")
     own["lines"] = lines = {}
-    for key, job in _jobs(said, label, grid_of(whole), where).items():
+    for key, job in _jobs(said, label, grid(whole), where).items():
         of = {**job, **said.get(key, {})}
         published = _by_data_set(of.pop("published", {}))
         check_settings(Line, of, f"{where}.lines.{key}.", ("published", "added"))

@@ -58,11 +58,16 @@ def show_run(run: Run, heading: str) -> None:
             show(table)
 
 
+def say(line: str) -> None:
+    """Print a line as it is."""
+    console().print(line, markup=False, soft_wrap=True)
+
+
 def say_missing(runs: Sequence[Run]) -> None:
     from reports.runs import missing_figures  # loads torch
 
     for reason in missing_figures(runs):
-        console().print(reason, markup=False, soft_wrap=True)
+        say(reason)
 
 
 def write_page(

@@ -160,7 +160,6 @@ class PretendedGpu(TorchDispatchMode):
             warnings.warn_explicit(message, UserWarning, frame.f_code.co_filename, frame.f_lineno)
 
     def moved(self, tensor: Tensor, device: torch.device, waits: bool = True) -> Tensor:
-        """A copy of `tensor` on the other device."""
         if tensor.requires_grad and torch.is_grad_enabled():
             raise NotImplementedError("the pretended GPU differentiates no copies between devices")
         if waits:
@@ -239,14 +238,12 @@ _gpu: PretendedGpu
 
 
 def _each(function: Callable[[Tensor], Tensor], x: Any) -> Any:
-    """`x` with `function` of each of its tensors."""
     if isinstance(x, Tensor):
         return function(x)
     return type(x)([_each(function, part) for part in x]) if isinstance(x, list | tuple) else x
 
 
 def _tensors(x: Iterable[Any]) -> list[Tensor]:
-    """All tensors in `x`."""
     found: list[Tensor] = []
     for part in x:
         if isinstance(part, Tensor):

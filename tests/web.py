@@ -42,7 +42,6 @@ class Web(ThreadingHTTPServer):
 
 @contextmanager
 def served() -> Iterator[Web]:
-    """A server for the time of the context."""
     with Web() as web:
         thread = threading.Thread(target=web.serve_forever, args=(0.01,))
         thread.start()

@@ -15,7 +15,7 @@ from reports.regression import Assertion, Figures, change_table, changes
 from reports.runs import load_runs
 from reports.tables import decimal
 from sweeps.baseline import checked, record
-from sweeps.terminal import console, finite, show
+from sweeps.terminal import finite, say, show
 
 
 def main(options: argparse.Namespace) -> int:
@@ -27,7 +27,7 @@ def main(options: argparse.Namespace) -> int:
         used = "without" if options.record else "with"
         raise SteerbenchError(f"--{unused[0]}: expected {used} --record")
     if options.record:
-        record(options.baseline, options.outputs, options.limit, _say)
+        record(options.baseline, options.outputs, options.limit, say)
         return 0
     found = checked(options.baseline, options.outputs)
     for name, form in forms.items():
@@ -36,8 +36,8 @@ def main(options: argparse.Namespace) -> int:
     if options.json != Path("-"):
         for run in found:
             show(change_table(run[0].run, run))
-            _say(run[0].note)
-        _say(_verdict(found))
+            say(run[0].note)
+        say(_verdict(found))
     return int(any(each.verdict for each in chain(*found)))
 
 
@@ -47,7 +47,7 @@ def _compare(options: argparse.Namespace) -> int:
     old, new = load_runs(store, keys)
     rows = list(changes([Figures.of(old)], [Figures.of(new)]))
     show(change_table(" to ".join(keys), rows))
-    _say(f"PSNR between the pictures that both kept: {decimal(old.psnr_to(new), 2)} dB")
+    say(f"PSNR between the pictures that both kept: {decimal(old.psnr_to(new), 2)} dB")
     return int(any(row.verdict for row in rows))
 
 
@@ -91,7 +91,3 @@ def _write(path: Path, text: str) -> None:
     adds = str(path) == os.environ.get("GITHUB_STEP_SUMMARY")  # other steps write there, too
     with explained(path.parent), path.open("a" if adds else "w", encoding="utf-8") as file:
         file.write(text)
-
-
-def _say(line: str) -> None:
-    console().print(line, markup=False, soft_wrap=True)

@@ -19,7 +19,7 @@ from reports.tables import Table
 from sweeps.execute import Launcher, divided, run_jobs
 from sweeps.measurement import newest, of_scene
 from sweeps.studies import StudyJob, jobs_of, subjects
-from sweeps.terminal import console, show
+from sweeps.terminal import say, show
 
 
 def main(options: argparse.Namespace) -> int:
@@ -44,7 +44,7 @@ def main(options: argparse.Namespace) -> int:
             show(part)
     if within is not None:
         for text in _recommended(lines, jobs, within):
-            console().print(text, markup=False, soft_wrap=True)
+            say(text)
     folder = options.report or outputs / study
     page = publish(_page(options, parts), folder, [line.run for line in lines])
     print(f"report: {page}", file=sys.stderr)

@@ -28,5 +28,4 @@ class RememberingLog:
 
 @pytest.fixture
 def log() -> RememberingLog:
-    """A log that keeps its messages."""
     return RememberingLog()

@@ -12,7 +12,6 @@ from bench.types import SteerbenchError
 
 @pytest.fixture
 def clock() -> SimpleNamespace:
-    """The time `now`, which a test sets."""
     return SimpleNamespace(now=1000.0)
 
 

@@ -33,7 +33,6 @@ def publish(monkeypatch: pytest.MonkeyPatch, files: Mapping[str, bytes], **where
 
 
 def found(folder: Path) -> dict[str, bytes]:
-    """All files but locks, by their paths."""
     paths = [path for path in folder.rglob("*") if path.is_file() and path.name != ".lock"]
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
 

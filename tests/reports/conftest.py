@@ -40,7 +40,6 @@ FIGURES = {
 
 @pytest.fixture
 def rows() -> pd.DataFrame:
-    """The rows of one run."""
     table = pd.DataFrame.from_dict(FIGURES, "index", columns=["value", "lo", "hi"])
     table = (
         table.rename_axis("metric")
@@ -85,7 +84,6 @@ def changed(run: Run, figures: Mapping[str, float], **facts: object) -> Run:
 
 
 def elsewhere(run: Run) -> Run:
-    """`run` on another machine."""
     machine = {**run.record["machine"], "cpu": "another"}
     return replace(run, record={**run.record, "machine": machine})
 
@@ -113,7 +111,6 @@ def run(store: Store, stored_run: str) -> Run:
 
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    """The figures that would be saved."""
     figures: list[Figure] = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
     return figures
@@ -129,7 +126,6 @@ def rewrite(store: Store, key: str, **others: object) -> None:
 
 
 def rename(store: Store, key: str, method: str) -> None:
-    """Change the method of a stored run."""
     path = store.folder / key / "rows.csv"
     pd.read_csv(path).assign(method=method).to_csv(path, index=False)
     rewrite(store, key, command="steerbench run seed=5")

@@ -38,7 +38,6 @@ ALIKE = replace(RISING, alike=True)
 
 
 def between(one: list[Run], two: list[Run], metric: str = "psnr") -> Gap:
-    """The gap between two lines."""
     return gap(metric, Repeated("one", one), Repeated("two", two))
 
 

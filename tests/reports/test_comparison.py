@@ -15,8 +15,6 @@ FACTS = dict.fromkeys(("split", "trajectory", "budget", "protocol", "device"), "
 
 @pytest.fixture
 def make(rows):
-    """Makes a run with the figures of `rows`, some of them changed."""
-
     def make_run(label: str, rows=rows, digest: str = "d", **figures: float) -> Run:
         machine, scene = {"cpu": "EPYC", "threads": 2, "gpus": []}, {"digest": digest}
         run = run_of(rows.assign(**FACTS), label, machine=machine, scene=scene)
@@ -26,12 +24,10 @@ def make(rows):
 
 
 def table_of(runs):
-    """The first table of a comparison."""
     return comparison(as_lines(runs), {})[0]
 
 
 def bold(table) -> set[tuple[str, str]]:
-    """Label and column of every bold cell."""
     return {(table.lines[row][0], table.columns[column]) for row, column in table.bold}
 
 

@@ -40,7 +40,6 @@ def measured(run: Run) -> dict[Place, Repeated]:
 
 
 def cells(text: str) -> dict[str, list[str]]:
-    """The figures of each line of a LaTeX table by its label."""
     rows = [line.removesuffix(r" \\") for line in text.splitlines() if " & " in line]
     return {
         label.strip(): list(map(str.strip, row)) for label, *row in (r.split("&") for r in rows)

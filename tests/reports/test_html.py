@@ -34,11 +34,9 @@ class Parsed(HTMLParser):
         self.feed(text)
 
     def of(self, tag: str) -> list[dict[str, str]]:
-        """The attributes of every element `tag`."""
         return [attributes for name, attributes in self.elements if name == tag]
 
     def values(self, attribute: str) -> list[str]:
-        """The values of an attribute, wherever it stands."""
         return [found[attribute] for _, found in self.elements if attribute in found]
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:

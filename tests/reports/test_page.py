@@ -22,7 +22,6 @@ PARTS: list[Part] = ["# Title & more", TABLE]
 
 
 def files(folder: Path) -> dict[Path, bytes]:
-    """All files below a folder, with their contents."""
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
@@ -38,7 +37,6 @@ def linked(page: Path) -> list[Path]:
 
 @pytest.fixture
 def page(store, stored_run, tmp_path) -> Path:
-    """The page of the one stored run."""
     return write_page(store, [stored_run], tmp_path / "page")
 
 

@@ -17,7 +17,6 @@ from tests.reports.conftest import TABLES, changed, measured_of, shifted
 
 
 def of(run: Run, label: str) -> Repeated:
-    """`run` as that of a line."""
     return Repeated(label, [replace(run, label=label)])
 
 

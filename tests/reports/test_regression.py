@@ -21,7 +21,6 @@ def change(metric: str, old: list[Figures], new: list[Figures]) -> Assertion:
 
 
 def with_frames(metric: str, *figures: float) -> Figures:
-    """`OLD` with so many frames."""
     return replace(OLD, frames={metric: {str(i): value for i, value in enumerate(figures)}})
 
 

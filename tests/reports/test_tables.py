@@ -9,7 +9,6 @@ from reports import tables
 
 
 def cells(table: tables.Table) -> dict[str, tuple[str, ...]]:
-    """The figures of a table by the label of their line."""
     return {line[0]: line[1:] for line in table.lines}
 
 

@@ -26,7 +26,6 @@ USERS = {
 
 @cache
 def node(choice: str, *words: str) -> dict[str, Any]:
-    """The node of a choice as a run has it."""
     config = composed([choice, *words])[choice.partition("=")[0]]
     return OmegaConf.to_container(config, resolve=choice.startswith("method"))
 
@@ -43,7 +42,6 @@ def options(name: str, node: Any) -> Iterator[tuple[str, Field, Any]]:
 
 
 def plain(value: Any) -> Any:
-    """Sequences as tuples, of dataclasses the fields."""
     if is_dataclass(value):
         return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, dict):
@@ -52,7 +50,6 @@ def plain(value: Any) -> Any:
 
 
 def default(field: Field) -> Any:
-    """Of a field that has one."""
     return field.default if field.default_factory is MISSING else field.default_factory()
 
 

@@ -15,8 +15,6 @@ from sweeps.overrides import composed, target_of
 
 @dataclass
 class Inner:
-    """A nested part."""
-
     size: int
     kind: Literal["round", "square"] = "round"
 
@@ -43,7 +41,6 @@ class Outer:
 
 
 def built(*overrides: str) -> Outer:
-    """`Outer` from a configuration with `overrides`."""
     inner = {"_target_": f"{__name__}.Inner", "size": 3}
     node = {"thing": {"_target_": f"{__name__}.Outer", "inner": inner}}
     config = OmegaConf.merge(node, OmegaConf.from_dotlist([f"thing.{one}" for one in overrides]))

@@ -63,7 +63,6 @@ def in_turns(*levels: float, turns: str = "table") -> list[Job]:
 
 
 def measured(*levels: float, turns: str = "table") -> bool:
-    """Whether the jobs of the levels had to be measured."""
     return obtain(in_turns(*levels, turns=turns))[1]
 
 

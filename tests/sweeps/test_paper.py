@@ -71,7 +71,6 @@ def put(store: Store, source: str, job: Job, key: str = "") -> str:
 
 
 def labels(page: Path) -> list[str]:
-    """The lines of Table 3 on a page."""
     table = page.read_text().partition("| here (paper) |")[2].partition("\n\n")[0]
     lines = [line for line in table.splitlines() if line.startswith("| L = ")]
     return [line.split("|")[1].strip() for line in lines]

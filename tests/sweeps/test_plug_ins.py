@@ -52,7 +52,6 @@ def folder(steerbench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def call(steerbench, folder: Path):
-    """Call a command with the folder of the configuration."""
     return lambda command, *argv: steerbench(
         command, "--config-dir", str(folder / "configs"), *argv
     )

@@ -18,7 +18,6 @@ from tests.sweeps.conftest import CONFIGS, STAND_INS
 
 
 def stored(tmp_path: Path) -> list[Path]:
-    """The folders of whole runs."""
     return sorted(path.parent for path in tmp_path.glob("outputs/runs/*/record.json"))
 
 

@@ -23,8 +23,6 @@ TORCH = [f"torch, {precision}" for precision in engine_kinds(())["torch"].precis
 
 @pytest.fixture
 def study(steerbench):
-    """Call a study of a stand-in."""
-
     def call(command: str, method: str, *argv: str) -> Outcome:
         return steerbench(command, *STAND_INS, *ROUNDS, f"method={method}", *argv)
 

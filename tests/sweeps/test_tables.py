@@ -7,7 +7,7 @@ import pytest
 from bench.errors import SteerbenchError
 from reports.tables import QUALITY
 from sweeps.data_sets import DATA_SETS, FIRST
-from sweeps.experiments import grid
+from sweeps.experiments import experiment, grid
 from sweeps.tables import chosen
 
 _, SECOND = DATA_SETS
@@ -45,7 +45,7 @@ def test_a_second_data_set_has_its_figures_in_a_block_if_the_paper_has_any(name)
 @pytest.mark.parametrize("name", TABLES)
 def test_the_lines_of_a_table_take_every_value_of_its_grid_and_no_other(name):
     jobs = [line.job for line in TABLES[name].lines.values()]
-    for setting, (usual, *others) in grid(name).items():
+    for setting, (usual, *others) in grid(experiment(name)).items():
         assert {usual, *(job[setting] for job in jobs if setting in job)} == {usual, *others}
 
 
@@ -64,7 +64,6 @@ table:
 
 
 def declared(folder: Path, more: str = "", text: str = MINE) -> list[str]:
-    """A folder with an experiment `mine`, as a word."""
     (folder / "experiment").mkdir()
     (folder / "experiment" / "mine.yaml").write_text(f"{text}{more}")
     return [f"--config-dir={folder}"]
@@ -72,7 +71,7 @@ def declared(folder: Path, more: str = "", text: str = MINE) -> list[str]:
 
 def test_a_table_of_ones_own_has_a_line_for_each_job_of_its_grid(tmp_path):
     words = declared(tmp_path)
-    assert grid("mine", words) == {"method.level": ["0.25", "0.5"], "seed": ["0", "1"]}
+    assert grid(experiment("mine", words)) == {"method.level": ["0.25", "0.5"], "seed": ["0", "1"]}
     (table,) = chosen("mine", words)
     assert {key: (line.label, line.job) for key, line in table.lines.items()} == {
         x: (f"method.level={x}", {"method.level": x}) for x in ("0.25", "0.5")

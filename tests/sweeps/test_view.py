@@ -87,7 +87,6 @@ def browser(viewer: Viewer) -> Iterator[Page]:
 
 @pytest.fixture
 def opened(steerbench: Callable[..., Any], tmp_path: Path) -> Iterator[Callable[..., Viewer]]:
-    """Open a viewer of the stand-ins, with further words of the command."""
     viewers = []
 
     def open_(*words: str) -> Viewer:

@@ -53,7 +53,6 @@ def pose(k: int) -> list[list[float]]:
 
 
 def edit_json(path: Path, change: Callable[[dict], object]) -> None:
-    """Apply a change to the object in a JSON file."""
     record = json.loads(path.read_text())
     change(record)
     path.write_text(json.dumps(record))

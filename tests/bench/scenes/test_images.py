@@ -169,7 +169,6 @@ def files(tmp_path: Path) -> list[Path]:
 
 
 def pictures(files: list[Path], log) -> Pictures:
-    """What is known of `files`, their pixels apart."""
     views = [View(path.name, path, pinhole(5, 4)) for path in files]
     return Pictures([describe(view, 1) for view in views], log)
 
