@@ -98,8 +98,11 @@ class Store:
         return keys[0]
 
     def save(self, parts: Mapping[str, object], measurement: Measurement) -> str:
-        """Write the run made of `parts` and return its key; raises as `write` does."""
+        """Write the run made of `parts`, unless it is there, and return its key; raises as `write`
+        does."""
         key = self.key(parts)
+        if self.find(key):
+            return key
         record = {
             "schema_version": SCHEMA_VERSION,
             "run": key,

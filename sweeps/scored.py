@@ -98,9 +98,7 @@ def score(
         "scene": {"name": facts["scene"], "digest": record["truths"]},
         "budget": {"name": NOTHING},
     }
-    key = store.key(parts)
-    if store.find(key) is None:
-        store.save(parts, replace(measurement, record={**record, **more}))
+    key = store.save(parts, replace(measurement, record={**record, **more}))
     send(config, key)
     (run,) = load_runs(store, [key])
     return run

@@ -77,16 +77,10 @@ def _export(options: argparse.Namespace) -> int:
 def _import(options: argparse.Namespace) -> int:
     store, file = Store(options.outputs), options.file
     measurement, facts = read_results(file)
-    parts = {
-        "import": digest(read_results),
-        "file": sha256(file),
-        "facts": facts,
-    }
-    key = store.key(parts)
-    if store.find(key) is None:
-        command = shlex.join(["steerbench", "import", options.form, str(file)])
-        record = {**measurement.record, "command": command}
-        store.save(parts, replace(measurement, record=record))
+    parts = {"import": digest(read_results), "file": sha256(file), "facts": facts}
+    command = shlex.join(["steerbench", "import", options.form, str(file)])
+    record = {**measurement.record, "command": command}
+    key = store.save(parts, replace(measurement, record=record))
     others = [store.whole_key(run) for run in options.beside]
     imported, *runs = load_runs(store, [key, *others])
     labelled = [replace(run, label=f"{run.label}, run {run.key[:8]}") for run in runs]
