@@ -61,7 +61,7 @@ class Setup:
         multiplied = self.precision == "fp32" or multiplies_bf16(self.device.type)
         return {
             "device": str(self.device),
-            "backend": by_kernel(self.backend, method),
+            "backend": by_kernel(self.backend, method, self.device),
             "engine": "none",
             "precision": "none",
             "field_precision": self.precision if multiplied else "bf16 in fp32",
@@ -81,7 +81,7 @@ class Setup:
             "grid": asdict(self.suited(scene).grid),
             "training": asdict(self.training),
             "precision": self.precision,
-            "backend": self.backend,
+            "backend": by_kernel(self.backend, HashField, self.device),
             "device": self.device.type,
             "seed": self.seed,
             **computed_by(train_field),

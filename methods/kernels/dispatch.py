@@ -13,7 +13,7 @@ from types import ModuleType
 import torch
 
 from bench.errors import Unavailable
-from bench.provenance import sources
+from bench.provenance import ROOT, sources
 
 BACKENDS = ("reference", "cpu", "gpu")
 
@@ -37,15 +37,17 @@ def interpreted() -> bool:
 def resolve(backend: str, device: torch.device | str) -> str:
     """The name of the backend that computes on `device`.
 
-    `auto` depends only on the device: `cpu` for CPU tensors, `reference` for all others. The
-    kernels of `gpu` have never been run on a GPU, so they must be chosen by name.
+    `auto` is `cpu` for CPU tensors. For those of a GPU with Triton it stays `auto`: each kernel has
+    the backend that its trial there chose, see `implementation`. For others it is `reference`.
 
     Raises `Unavailable` if the named backend is unknown, cannot be used here, or does not compute
     on this device.
     """
     kind = torch.device(device).type
     if backend == "auto":
-        return "cpu" if kind == "cpu" else "reference"
+        if kind == "cpu":
+            return "cpu"
+        return "reference" if availability()["gpu"] or interpreted() else "auto"
     if backend not in BACKENDS:
         near = difflib.get_close_matches(backend, BACKENDS, n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
@@ -63,13 +65,16 @@ def resolve(backend: str, device: torch.device | str) -> str:
     return backend
 
 
-def by_kernel(backend: str, method: type) -> str:
-    """`backend`, with the names of the kernels that `method` imports, directly or not, and that
-    have no such version: the reference computes those. For rows."""
-    files = sources(method)
-    folders = [Path(name).parent for name in files if name.endswith("/reference.py")]
-    lacking = sorted(x.name for x in folders if (x / f"{backend}.py").as_posix() not in files)
-    return f"{backend}, but reference: {', '.join(lacking)}" if lacking else backend
+def by_kernel(backend: str, method: type, device: torch.device) -> str:
+    """What computes the kernels that `method` imports, directly or not, if `backend` is asked for:
+    the reference has those that lack such a version. For rows."""
+    folders = [Path(name).parent for name in sources(method) if name.endswith("/reference.py")]
+    found = {x.name: _computing(".".join(x.parts), backend, device) for x in folders}
+    slow = sorted(kernel for kernel, name in found.items() if name == "reference")
+    fast = "".join({*found.values()} - {"reference"})
+    if not fast or not slow:
+        return fast or "reference"
+    return f"{fast}, but reference: {', '.join(slow)}"
 
 
 @cache
@@ -88,12 +93,18 @@ def implementation(kernel: str, backend: str, device: torch.device) -> ModuleTyp
     does."""
     for called in _calls:
         called.add(kernel)
-    name = resolve(_forced.get(kernel, backend), device)
-    if name not in served(kernel):
-        name = "reference"
+    name = _computing(kernel, resolve(_forced.get(kernel, backend), device), device)
     if name == "cpu":
         _load("methods.kernels.cpu").follow_torch_threads()
     return _load(f"{kernel}.{name}")
+
+
+def _computing(kernel: str, backend: str, device: torch.device) -> str:
+    """The backend that computes `kernel` if `backend` is asked for."""
+    if backend == "auto":
+        verdict = _load("methods.kernels.trial").verdicts(str(device)).get(kernel)
+        return "gpu" if verdict and verdict.trusted else "reference"
+    return backend if backend in served(kernel) else "reference"
 
 
 @contextmanager
@@ -122,6 +133,12 @@ def served(kernel: str) -> tuple[str, ...]:
     """The backends that implement `kernel`, a package."""
     folder = Path(*importlib.import_module(kernel).__path__)
     return tuple(name for name in BACKENDS if (folder / f"{name}.py").exists())
+
+
+def kernels(having: str = "reference") -> list[str]:
+    """The packages of all kernels that have a module `having`: "reference", "cpu" or "gpu"."""
+    paths = sorted((ROOT / "methods").rglob(f"kernels/*/{having}.py"))
+    return [".".join(path.parent.relative_to(ROOT).parts) for path in paths]
 
 
 def compiled(device: str) -> list[str]:

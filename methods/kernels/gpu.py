@@ -4,6 +4,7 @@ On a machine without a GPU, the kernels run (slowly) in Triton's interpreter if 
 is set in the environment, as the tests do.
 """
 
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -21,6 +22,11 @@ def launch(
     if all(grid):
         with torch.cuda.device_of(arguments[0]):
             kernel[grid](*arguments, enable_fp_fusion=False, **options)
+
+
+def cache_folder() -> Path:
+    """Where Triton keeps what it has compiled."""
+    return Path(triton.knobs.cache.dir)
 
 
 def check_float32(**tensors: Tensor) -> None:

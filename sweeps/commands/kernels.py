@@ -13,6 +13,7 @@ from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from methods import checks
 from methods.kernels import compiled
+from methods.kernels.trial import tried_again
 from reports.tables import Table, decimal
 from sweeps.processes import device_lock
 from sweeps.terminal import print_rows, show
@@ -33,6 +34,8 @@ def main(options: argparse.Namespace) -> int:
     if not cases:
         raise SteerbenchError(f"--filter: no kernel has {options.filter!r} in its name")
     with device_lock("auto", log):
+        if device == "cuda" and "gpu" in compiled(device):
+            tried_again("cuda:0", log)
         rows = timed_rows(cases, device, compiled(device), options.repeats, log)
     show(Table("Kernels", COLUMNS, tuple(map(_line, _saving_most_first(rows)))))
     print_rows(rows)

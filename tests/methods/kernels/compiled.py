@@ -15,7 +15,8 @@ from triton.compiler import ASTSource
 
 import methods.kernels.gpu
 from bench.case import Difference
-from methods.checks import found, kernels
+from methods.checks import found
+from methods.kernels.dispatch import kernels
 
 AMPERE, ADA, HOPPER = (GPUTarget("cuda", capability, 32) for capability in (80, 89, 90))
 TYPES = {

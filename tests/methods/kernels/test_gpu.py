@@ -15,10 +15,10 @@ import pytest
 import torch
 
 from bench.case import U32, largest_error, placed
-from methods.checks import kernels
 from methods.kernels import availability
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import composite, visible, weights
+from methods.kernels.dispatch import kernels
 from methods.kernels.encode import HashGrid, encode
 from methods.kernels.march import extents, march
 from methods.kernels.march.cases import cells, some_rays

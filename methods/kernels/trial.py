@@ -1,0 +1,150 @@
+"""Which Triton kernels a GPU is trusted with: `backend=auto` takes those that are right and faster.
+
+Before the kernels are first used on a GPU, their cases run there, against the reference and in
+turns with it. A child process does that, because a wrong kernel may crash or never end. The
+verdicts are kept in Triton's cache, until the GPU, its driver, torch, Triton or the code changes.
+"""
+
+import json
+import math
+import select
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import redirect_stdout
+from functools import cache
+from hashlib import sha256
+from importlib import import_module
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from bench.case import Case, failed, timed_rows
+from bench.console import ConsoleLog
+from bench.provenance import ROOT, libraries
+from bench.sharing import locked, whole
+from bench.types import Log
+from methods.kernels.dispatch import kernels
+
+LIMIT_S = 180.0  # for the cases of one kernel, most of it for Triton's compiler
+REPEATS = 5
+
+
+class Verdict(NamedTuple):
+    """What was found of a kernel on a GPU."""
+
+    ratio: float  # time of the reference / time of the kernel; NaN: not timed
+    fault: str  # "" if it agrees with the reference
+
+    @property
+    def trusted(self) -> bool:
+        return not self.fault and self.ratio > 1
+
+    def __str__(self) -> str:
+        return self.fault or f"{self.ratio:.2g}x as fast as the reference"
+
+
+@cache
+def verdicts(device: str) -> Mapping[str, Verdict]:
+    """Of every kernel of Triton on the GPU `device`, by its package; see `tried_again`."""
+    log, file = ConsoleLog(Path()), _file(device)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with locked(file.with_suffix(".lock"), f"waits for another trial of {device}", log):
+        if not file.exists():
+            return tried_again(device, log)
+    return {name: Verdict(*found) for name, found in json.loads(file.read_text()).items()}
+
+
+def tried_again(device: str, log: Log) -> Mapping[str, Verdict]:
+    """Try every kernel of Triton on the GPU `device`, tell `log`, and keep the verdicts."""
+    name = torch.cuda.get_device_name(device)
+    log.info(f"{name}: its kernels are tried against their reference, once")
+    found = tried(kernels("gpu"), [sys.executable, "-m", __name__, device], LIMIT_S)
+    with whole(_file(device)) as new:
+        new.write_text(json.dumps(found))
+    said = "; ".join(f"{kernel.rpartition('.')[2]}: {found[kernel]}" for kernel in found)
+    log.info(f"{name}: backend=auto takes the kernels that are right and faster. {said}")
+    if any(verdict.fault for verdict in found.values()):
+        log.info("please report the output of `steerbench kernels`, which tries them again")
+    return found
+
+
+def _file(device: str) -> Path:
+    """Where the verdicts are kept."""
+    gpu = import_module("methods.kernels.gpu")
+    folders = "methods.kernels", *kernels("gpu")
+    files = (path for name in folders for path in ROOT.joinpath(*name.split(".")).glob("*.py"))
+    code = {str(path): path.read_text() for path in sorted(files)}
+    driver = Path("/proc/driver/nvidia/version")
+    where = torch.cuda.get_device_name(device), driver.read_text() if driver.exists() else ""
+    key = json.dumps([where, libraries(gpu.launch), code]).encode()
+    return gpu.cache_folder() / "steerbench" / f"{sha256(key).hexdigest()[:16]}.json"
+
+
+def tried(kernels: Sequence[str], command: Sequence[str], limit_s: float) -> dict[str, Verdict]:
+    """The verdicts of a child, `command` with the names of the `kernels`; it has `limit_s` seconds
+    for each. If it ends early, another one goes on behind the kernel at which it was."""
+    found: dict[str, Verdict] = {}
+    while left := [kernel for kernel in kernels if kernel not in found]:
+        found |= _answers(command, left, limit_s)
+    return found
+
+
+def _answers(
+    command: Sequence[str], kernels: Sequence[str], limit_s: float
+) -> Iterator[tuple[str, Verdict]]:
+    """What one child finds: of at least one kernel."""
+    with (
+        tempfile.TemporaryFile() as errors,
+        subprocess.Popen(
+            [*command, *kernels], stdout=subprocess.PIPE, stderr=errors, bufsize=0
+        ) as child,
+    ):
+        assert child.stdout is not None
+        for kernel in kernels:
+            ready, _, _ = select.select([child.stdout], [], [], limit_s)
+            if not ready:
+                child.kill()
+                yield kernel, Verdict(math.nan, f"not done after {limit_s:.0f} s")
+                return
+            if not (line := child.stdout.readline()):
+                errors.seek(0)
+                last = errors.read().decode(errors="replace").strip().rpartition("\n")[2]
+                yield kernel, Verdict(math.nan, f"exit status {child.wait()}: {last}")
+                return
+            verdict = Verdict(*json.loads(line))
+            yield kernel, verdict
+            if verdict.fault:
+                child.kill()
+                return
+
+
+def examined(cases: Sequence[Case], device: str, log: Log) -> Verdict:
+    """Check all `cases` of a kernel on `device`, and time those that are to be timed."""
+    for case in cases:
+        for cell in case.tolerances:
+            if cell[0] == "gpu" and not case.slow and failed(row := case.check(cell, device)):
+                return Verdict(math.nan, f"{case.subject}, {case.name}: {row['status']}")
+    timed = [case for case in cases if case.timed]
+    rows = timed_rows(timed, device, ("reference", "gpu"), REPEATS, log)
+    ours = [row for row in rows if row["backend"] == "gpu" and "ratio" in row]
+    took = sum(row["ms"] for row in ours)
+    return Verdict(sum(row["ms"] * row["ratio"] for row in ours) / took if took else math.nan, "")
+
+
+def main(device: str, *kernels: str) -> None:
+    """Print the verdict of each kernel as a line of JSON, up to the first that is wrong: an error
+    may have spoilt what follows in this process."""
+    for kernel in kernels:
+        with redirect_stdout(sys.stderr):
+            cases = import_module(f"{kernel}.cases").cases()
+            verdict = examined(cases, device, ConsoleLog(Path()))
+        print(json.dumps(verdict), flush=True)
+        if verdict.fault:
+            return
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

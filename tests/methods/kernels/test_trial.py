@@ -1,0 +1,90 @@
+"""The trial of Triton's kernels on a GPU, with children that play the kernels."""
+
+import math
+import sys
+
+import torch
+
+from bench.case import Case, Difference
+from bench.console import ConsoleLog
+from methods.instant_ngp.training import FieldTraining
+from methods.kernels import dispatch, trial
+from methods.kernels.trial import Verdict, examined, tried, verdicts
+
+CHILD = """
+import json, os, sys, time
+for kernel in sys.argv[1:]:
+    if kernel == "crashes":
+        print("begun\\nout of reach", file=sys.stderr)
+        os._exit(3)
+    if kernel == "hangs":
+        time.sleep(1000)
+    found = {"right": [3.0, ""], "slower": [0.5, ""], "wrong": [None, "off"]}[kernel]
+    print(json.dumps(found), flush=True)
+"""
+NAN = math.nan
+
+
+def test_a_kernel_that_crashes_hangs_or_is_wrong_takes_no_other_with_it():
+    kernels = ["wrong", "crashes", "right", "hangs", "slower"]
+    found = tried(kernels, [sys.executable, "-c", CHILD], limit_s=3.0)
+    assert list(found) == kernels
+    assert [verdict.trusted for verdict in found.values()] == [False, False, True, False, False]
+    assert [verdict.fault for verdict in found.values()] == [
+        "off",
+        "exit status 3: out of reach",
+        "",
+        "not done after 3 s",
+        "",
+    ]
+
+
+def a_case(compute, **options):
+    def prepare(device):
+        return lambda backend: (torch.as_tensor(compute(backend)),)
+
+    cells = {("reference", "fp32"): None, ("gpu", "fp32"): None, ("cpu", "fp32"): None}
+    error = Difference(prepare, lambda: [1e-6])
+    return Case("kernel", "a case", "equal", "", cells, error, **options)
+
+
+def test_all_cases_of_a_kernel_are_checked_and_those_that_are_long_enough_are_timed():
+    def right(backend):
+        return 1.0
+
+    def wrong(backend):
+        return float(backend == "gpu")
+
+    def raises(backend):
+        return 1 / (backend != "gpu")
+
+    log, timed = ConsoleLog(None, quiet=True), a_case(right, timed=1)
+    assert examined([timed], "cpu", log).ratio > 0
+    assert examined([timed, a_case(wrong)], "cpu", log).fault == "kernel, a case: failed"
+    assert "ZeroDivisionError" in examined([timed, a_case(raises)], "cpu", log).fault
+    assert not examined([a_case(right)], "cpu", log).trusted  # it was not timed
+
+
+def test_what_agrees_and_is_faster_is_taken_and_kept(monkeypatch, tmp_path, capsys):
+    """`auto` on a GPU; the verdicts are kept until the GPU changes, and the row names what ran."""
+    played = {"adam": [NAN, "off"], "composite": [0.5, ""], "encode": [2.0, ""], "march": [3.0, ""]}
+    tries = []
+
+    def play(kernels, command, limit_s):
+        tries.append(command[-1])
+        return {name: Verdict(*played[name.rpartition(".")[2]]) for name in kernels}
+
+    monkeypatch.setattr(trial, "tried", play)
+    monkeypatch.setattr(dispatch, "availability", lambda: {"gpu": ""})
+    monkeypatch.setattr(dispatch, "interpreted", lambda: False)
+    monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
+    device = torch.device("cuda:0")
+    for name in ("one GPU", "one GPU", "another GPU"):
+        verdicts.cache_clear()
+        monkeypatch.setattr(torch.cuda, "get_device_name", lambda device, name=name: name)
+        assert dispatch.resolve("auto", device) == "auto"
+        said = dispatch.by_kernel("auto", FieldTraining, device)
+        assert said == "gpu, but reference: adam, composite, mlp"
+    verdicts.cache_clear()
+    assert tries == ["cuda:0", "cuda:0"]
+    assert "adam: off; composite: 0.5x as fast" in capsys.readouterr().err
