@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+from methods.kernels.march.contraction import HALF
 from methods.kernels.settings import (
     Checked,
     Count,
@@ -13,7 +14,6 @@ from methods.kernels.settings import (
     Only,
     Positive,
     Share,
-    SomeShare,
     Stop,
     between,
 )
@@ -28,7 +28,7 @@ class ModelOptions(Checked):
     channels: Annotated[int, between(3, 256)]  # K features of the field; the first three are RGB
     frames: Annotated[int, between(0, 64)]  # L, number of preceding frames
     scale: Annotated[int, between(1, 64)]  # s; the field is rendered at 1/s of the resolution
-    step: Length  # of the march at low resolution, in diagonals of the cube / 1024
+    step: Length  # of the march at low resolution, in diagonals of the box / 1024
     stop: Stop  # transmittance at which a ray ends
     feature_background: float  # what features beyond RGB are composited on
 
@@ -60,15 +60,16 @@ class Skips:
 class Rendering(Checked):
     """Settings chosen after training: one training serves every choice."""
 
-    step: Length  # of the march at low resolution, in diagonals of the cube / 1024
+    step: Length  # of the march at low resolution, in diagonals of the box / 1024
     stop: Stop  # transmittance at which a ray ends
     range: RangeReduction
     skip: Skips
 
-    @property
-    def sampling(self) -> Sampling:
-        """How rays at low resolution are marched."""
-        return Sampling(step=self.step * STEP, stop=self.stop if self.skip.hidden else 0.0)
+    def sampling(self, contracted: bool) -> Sampling:
+        """How rays at low resolution are marched. The box has half the sides of a `contracted`
+        cube: its steps are as fine as those of a box that is the cube."""
+        step = self.step * STEP * (2 * HALF if contracted else 1)
+        return Sampling(step=step, stop=self.stop if self.skip.hidden else 0.0)
 
 
 def _ordered(ends: Sequence[float]) -> bool:
@@ -99,7 +100,6 @@ class JointOptions(Checked):
     # Half waves of their schedule.
     half_waves: Annotated[int, Only("an odd number", lambda x: x > 0 and x % 2 == 1)]
     patch: Count  # maximum side of a patch, in low-resolution pixels
-    patch_share: SomeShare  # the same as a share of the shortest side of all low-resolution frames
     batch: Count  # patches per step
     jitter: bool  # whether the samples of each ray have a random phase
     opacity_entropy: NotNegative  # weight of -o ln o of the rays' opacity o

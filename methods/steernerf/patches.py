@@ -128,8 +128,7 @@ class Patches:
     def _side(self) -> int:
         """The side of all patches, in low-resolution pixels; even the smallest picture has one."""
         shortest = min(min(camera.width, camera.height) for camera in self.cameras)
-        share = self.options.patch_share * -(-shortest // self.pipeline.model.scale)
-        return min(self.options.patch, max(1, int(share)))
+        return min(self.options.patch, -(-shortest // self.pipeline.model.scale))
 
     def _truth(self, example: Example, top: int, left: int, full: Camera) -> Tensor:
         """The true picture [H, W, 3] of the patch. Beyond the border of a picture whose sides are
@@ -157,7 +156,8 @@ class Patches:
             jitter = torch.rand(len(rays.origins), generator=self.generator)
             jitter = jitter.to(field.device, non_blocking=True)
         with torch.set_grad_enabled(self.learning):
-            how, occupancy = self.rendering.sampling, self.pipeline.occupancy
+            occupancy = self.pipeline.occupancy
+            how = self.rendering.sampling(occupancy.contracted)
             pixels, _ = render_batch(field, rays, occupancy, how, jitter=jitter)
             ends = accumulate(map(len, chosen))
             rendered = (  # in the order of `_to_render`

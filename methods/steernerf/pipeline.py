@@ -92,7 +92,7 @@ class Pipeline:
     ) -> FeatureFrame:
         """Render features F and depth D at low resolution (Eq. 2 to 5). With range reduction, rays
         are sampled only near the depth of the newest of the `preceding` frames (Eq. 7, 8)."""
-        how, reduction = rendering.sampling, rendering.range
+        how, reduction = rendering.sampling(self.occupancy.contracted), rendering.range
         if preceding and reduction.mode == "paper":
             with probe.stage("depth_reprojection"):
                 expected = reduction.depth == "expected"

@@ -35,7 +35,6 @@ JOINT = JointOptions(
     final_rate=1e-5,
     half_waves=1,
     patch=32,
-    patch_share=1.0,
     batch=2,
     jitter=False,
     opacity_entropy=1e-3,

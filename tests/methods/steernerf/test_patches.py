@@ -147,25 +147,25 @@ def test_the_newest_preceding_frame_is_a_step_away(ball_scene):
 MOTION = small_motion(pool=3, uses=100)
 
 
-@pytest.mark.parametrize(("share", "side"), [(1.0, 6), (0.75, 6), (0.5, 4), (0.01, 1)])
-def test_a_patch_has_its_side_and_at_most_its_share_of_the_frame(ball_scene, share, side):
+@pytest.mark.parametrize(("patch", "side"), [(6, 6), (9, 8)])
+def test_a_patch_has_its_side_or_that_of_the_frame(ball_scene, patch, side):
     """Of a frame of 8 x 8 low-resolution pixels."""
-    source = new_patches(ball_scene, MOTION, patch=6, patch_share=share)
+    source = new_patches(ball_scene, MOTION, patch=patch)
     low = source.cut(source.example()).view.low
     assert (low.width, low.height) == (side, side)
 
 
 def test_patches_of_pictures_of_several_sizes_have_one_side(ball_scene):
-    """The share of the shortest side of all: half of 24 pixels is 3 low-resolution pixels."""
+    """The shortest side of all: 24 pixels are 6 low-resolution pixels."""
     split = ball_scene.splits["train"]
     narrow = crop_camera(split.cameras[0], 4, 0, SIZE - 8, SIZE)
     cameras = [narrow, *split.cameras[1:]]
     images = [split.images[0][:, 4:-4], *split.images[1:]]
     scene = replace(ball_scene, splits={"train": replace(split, cameras=cameras, images=images)})
-    source = new_patches(scene, small_motion(uses=1), patch=8, patch_share=0.5)
+    source = new_patches(scene, small_motion(uses=1), patch=8)
     cuts = [source.cut(source.example()) for _ in range(60)]
     assert {0, 1} <= {cut.example.number for cut in cuts}
-    assert {cut.truth.shape for cut in cuts} == {(12, 12, 3)}
+    assert {cut.truth.shape for cut in cuts} == {(24, 24, 3)}
 
 
 def test_a_patch_lies_anywhere(ball_scene):
