@@ -112,7 +112,7 @@ def accuracy(subject: Subject, only: Sequence[str], trained: bool) -> Iterator[S
         yield from subject.lines(knob, [*first, *knobs.get(knob, ())])
 
 
-def parity(subject: Subject, only: Sequence[str]) -> Iterator[StudyLine]:
+def parity(subject: Subject) -> Iterator[StudyLine]:
     """Every engine and precision, beside torch in fp32."""
     engines = subject.engines()
     first, *_ = chain(*engines.values())
@@ -120,7 +120,7 @@ def parity(subject: Subject, only: Sequence[str]) -> Iterator[StudyLine]:
         yield from subject.lines(engine, [first, *(x for x in own if x != first)])
 
 
-def skips(subject: Subject, only: Sequence[str]) -> Iterator[StudyLine]:
+def skips(subject: Subject) -> Iterator[StudyLine]:
     """All skips, further savings on top, all skips but each one, nothing skipped."""
     study = subject.study
     off = {name: f"{setting}=false" for name, setting in study.skips.items()}
@@ -131,7 +131,7 @@ def skips(subject: Subject, only: Sequence[str]) -> Iterator[StudyLine]:
     )
 
 
-def breakdown(subject: Subject, only: Sequence[str]) -> Iterator[StudyLine]:
+def breakdown(subject: Subject) -> Iterator[StudyLine]:
     """Each precision of the engine, or the method as it is without one; with and without skips."""
     variants = [Variant(subject.name)]
     if subject.has_engine:

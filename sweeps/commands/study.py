@@ -30,9 +30,9 @@ def main(options: argparse.Namespace) -> int:
     if study == "accuracy" and options.within is not None:
         within = decibels(options.within)
     words, of_hydra = divided(options.overrides)
-    more = {"trained": options.trained} if study == "accuracy" else {}
+    given = {name: getattr(options, name) for name in ("only", "trained") if name in options}
     found = subjects(study, words)
-    jobs = jobs_of(study, found, {"only": options.only, **more})
+    jobs = jobs_of(study, found, given)
     outputs = Path(jobs[0].config.outputs)
     failed = run_jobs(jobs, Launcher([*options.config_dir, *of_hydra], outputs))
     lines = list(_measured(jobs))
