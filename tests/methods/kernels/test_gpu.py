@@ -83,11 +83,11 @@ def test_a_thin_haze_keeps_its_light_to_the_last_digits() -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(platform.system() != "Linux", reason="Triton brings its assembler for Linux")
-def test_every_kernel_compiles_for_a_gpu_that_is_not_here(tmp_path: Path) -> None:
+def test_every_kernel_compiles_for_gpus_that_are_not_here_without_spills(tmp_path: Path) -> None:
     environment = {name: text for name, text in os.environ.items() if name != "TRITON_INTERPRET"}
     done = subprocess.run(
         [sys.executable, "-P", Path(__file__).with_name("compiled.py")],
-        env=environment | {"TRITON_CACHE_DIR": str(tmp_path)},
+        env=environment | {"TRITON_CACHE_DIR": str(tmp_path), "TRITON_DUMP_PTXAS_LOG": "1"},
         capture_output=True,
         text=True,
         check=False,
@@ -98,6 +98,8 @@ def test_every_kernel_compiles_for_a_gpu_that_is_not_here(tmp_path: Path) -> Non
         source = inspect.getsource(importlib.import_module(f"{name}.gpu"))
         launched = {f"{name}.gpu {kernel}" for kernel in re.findall(r"launch\(\s*(_\w+)", source)}
         assert launched <= compiled
+    spilled = re.findall(r"(\d+) bytes spill", done.stdout)
+    assert set(spilled) == {"0"}
 
 
 def test_what_it_does_not_serve_is_refused() -> None:
