@@ -17,8 +17,9 @@ def launch(
     kernel: triton.JITFunction, grid: tuple[int, ...], *arguments: Any, **options: Any
 ) -> None:
     """Run `kernel` on `grid`, unless that is empty, on the device of the first argument, a tensor.
-    Multiply-adds are not fused, so that the march gives the same bits as the reference. Division
-    and exponential are within 2 ulp."""
+    Multiply-adds are not fused, so that the march gives the same bits as the reference. A division
+    by `/` is within 2 ulp, by `tl.div_rn` exactly rounded. An exponential is 2^(x log2 e): within
+    2 + 1.17 |x| ulp."""
     if all(grid):
         with torch.cuda.device_of(arguments[0]):
             kernel[grid](*arguments, enable_fp_fusion=False, **options)

@@ -85,9 +85,9 @@ def _update(
     m = tl.load(first + place, mask=changed, other=0.0) * BETA1 + gradient * (1 - BETA1)
     squared = gradient * (1 - BETA2) * gradient
     v = tl.load(second + place, mask=changed, other=0.0) * BETA2 + squared
-    scale = tl.sqrt(v * correction2) + EPS
+    scale = tl.sqrt_rn(v * correction2) + EPS
     old = tl.load(table + place, mask=changed, other=0.0)
-    new = old - rate * m * correction1 / scale
+    new = old - tl.div_rn(rate * m * correction1, scale)
     tl.debug_barrier()  # all warps must have read `steps` before any writes
     tl.store(steps + entry, step, mask=touched)
     tl.store(first + place, m, mask=changed)

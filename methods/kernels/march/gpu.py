@@ -106,7 +106,7 @@ def _contracted(x, y, z):
     """`contraction.contract`."""
     x, y, z = (x - 0.5) * 4, (y - 0.5) * 4, (z - 0.5) * 4
     size = tl.maximum(tl.abs(x), tl.maximum(tl.abs(y), tl.abs(z)))
-    inverse = 1 / tl.maximum(size, 1.0)
+    inverse = tl.div_rn(1.0, tl.maximum(size, 1.0))
     shrunk = tl.where(inverse < 1, (2 - inverse) * inverse, 1.0)
     return x * shrunk * 0.25 + 0.5, y * shrunk * 0.25 + 0.5, z * shrunk * 0.25 + 0.5
 
@@ -115,7 +115,7 @@ def _contracted(x, y, z):
 def _spread(v):
     """r at `v`, see `contraction`."""
     size = tl.abs(v)
-    size = tl.where(size <= 1, size, 1 / tl.maximum(2 - size, 1e-6))
+    size = tl.where(size <= 1, size, tl.div_rn(1.0, tl.maximum(2 - size, 1e-6)))
     return tl.where(v < 0, -size, size)
 
 
@@ -123,7 +123,7 @@ def _spread(v):
 def _drawn_in(r):
     """v at `r`, see `contraction`."""
     size = tl.abs(r)
-    size = tl.where(size <= 1, size, 2 - 1 / tl.maximum(size, 1.0))
+    size = tl.where(size <= 1, size, 2 - tl.div_rn(1.0, tl.maximum(size, 1.0)))
     return tl.where(r < 0, -size, size)
 
 
@@ -187,16 +187,16 @@ def _march(
     low = tl.load(lowest + ray, mask=going, other=0.0)
     phase = tl.load(phases + ray, mask=going, other=0.0)
     size = side * 4
-    width = 1.0 / size.to(tl.float32)
+    width = tl.div_rn(1.0, size.to(tl.float32))
     count = tl.zeros([BLOCK], tl.int64)
     begin = count if offsets is None else tl.load(offsets + ray, mask=inside, other=0)
     again = tl.full([BLOCK], -1, tl.int32)
     # One step less, because rounding may affect the step before.
     if contracted:
         sy = tl.where(going, sy, 1.0)
-        ahead = (_drawn_in((low - sx) / sy) - sz) / step
+        ahead = tl.div_rn(_drawn_in(tl.div_rn(low - sx, sy)) - sz, step)
     else:
-        ahead = (low - near) / step
+        ahead = tl.div_rn(low - near, step)
     k = tl.where(going, tl.maximum(k, (ahead - phase).to(tl.int32) - 1), k)
     while tl.max(going.to(tl.int32), 0) > 0:
         if contracted:
@@ -232,13 +232,14 @@ def _march(
                 room = tl.minimum(_room(px, x, free, width), _room(py, y, free, width))
                 room = tl.maximum(tl.minimum(room, _room(pz, z, free, width)), 0.0)
                 speed = tl.maximum(tl.abs(dx), tl.maximum(tl.abs(dy), tl.abs(dz)))
-                leave = t + room / tl.maximum(_steepness(px, py, pz, room) * speed, 1e-37)
-                ahead = (_drawn_in((leave - sx) / sy) - sz) / step
+                pace = tl.maximum(_steepness(px, py, pz, room) * speed, 1e-37)
+                leave = t + tl.div_rn(room, pace)
+                ahead = tl.div_rn(_drawn_in(tl.div_rn(leave - sx, sy)) - sz, step)
             else:
                 leave = _leave_slab(ox, sx, x, free, width)
                 leave = tl.minimum(leave, _leave_slab(oy, sy, y, free, width))
                 leave = tl.minimum(leave, _leave_slab(oz, sz, z, free, width))
-                ahead = (leave - near) / step
+                ahead = tl.div_rn(leave - near, step)
             # Rounded down, so that the first step beyond the empty space is never skipped.
             ahead = tl.where(skips, ahead, 0.0) - phase
             k = tl.maximum(k, ahead.to(tl.int32))
