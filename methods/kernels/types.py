@@ -1,7 +1,7 @@
 """What rays, samples and pixels are: the nouns that kernels and methods pass around.
 
-An `Occupancy` says where samples may lie, `Samples` are `Intervals` on rays with positions, an
-`Extent` is how many there are, and `Pixels` are what becomes of them.
+An `Occupancy` says where samples may lie, `Samples` are `Intervals` on rays with positions, and
+`Pixels` are what becomes of them.
 """
 
 from __future__ import annotations
@@ -113,19 +113,10 @@ def clearance(used: Tensor) -> Tensor:
     return apart.where(apart >= 0, len(used)).clamp(max=255).to(used.device, torch.uint8)
 
 
-@dataclass(frozen=True)
-class Extent:
-    """How many samples some rays have, in `total`, and the one with the most; known to the host."""
-
-    total: int
-    longest: int
-
-    @classmethod
-    def of_each(cls, counts: Tensor) -> list[Extent]:
-        """The extent of each group of rays with `counts` [G, R] samples. Waits for a GPU, once."""
-        counts = functional.pad(counts, (0, 1))  # for a group without rays
-        figures = torch.stack((counts.sum(dim=1), counts.amax(dim=1)), dim=1)
-        return [cls(*size) for size in figures.tolist()]
+def total_and_longest(counts: Tensor) -> list[int]:
+    """How many samples rays with `counts` [R] have, and how many the one with the most. The host
+    waits for a GPU, once."""
+    return torch.stack((counts.sum(), functional.pad(counts, (0, 1)).amax())).tolist()
 
 
 def offsets_of(counts: Tensor) -> Tensor:
@@ -149,11 +140,11 @@ class Intervals:
 
     def front(self, counts: Tensor) -> Self:
         """Only the first `counts` [R] samples of each ray. The host waits for a GPU."""
-        (extent,) = Extent.of_each(counts[None])
+        total, longest = total_and_longest(counts)
         offsets = offsets_of(counts)
-        shift = (self.offsets - offsets)[:-1].repeat_interleave(counts, output_size=extent.total)
-        index = torch.arange(extent.total, device=shift.device) + shift
-        return self.chosen(index, offsets, extent.longest)
+        shift = (self.offsets - offsets)[:-1].repeat_interleave(counts, output_size=total)
+        index = torch.arange(total, device=shift.device) + shift
+        return self.chosen(index, offsets, longest)
 
     def chosen(self, index: Tensor, offsets: Tensor, longest: int | None) -> Self:
         """Only the samples at `index` [N], which lie on the rays as `offsets` [R + 1] say."""

@@ -15,11 +15,10 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from bench.types import Rays, check_shape
 from methods.kernels.dispatch import implementation
-from methods.kernels.types import Extent, Occupancy, Samples, check_rays, expect
+from methods.kernels.types import Occupancy, Samples, check_rays, expect
 
 MAX_SAMPLES = 1024  # most samples of a ray through the unit cube at the usual step, sqrt(3) / 1024
 
@@ -49,11 +48,10 @@ def march(
     jitter: Tensor | None = None,
     start: Tensor | None = None,
     limit: int | None = None,
-    extent: Extent | None = None,
     backend: str = "auto",
 ) -> Samples:
     """Sample R `rays` inside the unit cube, or in all of space if it is contracted into the cube.
-    Not differentiable.
+    Not differentiable. The host waits for a GPU, once.
 
     A ray has no samples if it misses the cube, is not finite, or has a direction that is zero, so
     short that t overflows, or so long that a step in t is below `LEAST_STEP`.
@@ -65,28 +63,10 @@ def march(
         start: [R] int32 first step, from `Samples.resume` of an earlier call with the same rays;
             negative: no samples; None: 0.
         limit: maximum number of samples per ray; None: all.
-        extent: how many samples there are, from `extents`; with it, the host does not wait for a
-            GPU.
     """
     segments = _segments(rays, step, window, jitter, start, limit)
     kernel = implementation(__name__, backend, rays.origins.device)
-    return kernel.march(segments, occupancy, extent)
-
-
-def extents(
-    rays: Rays,
-    occupancy: Occupancy,
-    step: float,
-    size: int,
-    *,
-    window: Tensor | None = None,
-    backend: str = "auto",
-) -> list[Extent]:
-    """How many samples `march` finds in each batch of `size` rays, in order, without `jitter`,
-    `start` and `limit`. The host waits for a GPU, once."""
-    kernel = implementation(__name__, backend, rays.origins.device)
-    counts = kernel.count(_segments(rays, step, window, None, None, None), occupancy)
-    return Extent.of_each(functional.pad(counts, (0, -len(counts) % size)).view(-1, size))
+    return kernel.march(segments, occupancy)
 
 
 def longest_ray(step: float) -> int:

@@ -11,13 +11,12 @@ import math
 import numpy as np
 import torch
 from numba import prange
-from torch import Tensor
 
 from methods.kernels.cpu import arrays, check_float32, f32, f64, i32, jit, slope, u64
 from methods.kernels.march import LEAST_STEP, Segments, longest_ray
 from methods.kernels.march.contraction import BEYOND, Course
 from methods.kernels.march.reference import clip, course_of
-from methods.kernels.types import Extent, Occupancy, Samples, offsets_of
+from methods.kernels.types import Occupancy, Samples, offsets_of
 
 CHUNK = 128  # rays that are marched together; their numbers stay in the first-level cache
 
@@ -40,12 +39,7 @@ K, RAY, COUNT, CELL, FREE = 0, 1, 2, 3, 6
 INTEGERS = 7
 
 
-def count(segments: Segments, occupancy: Occupancy) -> Tensor:
-    """How many samples a ray has, [R] int64."""
-    return march(segments, occupancy, None).offsets.diff()
-
-
-def march(segments: Segments, occupancy: Occupancy, extent: Extent | None) -> Samples:
+def march(segments: Segments, occupancy: Occupancy) -> Samples:
     step, origins, directions = segments.step, segments.rays.origins, segments.rays.directions
     check_float32(origins)
     rays = len(origins)

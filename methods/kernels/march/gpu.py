@@ -15,33 +15,24 @@ from methods.kernels.gpu import check_float32, launch, vector
 from methods.kernels.march import Segments
 from methods.kernels.march.contraction import Course
 from methods.kernels.march.reference import clip, course_of, slopes
-from methods.kernels.types import BRICK, Extent, Occupancy, Samples, offsets_of
+from methods.kernels.types import BRICK, Occupancy, Samples, offsets_of, total_and_longest
 
 BLOCK = 128 if interpreted() else 32
 """Rays per program: one warp, which waits for its longest ray. The interpreter takes as long for
 many as for few."""
 
 
-def count(segments: Segments, occupancy: Occupancy) -> Tensor:
-    """How many samples a ray has, [R] int64."""
-    course = course_of(segments, occupancy)
-    counts, _ = _counted(_arguments(segments, occupancy, course))
-    return counts
-
-
-def march(segments: Segments, occupancy: Occupancy, extent: Extent | None) -> Samples:
+def march(segments: Segments, occupancy: Occupancy) -> Samples:
     course = course_of(segments, occupancy)
     arguments = _arguments(segments, occupancy, course)
     counts, resume = _counted(arguments)
-    if extent is None:
-        (extent,) = Extent.of_each(counts[None])
-    device, total = counts.device, extent.total
+    device, (total, longest) = counts.device, total_and_longest(counts)
     offsets = offsets_of(counts)
     ray = torch.empty(total, dtype=torch.int32, device=device)
     t, positions = (torch.empty(*shape, device=device) for shape in ((total,), (total, 3)))
     _launch(arguments, counts, resume, offsets, ray, t, positions)
     delta = torch.full_like(t, segments.step) if course is None else course.lengths(ray, t)
-    return Samples(t, delta, offsets, ray, positions, resume, longest=extent.longest)
+    return Samples(t, delta, offsets, ray, positions, resume, longest=longest)
 
 
 def _arguments(segments: Segments, occupancy: Occupancy, course: Course | None) -> list[Any]:

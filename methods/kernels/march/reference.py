@@ -11,30 +11,23 @@ from torch.nn import functional
 
 from methods.kernels.march import LEAST_STEP, Segments, longest_ray
 from methods.kernels.march.contraction import Course, contract
-from methods.kernels.types import PARALLEL, Extent, Occupancy, Samples, offsets_of
+from methods.kernels.types import PARALLEL, Occupancy, Samples, offsets_of, total_and_longest
 
 BLOCK = 1 << 12  # rays that are tested at a time: [BLOCK, 1024, 3] positions are 50 MB
 
 
-def count(segments: Segments, occupancy: Occupancy) -> Tensor:
-    """How many samples a ray has, [R] int64."""
-    steps = _Steps.of(segments, occupancy)
-    return torch.cat([counts for _, counts, _ in steps.taken(occupancy)])
-
-
-def march(segments: Segments, occupancy: Occupancy, extent: Extent | None) -> Samples:
+def march(segments: Segments, occupancy: Occupancy) -> Samples:
     steps = _Steps.of(segments, occupancy)
     parts = zip(*steps.taken(occupancy), strict=True)
     kept, counts, resume = (torch.cat(column) for column in parts)
-    if extent is None:
-        (extent,) = Extent.of_each(counts[None])
-    place = torch.nonzero_static(kept.flatten(), size=extent.total).squeeze(1)
+    total, longest = total_and_longest(counts)
+    place = torch.nonzero_static(kept.flatten(), size=total).squeeze(1)
     ray, k = place // max(steps.most, 1), place % max(steps.most, 1)
     t, positions = steps.at(ray, k)
     course = steps.course
     delta = torch.full_like(t, segments.step) if course is None else course.lengths(ray, t)
     where = t, delta, offsets_of(counts), ray.int(), positions, resume
-    return Samples(*where, longest=extent.longest)
+    return Samples(*where, longest=longest)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from bench.types import Rays
 from methods.kernels.march.reference import crossed, lengths, slopes
-from methods.kernels.types import Extent, offsets_of
+from methods.kernels.types import offsets_of, total_and_longest
 from methods.kernels.voxel_walk import BRICK, Crossings, Voxels
 
 BLOCK = 1 << 11  # rays that are processed at a time
@@ -22,9 +22,9 @@ def walk(rays: Rays, voxels: Voxels) -> Crossings:
     ray = ray.repeat_interleave(counts, output_size=len(near))
     delta = (far - near) * lengths(rays.directions)[ray]
     middle = (near + far) * 0.5
-    (extent,) = Extent.of_each(counts[None])  # read once here, not in each composite
+    _, longest = total_and_longest(counts)  # read once here, not in each composite
     where = middle, delta, offsets_of(counts), near, far, ray.int(), voxel
-    return Crossings(*where, longest=extent.longest)
+    return Crossings(*where, longest=longest)
 
 
 def _walk_block(origins: Tensor, directions: Tensor, voxels: Voxels) -> tuple[Tensor, ...]:

@@ -14,29 +14,18 @@ from pathlib import Path
 import pytest
 import torch
 
-from bench.case import U32, largest_error, placed
+from bench.case import U32, largest_error
 from methods.kernels import availability
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import composite, visible, weights
 from methods.kernels.dispatch import kernels
 from methods.kernels.encode import HashGrid, encode
-from methods.kernels.march import extents, march
-from methods.kernels.march.cases import cells, some_rays
-from methods.kernels.types import Intervals, Occupancy
+from methods.kernels.types import Intervals
 
 pytestmark = pytest.mark.skipif(
     bool(availability()["gpu"]), reason="Triton has no build for this platform"
 )
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
-
-
-def test_what_is_marched_has_the_extent_that_was_told() -> None:
-    given = placed(some_rays(40), DEVICE), Occupancy(cells("dust", 16).to(DEVICE)), 0.02
-    (extent,) = extents(*given, 40, backend="gpu")
-    samples = march(*given, backend="reference")
-    assert (extent.total, extent.longest) == (len(samples), int(samples.offsets.diff().max()))
-    known = march(*given, extent=extent, backend="gpu")
-    assert torch.equal(known.offsets, samples.offsets)
 
 
 def test_what_is_not_a_number_shows_and_what_is_behind_it_does_not() -> None:
