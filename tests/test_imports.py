@@ -18,7 +18,7 @@ MAY_IMPORT = {
 REACHES = {
     "sweeps/commands/compile.py": "methods.checks",
     "sweeps/commands/experiments.py": "methods.checks",
-    "sweeps/commands/kernels.py": ("methods.checks", "methods.kernels."),
+    "sweeps/commands/kernels.py": ("methods.checks", "methods.kernels.", "methods.trial."),
     "sweeps/commands/list.py": "methods.kernels.",
     "sweeps/commands/stress.py": "methods.checks",
     "sweeps/commands/worth.py": "methods.kernels.",

@@ -102,7 +102,7 @@ def implementation(kernel: str, backend: str, device: torch.device) -> ModuleTyp
 def _computing(kernel: str, backend: str, device: torch.device) -> str:
     """The backend that computes `kernel` if `backend` is asked for."""
     if backend == "auto":
-        verdict = _load("methods.kernels.trial").verdicts(str(device)).get(kernel)
+        verdict = _load("methods.trial").verdicts(str(device)).get(kernel)
         return "gpu" if verdict and verdict.trusted else "reference"
     return backend if backend in served(kernel) else "reference"
 

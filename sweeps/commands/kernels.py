@@ -13,7 +13,7 @@ from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from methods import checks
 from methods.kernels import compiled
-from methods.kernels.trial import tried_again
+from methods.trial import tried_again
 from reports.tables import Table, decimal
 from sweeps.processes import device_lock
 from sweeps.terminal import print_rows, show

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from bench.types import Rays
-from methods.kernels.march import extents, march
+from methods.kernels.march import march
 from methods.kernels.types import Occupancy
 
 STEP = math.sqrt(3) / 1024
@@ -65,20 +65,6 @@ def test_samples_are_the_steps_in_occupied_cells(jitter):
     places = rays.origins[ray] + samples.t[:, None] * rays.directions[ray]
     assert torch.equal(samples.positions, places)
     assert grid.holds(places).all()
-
-
-def test_extents_are_those_of_what_is_marched_and_change_nothing(backend):
-    rays, grid = rays_through_the_cube(50), dust(4)
-    samples = march(rays, grid, STEP, backend=backend)
-    parts = samples.offsets.diff().split(20)
-    found = extents(rays, grid, STEP, 20, backend=backend)
-    assert [(x.total, x.longest) for x in found] == [(int(p.sum()), int(p.max())) for p in parts]
-    (extent,) = extents(rays, grid, STEP, 50, backend=backend)
-    known = march(rays, grid, STEP, extent=extent, backend=backend)
-    for name in ("t", "delta", "offsets", "ray", "positions", "resume"):
-        assert torch.equal(getattr(known, name), getattr(samples, name)), name
-    none = Rays(torch.zeros(0, 3), torch.zeros(0, 3))
-    assert extents(none, grid, STEP, 20, backend=backend) == []
 
 
 @pytest.mark.parametrize("limit", [1, 40, 1024])

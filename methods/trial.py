@@ -50,7 +50,6 @@ class Verdict(NamedTuple):
 def verdicts(device: str) -> Mapping[str, Verdict]:
     """Of every kernel of Triton on the GPU `device`, by its package; see `tried_again`."""
     log, file = ConsoleLog(Path()), _file(device)
-    file.parent.mkdir(parents=True, exist_ok=True)
     with locked(file.with_suffix(".lock"), f"waits for another trial of {device}", log):
         if not file.exists():
             return tried_again(device, log)
@@ -72,7 +71,7 @@ def tried_again(device: str, log: Log) -> Mapping[str, Verdict]:
 
 
 def _file(device: str) -> Path:
-    """Where the verdicts are kept."""
+    """Where the verdicts are kept, in a folder that is there."""
     gpu = import_module("methods.kernels.gpu")
     folders = "methods.kernels", *kernels("gpu")
     files = (path for name in folders for path in ROOT.joinpath(*name.split(".")).glob("*.py"))
@@ -80,7 +79,9 @@ def _file(device: str) -> Path:
     driver = Path("/proc/driver/nvidia/version")
     where = torch.cuda.get_device_name(device), driver.read_text() if driver.exists() else ""
     key = json.dumps([where, libraries(gpu.launch), code]).encode()
-    return gpu.cache_folder() / "steerbench" / f"{sha256(key).hexdigest()[:16]}.json"
+    folder = gpu.cache_folder() / "steerbench"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder / f"{sha256(key).hexdigest()[:16]}.json"
 
 
 def tried(kernels: Sequence[str], command: Sequence[str], limit_s: float) -> dict[str, Verdict]:

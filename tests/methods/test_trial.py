@@ -7,9 +7,10 @@ import torch
 
 from bench.case import Case, Difference
 from bench.console import ConsoleLog
+from methods import trial
 from methods.instant_ngp.training import FieldTraining
-from methods.kernels import dispatch, trial
-from methods.kernels.trial import Verdict, examined, tried, verdicts
+from methods.kernels import dispatch
+from methods.trial import Verdict, examined, tried, verdicts
 
 CHILD = """
 import json, os, sys, time
