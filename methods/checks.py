@@ -1,10 +1,16 @@
-"""All checks: the `cases.py` and `experiments.py` of the folders."""
+"""All kernels, and all checks: the `cases.py` and `experiments.py` of the folders."""
 
 import importlib
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parent.parent
+
+
+def kernels(having: str = "reference") -> list[str]:
+    """The packages of all kernels that have a module `having`: "reference", "cpu" or "gpu"."""
+    paths = sorted((ROOT / "methods").rglob(f"kernels/*/{having}.py"))
+    return [".".join(path.parent.relative_to(ROOT).parts) for path in paths]
 
 
 def modules(name: str) -> list[str]:

@@ -8,12 +8,13 @@ verdicts are kept in Triton's cache, until the GPU, its driver, torch, Triton or
 import json
 import math
 import select
+import statistics
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import redirect_stdout
-from functools import cache
+from functools import cache, partial
 from hashlib import sha256
 from importlib import import_module
 from pathlib import Path
@@ -21,12 +22,13 @@ from typing import NamedTuple
 
 import torch
 
-from bench.case import Case, failed, timed_rows
+from bench.case import Case, Difference, failed
+from bench.clock import times_ms
 from bench.console import ConsoleLog
 from bench.provenance import ROOT, libraries
 from bench.sharing import locked, whole
 from bench.types import Log
-from methods.kernels.dispatch import kernels
+from methods import checks
 
 LIMIT_S = 180.0  # for the cases of one kernel, most of it for Triton's compiler
 REPEATS = 5
@@ -60,7 +62,7 @@ def tried_again(device: str, log: Log) -> Mapping[str, Verdict]:
     """Try every kernel of Triton on the GPU `device`, tell `log`, and keep the verdicts."""
     name = torch.cuda.get_device_name(device)
     log.info(f"{name}: its kernels are tried against their reference, once")
-    found = tried(kernels("gpu"), [sys.executable, "-m", __name__, device], LIMIT_S)
+    found = tried(checks.kernels("gpu"), [sys.executable, "-m", __name__, device], LIMIT_S)
     with whole(_file(device)) as new:
         new.write_text(json.dumps(found))
     said = "; ".join(f"{kernel.rpartition('.')[2]}: {found[kernel]}" for kernel in found)
@@ -73,7 +75,7 @@ def tried_again(device: str, log: Log) -> Mapping[str, Verdict]:
 def _file(device: str) -> Path:
     """Where the verdicts are kept, in a folder that is there."""
     gpu = import_module("methods.kernels.gpu")
-    folders = "methods.kernels", *kernels("gpu")
+    folders = "methods.kernels", *checks.kernels("gpu")
     files = (path for name in folders for path in ROOT.joinpath(*name.split(".")).glob("*.py"))
     code = {str(path): path.read_text() for path in sorted(files)}
     driver = Path("/proc/driver/nvidia/version")
@@ -122,17 +124,20 @@ def _answers(
                 return
 
 
-def examined(cases: Sequence[Case], device: str, log: Log) -> Verdict:
-    """Check all `cases` of a kernel on `device`, and time those that are to be timed."""
+def examined(cases: Sequence[Case], device: str) -> Verdict:
+    """Check all `cases` of a kernel on `device`, then time those that are to be timed."""
     for case in cases:
         for cell in case.tolerances:
             if cell[0] == "gpu" and not case.slow and failed(row := case.check(cell, device)):
                 return Verdict(math.nan, f"{case.subject}, {case.name}: {row['status']}")
-    timed = [case for case in cases if case.timed]
-    rows = timed_rows(timed, device, ("reference", "gpu"), REPEATS, log)
-    ours = [row for row in rows if row["backend"] == "gpu" and "ratio" in row]
-    took = sum(row["ms"] for row in ours)
-    return Verdict(sum(row["ms"] * row["ratio"] for row in ours) / took if took else math.nan, "")
+    took = {"reference": 0.0, "gpu": 0.0}
+    for case in cases:
+        if case.timed and isinstance(case.error, Difference):
+            compute = case.error.prepare(device)
+            of_each = times_ms([partial(compute, name) for name in took], REPEATS, device)
+            for name, times in zip(took, of_each, strict=True):
+                took[name] += statistics.median(times)
+    return Verdict(took["reference"] / took["gpu"] if took["gpu"] else math.nan, "")
 
 
 def main(device: str, *kernels: str) -> None:
@@ -141,7 +146,7 @@ def main(device: str, *kernels: str) -> None:
     for kernel in kernels:
         with redirect_stdout(sys.stderr):
             cases = import_module(f"{kernel}.cases").cases()
-            verdict = examined(cases, device, ConsoleLog(Path()))
+            verdict = examined(cases, device)
         print(json.dumps(verdict), flush=True)
         if verdict.fault:
             return

@@ -81,7 +81,7 @@ class Setup:
             "grid": asdict(self.suited(scene).grid),
             "training": asdict(self.training),
             "precision": self.precision,
-            "backend": by_kernel(self.backend, HashField, self.device),
+            "backend": by_kernel(self.backend, train_field, self.device),
             "device": self.device.type,
             "seed": self.seed,
             **computed_by(train_field),

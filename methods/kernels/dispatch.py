@@ -9,11 +9,12 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import torch
 
 from bench.errors import Unavailable
-from bench.provenance import ROOT, sources
+from bench.provenance import sources
 
 BACKENDS = ("reference", "cpu", "gpu")
 
@@ -65,9 +66,9 @@ def resolve(backend: str, device: torch.device | str) -> str:
     return backend
 
 
-def by_kernel(backend: str, method: type, device: torch.device) -> str:
-    """What computes the kernels that `method` imports, directly or not, if `backend` is asked for:
-    the reference has those that lack such a version. For rows."""
+def by_kernel(backend: str, method: Any, device: torch.device) -> str:
+    """What computes the kernels that `method`, a class or function, imports, directly or not, if
+    `backend` is asked for: the reference has those that lack such a version. For rows."""
     folders = [Path(name).parent for name in sources(method) if name.endswith("/reference.py")]
     found = {x.name: _computing(".".join(x.parts), backend, device) for x in folders}
     slow = sorted(kernel for kernel, name in found.items() if name == "reference")
@@ -133,12 +134,6 @@ def served(kernel: str) -> tuple[str, ...]:
     """The backends that implement `kernel`, a package."""
     folder = Path(*importlib.import_module(kernel).__path__)
     return tuple(name for name in BACKENDS if (folder / f"{name}.py").exists())
-
-
-def kernels(having: str = "reference") -> list[str]:
-    """The packages of all kernels that have a module `having`: "reference", "cpu" or "gpu"."""
-    paths = sorted((ROOT / "methods").rglob(f"kernels/*/{having}.py"))
-    return [".".join(path.parent.relative_to(ROOT).parts) for path in paths]
 
 
 def compiled(device: str) -> list[str]:

@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from bench.case import Difference, nearest
-from methods.checks import found, modules
+from methods.checks import found, kernels, modules
 from methods.kernels import availability, dispatch
-from methods.kernels.dispatch import kernels
 
 CASES = found("cases")
 QUICK = [case for case in CASES if case.quick]

@@ -6,7 +6,6 @@ import sys
 import torch
 
 from bench.case import Case, Difference
-from bench.console import ConsoleLog
 from methods import trial
 from methods.instant_ngp.training import FieldTraining
 from methods.kernels import dispatch
@@ -59,11 +58,11 @@ def test_all_cases_of_a_kernel_are_checked_and_those_that_are_long_enough_are_ti
     def raises(backend):
         return 1 / (backend != "gpu")
 
-    log, timed = ConsoleLog(None, quiet=True), a_case(right, timed=1)
-    assert examined([timed], "cpu", log).ratio > 0
-    assert examined([timed, a_case(wrong)], "cpu", log).fault == "kernel, a case: failed"
-    assert "ZeroDivisionError" in examined([timed, a_case(raises)], "cpu", log).fault
-    assert not examined([a_case(right)], "cpu", log).trusted  # it was not timed
+    timed = a_case(right, timed=1)
+    assert examined([timed], "cpu").ratio > 0
+    assert examined([timed, a_case(wrong)], "cpu").fault == "kernel, a case: failed"
+    assert "ZeroDivisionError" in examined([timed, a_case(raises)], "cpu").fault
+    assert not examined([a_case(right)], "cpu").trusted  # it was not timed
 
 
 def test_what_agrees_and_is_faster_is_taken_and_kept(monkeypatch, tmp_path, capsys):

@@ -15,8 +15,7 @@ from triton.compiler import ASTSource
 
 import methods.kernels.gpu
 from bench.case import Difference
-from methods.checks import found
-from methods.kernels.dispatch import kernels
+from methods.checks import found, kernels
 
 TARGETS = [GPUTarget("cuda", capability, 32) for capability in (80, 90, 120)]
 TYPES = {

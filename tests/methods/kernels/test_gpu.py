@@ -15,10 +15,10 @@ import pytest
 import torch
 
 from bench.case import U32, largest_error
+from methods.checks import kernels
 from methods.kernels import availability
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import composite, visible, weights
-from methods.kernels.dispatch import kernels
 from methods.kernels.encode import HashGrid, encode
 from methods.kernels.types import Intervals
 
