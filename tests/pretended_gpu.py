@@ -4,7 +4,8 @@ A tensor on `cuda:0` holds one on the CPU. Python sees the GPU, torch's C++ code
 because a torch without CUDA cannot differentiate anywhere else. Every operation is computed
 on what its tensors hold, after it was checked for what CUDA refuses: tensors or random numbers of
 two devices, `.numpy()`, a tensor of the CPU in a Triton kernel, and waiting while a graph is
-captured. `torch.cuda.set_sync_debug_mode` tells of every operation for which the host waits.
+captured. `torch.cuda.set_sync_debug_mode` tells of every operation for which the host waits;
+`launched` counts kernels of torch and of Triton.
 
 Not pretended: time, memory, streams, the order of atomics, types that CUDA has no kernel for, which
 operations autocast lowers there, and Triton's compiler. Only one thread sees the GPU.
@@ -133,7 +134,7 @@ class PretendedGpu(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()
         self.generators: dict[int, torch.Generator] = {}  # kept: the address of one is its key
-        self.sync_debug_mode = self.waited = 0
+        self.sync_debug_mode = self.waited = self.launched = 0
         self.graph: Graph | None = None
         self.inside = False  # a function that works on the GPU: what C++ makes belongs there
         self.differentiating = False  # the same of C++ alone, but not of Python that it calls
@@ -184,6 +185,7 @@ class PretendedGpu(TorchDispatchMode):
         args = _each(_held, args)
         kwargs = {name: _each(_held, x) for name, x in kwargs.items()}
         results = func(*args, **kwargs)
+        self.launched += on_gpu and _computes(func, args, results)
         if self.graph is not None and on_gpu:
             self.graph.append((func, args, kwargs, results))
 
@@ -251,6 +253,14 @@ def _tensors(x: Iterable[Any]) -> list[Tensor]:
         elif isinstance(part, list | tuple):
             found += _tensors(part)
     return found
+
+
+def _computes(func: Any, args: Any, results: Any) -> bool:
+    """Whether an operation launches a kernel: it makes more than memory or a view."""
+    if func._schema.is_mutable or "empty" in func.overloadpacket.__name__:
+        return func._schema.is_mutable
+    known = {x.untyped_storage().data_ptr() for x in _tensors(args)}
+    return any(x.numel() and x.untyped_storage().data_ptr() not in known for x in _tensors([results]))
 
 
 def _held(x: Tensor) -> Tensor:
@@ -373,6 +383,7 @@ def _patch_triton(patch: pytest.MonkeyPatch) -> None:
         if any(isinstance(x, Tensor) and not isinstance(x, GpuTensor) for x in args):
             raise ValueError("Pointer argument cannot be accessed from Triton (cpu tensor?)")
         held = _each(_held, args)
+        _gpu.launched += 1
         if _gpu.graph is not None:
             _gpu.graph.append((partial(run, self), held, kwargs, None))
         return run(self, *held, **kwargs)

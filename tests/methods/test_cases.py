@@ -11,6 +11,7 @@ import torch
 from bench.case import Difference, nearest
 from methods.checks import found, kernels, modules
 from methods.kernels import availability, dispatch
+from tests.interpreter import unforgiving
 
 CASES = found("cases")
 QUICK = [case for case in CASES if case.quick]
@@ -35,7 +36,8 @@ KERNELS = kernels("cpu")
 
 @pytest.mark.parametrize(("case", "cell"), list(cells()))
 def test_it_holds(case, cell, device):
-    row = case.check(cell, device)
+    with unforgiving():
+        row = case.check(cell, device)
     if row["status"].startswith("unavailable"):
         pytest.skip(row["status"])
     assert row["status"] == "ok", row

@@ -29,6 +29,7 @@ class AdamState:
     first: Tensor
     second: Tensor
     steps: Tensor
+    gradient: Tensor | None = None  # where a GPU adds up gradients: 0 between steps
 
     @classmethod
     def like(cls, table: Tensor) -> AdamState:
@@ -41,12 +42,12 @@ class AdamState:
 
     def tensors(self) -> dict[str, Tensor]:
         """The state, for a checkpoint."""
-        return dict(vars(self))
+        return {"first": self.first, "second": self.second, "steps": self.steps}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Restore what `tensors` returned."""
         device = self.first.device
-        self.first, self.second, self.steps = (tensors[x].to(device) for x in vars(self))
+        self.first, self.second, self.steps = (tensors[x].to(device) for x in self.tensors())
 
 
 @cache

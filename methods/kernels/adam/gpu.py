@@ -55,7 +55,9 @@ def hash_adam_(
     rate: float,
     packed: Tensor | None,
 ) -> None:
-    _step(table, table_gradient(positions, grad, grid), state, rate, packed)
+    if state.gradient is None:
+        state.gradient = torch.zeros_like(table)
+    _step(table, table_gradient(positions, grad, grid, state.gradient), state, rate, packed)
 
 
 @cache

@@ -88,7 +88,7 @@ class SampleGradients(list[tuple[Tensor, Tensor]]):
     def joined(self) -> tuple[Tensor, Tensor]:
         """All positions and gradients; there must be some."""
         positions, gradients = zip(*self, strict=True)
-        return torch.cat(positions), torch.cat(gradients)
+        return self[0] if len(self) == 1 else (torch.cat(positions), torch.cat(gradients))
 
 
 class _Collect(torch.autograd.Function):
@@ -146,6 +146,8 @@ def encode(
     features = kernel.encode(positions, read, grid, packed)
     if gradients is not None:
         features = collect(features, positions, gradients)
+    if hasattr(kernel, "MARKS_NAN"):
+        return features
     # NaN is rare. On a CPU one sum tests for it cheaply; on a GPU, waiting for it would cost more.
     if positions.device.type != "cpu" or positions.sum().isnan():
         features = torch.where(positions.isnan().any(dim=1, keepdim=True), torch.nan, features)

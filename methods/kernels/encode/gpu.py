@@ -1,4 +1,5 @@
-"""Hash-grid encoding with Triton: a program encodes a block of samples at one level.
+"""Hash-grid encoding with Triton: a program encodes a block of samples at one level, a tile
+[samples, features], so that a lane loads and adds the features of an entry together.
 
 Programs of one level are numbered consecutively, so that those running at the same time mostly read
 one level, which stays in the L2 cache. The backward pass scatters with atomics, whose order is not
@@ -13,9 +14,11 @@ import triton.language as tl
 from torch import Tensor
 
 from methods.kernels.encode import PRIMES, HashGrid
-from methods.kernels.gpu import check_float32, launch
+from methods.kernels.gpu import check_float32, launch, vector
 
 BLOCK = tl.constexpr(256)  # samples
+MARKS_NAN = True
+"""`encode` itself makes the features of a position with a NaN NaN, and gives it no gradient."""
 PRIME_Y, PRIME_Z = tl.constexpr(PRIMES[1]), tl.constexpr(PRIMES[2])
 
 
@@ -42,10 +45,12 @@ class _TritonEncode(torch.autograd.Function):
         return None, table_gradient(positions, grad, ctx.grid), None, None
 
 
-def table_gradient(positions: Tensor, grad: Tensor, grid: HashGrid) -> Tensor:
+def table_gradient(
+    positions: Tensor, grad: Tensor, grid: HashGrid, to: Tensor | None = None
+) -> Tensor:
     """The gradient [entries, F] float32 of a table, by the gradient `grad` [N, levels * F] of the
-    features at `positions` [N, 3]."""
-    target = torch.zeros(grid.entries, grid.features, device=grad.device)
+    features at `positions` [N, 3]; added `to` one, if that is given."""
+    target = torch.zeros(grid.entries, grid.features, device=grad.device) if to is None else to
     _launch(_scatter, positions, target, grid, grad.contiguous())
     return target
 
@@ -69,11 +74,9 @@ def _level_arrays(grid: HashGrid, device: torch.device) -> tuple[Tensor, Tensor]
 
 
 @triton.jit
-def _axis(positions, i, inside, axis, scale):
+def _axis(x, scale):
     """Cell and fraction along an axis; NaN counts as 0."""
-    x = tl.load(positions + 3 * i + axis, mask=inside, other=0.0)
-    x = tl.minimum(tl.where(x > 0, x, 0.0), 1.0)
-    p = x * scale + 0.5
+    p = tl.minimum(tl.where(x > 0, x, 0.0), 1.0) * scale + 0.5
     cell = p.to(tl.int32)
     return cell.to(tl.uint32), p - cell.to(tl.float32)
 
@@ -98,48 +101,54 @@ def _corner(ix, iy, iz, fx, fy, fz, stride, size, corner: tl.constexpr):
 
 @triton.jit
 def _locate(positions, scales, shapes, level, i, inside):
-    """Cells and fractions of samples at a level, and the level's row of `_level_arrays`."""
+    """Cells and fractions of samples at a level, whether a sample has a NaN, and the level's row of
+    `_level_arrays`."""
     scale = tl.load(scales + level)
-    ix, fx = _axis(positions, i, inside, 0, scale)
-    iy, fy = _axis(positions, i, inside, 1, scale)
-    iz, fz = _axis(positions, i, inside, 2, scale)
+    x, y, z = vector(positions, i, inside)
+    ix, fx = _axis(x, scale)
+    iy, fy = _axis(y, scale)
+    iz, fz = _axis(z, scale)
+    lost = (x != x) | (y != y) | (z != z)
     stride = tl.load(shapes + 3 * level).to(tl.uint32)
     first = tl.load(shapes + 3 * level + 1)
     size = tl.load(shapes + 3 * level + 2).to(tl.uint32)
-    return ix, iy, iz, fx, fy, fz, stride, first, size
+    return ix, iy, iz, fx, fy, fz, lost, stride, first, size
 
 
 @triton.jit
 def _forward(positions, table, scales, shapes, features, total, channels, FEATURES: tl.constexpr):
-    level = tl.program_id(1)
+    WIDTH: tl.constexpr = triton.next_power_of_2(FEATURES)
+    level, feature = tl.program_id(1), tl.arange(0, WIDTH)[None, :]
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = i < total
-    ix, iy, iz, fx, fy, fz, stride, first, size = _locate(
+    there = inside[:, None] & (feature < FEATURES)
+    ix, iy, iz, fx, fy, fz, lost, stride, first, size = _locate(
         positions, scales, shapes, level, i, inside
     )
-    for feature in tl.static_range(FEATURES):
-        blended = tl.zeros([BLOCK], tl.float32)
-        for corner in tl.static_range(8):
-            entry, weight = _corner(ix, iy, iz, fx, fy, fz, stride, size, corner)
-            value = tl.load(table + (first + entry) * FEATURES + feature, mask=inside, other=0.0)
-            blended += weight * value.to(tl.float32)
-        out = features + i * channels + level * FEATURES + feature
-        tl.store(out, blended.to(features.dtype.element_ty), mask=inside)
+    blended = tl.zeros([BLOCK, WIDTH], tl.float32)
+    for corner in tl.static_range(8):
+        entry, weight = _corner(ix, iy, iz, fx, fy, fz, stride, size, corner)
+        place = table + (first + entry)[:, None] * FEATURES + feature
+        blended += weight[:, None] * tl.load(place, mask=there, other=0.0).to(tl.float32)
+    blended = tl.where(lost[:, None], float("nan"), blended)
+    out = features + i[:, None] * channels + level * FEATURES + feature
+    tl.store(out, blended.to(features.dtype.element_ty), mask=there)
 
 
 @triton.jit
 def _scatter(positions, target, scales, shapes, grad, total, channels, FEATURES: tl.constexpr):
     """Adjoint of `_forward`: target[corner] += weight * grad."""
-    level = tl.program_id(1)
+    WIDTH: tl.constexpr = triton.next_power_of_2(FEATURES)
+    level, feature = tl.program_id(1), tl.arange(0, WIDTH)[None, :]
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = i < total
-    ix, iy, iz, fx, fy, fz, stride, first, size = _locate(
+    ix, iy, iz, fx, fy, fz, lost, stride, first, size = _locate(
         positions, scales, shapes, level, i, inside
     )
-    for feature in tl.static_range(FEATURES):
-        of_feature = grad + i * channels + level * FEATURES + feature
-        share = tl.load(of_feature, mask=inside, other=0.0).to(tl.float32)
-        for corner in tl.static_range(8):
-            entry, weight = _corner(ix, iy, iz, fx, fy, fz, stride, size, corner)
-            place = target + (first + entry) * FEATURES + feature
-            tl.atomic_add(place, weight * share, mask=inside, sem="relaxed")
+    there = (inside & ~lost)[:, None] & (feature < FEATURES)
+    of_features = grad + i[:, None] * channels + level * FEATURES + feature
+    share = tl.load(of_features, mask=there, other=0.0).to(tl.float32)
+    for corner in tl.static_range(8):
+        entry, weight = _corner(ix, iy, iz, fx, fy, fz, stride, size, corner)
+        place = target + (first + entry)[:, None] * FEATURES + feature
+        tl.atomic_add(place, weight[:, None] * share, mask=there, sem="relaxed")

@@ -1,0 +1,51 @@
+"""`make gpu`, rehearsed to its end on a pretended GPU."""
+
+import importlib.util
+import json
+import subprocess
+import sys
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+from pathlib import Path
+
+import pytest
+
+from sweeps.cli import dispatch, guard
+from tests.pretended_gpu import PretendedGpu
+
+_spec = importlib.util.spec_from_file_location(
+    "gpu_report", Path(__file__).parents[1] / "docs" / "gpu.py"
+)
+report = importlib.util.module_from_spec(_spec)
+sys.modules["gpu_report"] = report
+_spec.loader.exec_module(report)
+
+TINY = [
+    *("scene.width=16", "scene.train=4", "scene.test=3", "protocol.lpips=[]", "protocol.warmup=0"),
+    *("budget.steps=2", "budget.samples=512", "budget.renderer_steps=1", "budget.frames=2"),
+    *("method.grid.log2_table=8", "method.training.max_rays=64", "pictures=0"),
+    *("method.training.grid_samples=512", "exclusive=false"),
+]
+
+
+def in_this_process(step: report.Step) -> subprocess.CompletedProcess[str]:
+    """Where the pretended GPU is."""
+    printed, said = StringIO(), StringIO()
+    with redirect_stdout(printed), redirect_stderr(said):
+        status = guard(dispatch, step.words)
+    return subprocess.CompletedProcess(step.words, status, printed.getvalue(), said.getvalue())
+
+
+def test_it_goes_to_its_end_and_says_what_failed(
+    gpu: PretendedGpu, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(report, "ran", in_this_process)
+    assert report.main(["--filter", "hash adam", *TINY]) == 1
+    ended = {
+        file.stem: json.loads(file.read_text())["done"][0]
+        for file in Path("outputs/gpu").glob("*.json")
+    }
+    assert [name for name, status in ended.items() if status] == ["tensorrt-fp16", "tensorrt-int8"]
+    text = Path("outputs/gpu/report.md").read_text()
+    print(text)
