@@ -1,4 +1,4 @@
-"""Triton's interpreter, as unforgiving as a GPU: programs in any order, no stray access, no race."""
+"""Triton's interpreter, as unforgiving as a GPU: any order of programs, no race or stray access."""
 
 from __future__ import annotations
 
@@ -18,13 +18,8 @@ class Launch:
 
     def __init__(self, tensors: list[Tensor], random: np.random.Generator) -> None:
         self._random = random
-        extents = [(x, sum((n - 1) * step for n, step in zip(x.shape, x.stride()))) for x in tensors]
-        bytes_ = [
-            (x.data_ptr(), x.data_ptr() + (last + 1) * x.element_size())
-            for x, last in extents
-            if x.numel()
-        ]
-        self._begins, self._ends = np.array(sorted(bytes_), np.uint64).reshape(-1, 2).T
+        ranges = sorted(_range(x) for x in tensors if x.numel())
+        self._begins, self._ends = np.array(ranges, np.uint64).reshape(-1, 2).T
         self._program = 0
         self._accesses: list[np.ndarray] = []  # address, program and kind: [N, 3]
 
@@ -60,6 +55,13 @@ class Launch:
         written = (kind & 1 << WRITE > 0) | ((kind & 1 << ATOMIC > 0) & (kind & 1 << READ > 0))
         if (several & written).any():
             raise RuntimeError("a race of two programs")
+
+
+def _range(tensor: Tensor) -> tuple[int, int]:
+    """Addresses of its first byte and behind its last one."""
+    steps = zip(tensor.shape, tensor.stride(), strict=True)
+    last = sum((size - 1) * step for size, step in steps)
+    return tensor.data_ptr(), tensor.data_ptr() + (last + 1) * tensor.element_size()
 
 
 @contextmanager

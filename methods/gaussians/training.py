@@ -115,7 +115,11 @@ class GaussianTraining(loop.Training):
         costs = options.opacity_cost * gaussians.opacities.mean()
         costs = costs + options.scale_cost * scales.mean()
         (loss + costs).backward()
-        errors = loop.look(self, {"": functional.mse_loss(picture, target)}, {"picture": picture})
+
+        def error() -> dict[str, Tensor]:
+            return {"": functional.mse_loss(picture, target)}
+
+        errors = loop.look(self, error, {"picture": picture})
         rate = options.means * options.final_means**share
         self.optimiser.param_groups[0]["lr"] = rate
         self.optimiser.step()

@@ -11,8 +11,8 @@ from bench.types import Probe
 from methods.kernels import multiplies_bf16
 from methods.kernels.encode import HashGrid, SampleGradients, collect, encode, pack
 from methods.kernels.mlp import mlp
+from methods.kernels.shade import harmonics
 from methods.kernels.spherical import CHANNELS as DIRECTION_CHANNELS
-from methods.kernels.spherical import spherical_harmonics
 from methods.rendering.field import (
     BATCH_QUANTUM,
     CACHED_SAMPLES,
@@ -90,7 +90,7 @@ class HashField(nn.Module):
     def encode_directions(self, directions: Tensor) -> Tensor:
         """Spherical harmonics [R, 16] of ray `directions` [R, 3] of any length."""
         unit = functional.normalize(directions, dim=-1)
-        return spherical_harmonics(unit).to(self._compute_dtype)
+        return harmonics(unit, backend=self.backend).to(self._compute_dtype)
 
     def encode(self, positions: Tensor) -> Tensor:
         """Features [S, channels] of the table at `positions` [S, 3]."""

@@ -42,7 +42,6 @@ class PixelBatches:
         self._pixels = torch.cat([p.to(device) for p in pictures])  # [P, 3 or 4] uint8
         ends = torch.tensor([len(picture) for picture in pictures]).cumsum(0)
         self._ends = ends.to(device)  # of each picture in `_pixels`
-        self._starts = functional.pad(ends[:-1], (1, 0)).to(device)
         self._counted: Tensor | None = None  # numbers of the pixels that count; None: all do
         if split.masks:
             pairs = zip(split.images, split.masks, strict=True)
@@ -53,17 +52,19 @@ class PixelBatches:
                 raise unexpected("masks of the training pictures", "a pixel that counts", "none")
 
         cameras = split.cameras
-        self._widths = torch.tensor([c.width for c in cameras], device=device)
-        self._heights = torch.tensor([c.height for c in cameras], device=device)
+        starts = (0, *ends.tolist())
+        # Where each picture starts in `_pixels`, its width and height.
+        of_each = [(start, c.width, c.height) for start, c in zip(starts, cameras, strict=False)]
+        self._pictures = torch.tensor(of_each, device=device)
         # In double precision, because corner and steps cancel for the most part.
         poses = torch.stack([c.c2w for c in cameras]).double().cpu()  # [N, 3, 4]
         inside = [(c.fx, c.fy, c.cx, c.cy) for c in cameras]
         fx, fy, cx, cy = torch.tensor(inside, dtype=torch.float64).T[..., None]
-        # A step in the picture, to the right and down, and the ray through its upper left corner.
+        # A step in the picture, to the right and down, the ray through its upper left corner, and
+        # the centre: [N, 4, 3].
         right, down = poses[:, :, 0] / fx, poses[:, :, 1] / fy
         corner = poses[:, :, 2] - cx * right - cy * down
-        self._steps = [step.float().to(device) for step in (right, down)]  # [N, 3] each
-        self._corners, self._centres = (x.float().to(device) for x in (corner, poses[:, :, 3]))
+        self._rays = torch.stack((right, down, corner, poses[:, :, 3]), dim=1).float().to(device)
 
     def __len__(self) -> int:
         return len(self._pixels if self._counted is None else self._counted)
@@ -84,19 +85,19 @@ class PixelBatches:
         if self._counted is not None:
             pixel = self._counted.index_select(0, pixel)
         view = torch.searchsorted(self._ends, pixel, right=True)
-        width, height = (sides.index_select(0, view) for sides in (self._widths, self._heights))
-        within = pixel - self._starts.index_select(0, view)
+        start, width, height = self._pictures.index_select(0, view).unbind(dim=1)
+        within = pixel - start
         strip = within // (STRIP * height)
         left = STRIP * strip
         strip_width = (width - left).clamp(max=STRIP)  # the last strip of a picture may be narrower
         within -= left * height
         row = within // strip_width
         column = left + within - row * strip_width
-        right, down = (step.index_select(0, view) for step in self._steps)
-        directions = self._corners.index_select(0, view)
-        directions.addcmul_(column[:, None] + 0.5, right).addcmul_(row[:, None] + 0.5, down)
+        right, down, corner, centre = self._rays.index_select(0, view).unbind(dim=1)
+        directions = corner.addcmul(column[:, None] + 0.5, right)
+        directions.addcmul_(row[:, None] + 0.5, down)
         colours = self._pixels.index_select(0, pixel).float() / 255
-        return Rays(self._centres.index_select(0, view), directions), colours
+        return Rays(centre, directions), colours
 
 
 class ErrorMap:

@@ -128,12 +128,15 @@ class PixelTraining(loop.Training, ABC):
         pixels, samples = self._render(rays, jitter, background)
         each = (pixels.values - target).square().mean(dim=1)
         loss = each.mean()
-        shown = each[:alike].mean() + 0 * loss  # not finite if any error is not
         entropy = opacity_entropy(pixels.alpha)
         (loss + self.options.opacity_entropy * entropy).backward()
         if self.errors is not None:
             self.errors.learn(numbers, each.detach())
-        errors = loop.look(self, {"": shown}, {"loss": loss, "rendered pixels": pixels.values})
+
+        def shown() -> dict[str, Tensor]:
+            return {"": each[:alike].mean() + 0 * loss}  # not finite if any error is not
+
+        errors = loop.look(self, shown, {"loss": loss, "rendered pixels": pixels.values})
         self._update()
         self._fit_batch(samples)
         self.step += 1

@@ -113,10 +113,10 @@ def clearance(used: Tensor) -> Tensor:
     return apart.where(apart >= 0, len(used)).clamp(max=255).to(used.device, torch.uint8)
 
 
-def total_and_longest(counts: Tensor) -> list[int]:
-    """How many samples rays with `counts` [R] have, and how many the one with the most. The host
-    waits for a GPU, once."""
-    return torch.stack((counts.sum(), functional.pad(counts, (0, 1)).amax())).tolist()
+def total_and_longest(counts: Tensor, offsets: Tensor) -> list[int]:
+    """How many samples rays with `counts` [R] have, and how many the one with the most; `offsets`
+    are those `of` the counts. The host waits for a GPU, once."""
+    return torch.stack((offsets[-1], counts.amax())).tolist() if len(counts) else [0, 0]
 
 
 def offsets_of(counts: Tensor) -> Tensor:
@@ -140,8 +140,8 @@ class Intervals:
 
     def front(self, counts: Tensor) -> Self:
         """Only the first `counts` [R] samples of each ray. The host waits for a GPU."""
-        total, longest = total_and_longest(counts)
         offsets = offsets_of(counts)
+        total, longest = total_and_longest(counts, offsets)
         shift = (self.offsets - offsets)[:-1].repeat_interleave(counts, output_size=total)
         index = torch.arange(total, device=shift.device) + shift
         return self.chosen(index, offsets, longest)

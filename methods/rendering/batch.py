@@ -119,7 +119,7 @@ def visible_samples(
         else:
             parts = pad(samples.positions).split(CHUNK_SAMPLES)
             judge = field if teacher is None else teacher
-            sigma = torch.cat([judge.density(part)[0] for part in parts])[: len(samples)]
+            sigma = cat([judge.density(part)[0] for part in parts])[: len(samples)]
         counts, left = visible(sigma, samples, stop=how.stop, front=front, backend=field.backend)
         rounds.append(Round(chosen, samples, sigma, counts))
         if limit is None:
@@ -144,23 +144,23 @@ def _encoded_densities(field: Encoder, samples: Samples) -> tuple[Tensor, Sample
     for part in pad(samples.positions).split(size):
         encoded.append(field.encode(part))
         sigma.append(field.density(part, encoded[-1])[0])
-    known = torch.cat(encoded)[: len(samples)]
-    return torch.cat(sigma)[: len(samples)], replace(samples, encoded=known)
+    known = cat(encoded)[: len(samples)]
+    return cat(sigma)[: len(samples)], replace(samples, encoded=known)
 
 
 def thinned(rounds: list[Round], thin: float, turns: Tensor) -> Samples:
     """The visible samples, numbered along each ray from its turn [R] on. Of those below the optical
     depth `thin`, the ones stay whose number `KEPT_THIN` divides, with the length of all."""
-    rays = torch.arange(len(turns), dtype=torch.int32, device=turns.device)
     numbers, shown, of_ray = [], [], []
     for some in rounds:
-        own = some.samples.ray
+        own, chosen = some.samples.ray, some.chosen
         number = torch.arange(len(own), device=own.device)
         number -= some.samples.offsets.index_select(0, own)
         shown.append(number < some.counts.index_select(0, own))
-        numbers.append(number + turns[some.chosen].index_select(0, own))
-        of_ray.append(rays[some.chosen].index_select(0, own))
-        turns[some.chosen] += some.counts  # all samples of a ray that goes on are visible
+        numbers.append(number + turns[chosen].index_select(0, own))
+        of_ray.append(own if isinstance(chosen, slice) else chosen.int().index_select(0, own))
+        if some is not rounds[-1]:
+            turns[chosen] += some.counts  # all samples of a ray that goes on are visible
     every = [some.samples for some in rounds]
     delta, ray = cat([samples.delta for samples in every]), cat(of_ray)
     faint = cat([some.sigma for some in rounds]) * delta < thin
@@ -177,12 +177,11 @@ def thinned(rounds: list[Round], thin: float, turns: Tensor) -> Samples:
         positions=cat([samples.positions for samples in every]),
         encoded=cat(encoded) if encoded else None,
     )
-    return together.chosen(
-        # Those of a ray lie in memory in their order, round after round.
-        index.index_select(0, ray_of_kept.argsort(stable=True)),
-        offsets_of(counts),
-        every[0].longest if len(rounds) == 1 else None,  # one round: it has no more
-    )
+    if len(rounds) == 1:  # its samples lie in memory ray by ray, and no ray has more
+        return together.chosen(index, offsets_of(counts), every[0].longest)
+    # Those of a ray lie in memory in their order, round after round.
+    in_order = index.index_select(0, ray_of_kept.argsort(stable=True))
+    return together.chosen(in_order, offsets_of(counts), None)
 
 
 def opacity_entropy(opacity: Tensor) -> Tensor:

@@ -73,14 +73,18 @@ def query(
         assert isinstance(field, Encoder)
         sigma, geometry = field.density(pad(positions), pad(encoded))
     values = field.features(geometry, directions.index_select(0, pad(ray)))
+    if len(sigma) == len(positions):  # a gradient would be copied for a part
+        return sigma, values
     return sigma[: len(positions)], values[: len(positions)]
 
 
 def pad(samples: Tensor) -> Tensor:
-    """Pad [S, ...] with zeros to a multiple of `BATCH_QUANTUM`. oneDNN prepares code for every new
-    matrix size, which takes longer than the product itself, so a field should see only a few round
-    batch sizes."""
+    """Pad [S, ...] on a CPU with zeros to a multiple of `BATCH_QUANTUM`. oneDNN prepares code for
+    every new matrix size, which takes longer than the product itself, so a field should see only a
+    few round batch sizes."""
     padding = -len(samples) % BATCH_QUANTUM
+    if not padding or samples.device.type != "cpu":
+        return samples
     return functional.pad(samples, (0, 0) * (samples.dim() - 1) + (0, padding))
 
 

@@ -14,7 +14,7 @@ from methods.kernels.composite import composite, weights
 from methods.kernels.march import march
 from methods.kernels.types import BRICK, Occupancy, Pixels, Samples
 from methods.rendering.compaction import compacts
-from methods.rendering.field import CACHED_SAMPLES, CHUNK_SAMPLES, Field, pad, query
+from methods.rendering.field import CACHED_SAMPLES, CHUNK_SAMPLES, Field, cat, pad, query
 from methods.rendering.sampling import Sampling
 
 CHUNK_RAYS = 1 << 16
@@ -133,61 +133,74 @@ def render_rays(
     once a round, for the number of samples. Rounds begin with a single sample of each ray and at
     least double.
     """
-    count, device = len(rays.origins), rays.origins.device
-    window, backend = how.window, field.backend
+    size = CHUNK_RAYS if compacts(rays.origins.device) else GPU_RAYS
+    parts = []
+    for first in range(0, max(len(rays.origins), 1), size):
+        chunk = slice(first, first + size)
+        window = None if how.window is None else how.window[chunk]
+        chunk_how = replace(how, window=window)
+        parts.append(_render_chunk(field, rays.take(chunk), occupancy, probe, chunk_how).columns)
+    return Pixels(*map(cat, zip(*parts, strict=True)))
+
+
+def _render_chunk(
+    field: Field, rays: Rays, occupancy: Occupancy, probe: Probe, how: Sampling
+) -> Pixels:
+    """`render_rays` for rays that are rendered together."""
+    count, device, window = len(rays.origins), rays.origins.device, how.window
+    with probe.stage("field"):
+        directions = field.encode_directions(rays.directions)
     canvas = Pixels.blank(count, field.channels, device)
 
-    def advance(index: Tensor | slice, start: Tensor, limit: int) -> tuple[int, Tensor, Tensor]:
-        """Composite the next samples of some rays; return how many there were, where the rays
-        resume, and which of them do."""
+    def advance(
+        index: Tensor | slice, front: Pixels, start: Tensor, limit: int
+    ) -> tuple[int, Pixels, Tensor, Tensor]:
+        """Composite the next samples of some rays behind `front`; return how many there were, the
+        pixels, where the rays resume, and which of them do."""
         with probe.stage("march"):
-            some, seen = rays.take(index), None if window is None else window[index]
             samples = march(
-                some,
+                rays.take(index),
                 occupancy,
                 how.step,
-                window=seen,
+                window=None if window is None else window[index],
                 start=start,
                 limit=limit,
-                backend=backend,
+                backend=field.backend,
             )
         probe.count("samples", len(samples))
-        front = canvas.take(index)
         if len(samples):
-            sigma, values = _evaluated(field, samples, some.directions, front, how, probe)
+            sigma, values = _evaluated(field, samples, directions[index], front, how, probe)
             with probe.stage("composite"):
                 front = composite(
-                    sigma, values, samples, stop=how.stop, carry=front, backend=backend
+                    sigma, values, samples, stop=how.stop, carry=front, backend=field.backend
                 )
-                canvas.put(index, front)
-        return len(samples), samples.resume, (samples.resume >= 0) & (1 - front.alpha > how.stop)
+        open_ = (samples.resume >= 0) & (1 - front.alpha > how.stop)
+        return len(samples), front, samples.resume, open_
 
-    for first in range(0, count, CHUNK_RAYS if compacts(device) else GPU_RAYS):
-        if compacts(device):
-            left = torch.arange(first, min(first + CHUNK_RAYS, count))
-            start, whole = torch.zeros(len(left), dtype=torch.int32), len(left)
-            while len(left):
-                limit = field.round_samples * max(whole // (2 * len(left)), 1)
-                _, resume, open_ = advance(left, start, limit)
-                with probe.stage("composite"):
-                    going = open_.nonzero().squeeze(1)
-                    left, start = left[going], resume[going]
-        else:
-            chunk = slice(first, min(first + GPU_RAYS, count))
-            start = torch.zeros(chunk.stop - first, dtype=torch.int32, device=device)
-            limit = taken = most = GPU_SAMPLES
-            while taken >= limit:  # else no ray resumes: each would have taken as many as it may
-                taken, resume, open_ = advance(chunk, start, limit)
-                start, most = torch.where(open_, resume, -1), max(most, taken)
-                limit *= max(most // (2 * taken), 2) if taken else 1
+    start = torch.zeros(count, dtype=torch.int32, device=device)
+    if compacts(device):
+        left = torch.arange(count)
+        while len(left):
+            limit = field.round_samples * max(count // (2 * len(left)), 1)
+            _, front, resume, open_ = advance(left, canvas.take(left), start, limit)
+            with probe.stage("composite"):
+                canvas.put(left, front)
+                going = open_.nonzero().squeeze(1)
+                left, start = left[going], resume[going]
+        return canvas
+    limit = taken = most = GPU_SAMPLES
+    while taken >= limit:  # else no ray resumes: each would have taken as many as it may
+        taken, canvas, resume, open_ = advance(slice(None), canvas, start, limit)
+        start, most = torch.where(open_, resume, -1), max(most, taken)
+        limit *= max(most // (2 * taken), 2) if taken else 1
     return canvas
 
 
 def _evaluated(
-    field: Field, samples: Samples, directions: Tensor, front: Pixels, how: Sampling, probe: Probe
+    field: Field, samples: Samples, encoded: Tensor, front: Pixels, how: Sampling, probe: Probe
 ) -> tuple[Tensor, Tensor]:
     """Density [S] and features [S, K] of `samples` behind the pixels in `front`; features of faint
-    samples are 0."""
+    samples are 0. `encoded` [R, D] are the directions of the rays."""
 
     def bright(sigma: Tensor) -> Tensor:
         through = 1 - front.alpha
@@ -195,7 +208,6 @@ def _evaluated(
         return weight > how.least_weight
 
     with probe.stage("field"):
-        encoded = field.encode_directions(directions)
         if compacts(samples.t.device):
             sigma, geometry = field.density(pad(samples.positions))
             sigma = sigma[: len(samples)]
@@ -209,7 +221,7 @@ def _evaluated(
         else:
             columns = samples.positions.split(CHUNK_SAMPLES), samples.ray.split(CHUNK_SAMPLES)
             parts = [query(field, *piece, encoded) for piece in zip(*columns, strict=True)]
-            sigma, values = (torch.cat(column) for column in zip(*parts, strict=True))
+            sigma, values = map(cat, zip(*parts, strict=True))
             shaded, values = len(samples), torch.where(bright(sigma)[:, None], values, 0)
     probe.count("shaded_samples", shaded, len(samples))
     field.count(probe, len(samples), shaded)

@@ -144,7 +144,7 @@ class JointTraining(loop.Training):
         if self.trained and len(batch.opacity):
             loss = error + self.options.opacity_entropy * opacity_entropy(batch.opacity)
         loss.backward()
-        errors = loop.look(self, {"": error}, {"loss": error, "picture": pictures})
+        errors = loop.look(self, lambda: {"": error}, {"loss": error, "picture": pictures})
         rate = self.rate_now(self.options.rate)
         for name, optimiser in self._of_renderer.items():
             loop.step_at(optimiser, MUON * rate if name == "muon" else rate)

@@ -133,7 +133,7 @@ class StudentTraining(PixelTraining):
         directions = torch.randn(shape, generator=self.generator, device=device)
         loss = self._difference(positions, functional.normalize(directions, dim=1))
         loss.backward()
-        errors = loop.look(self, {"": loss}, {"loss": loss})
+        errors = loop.look(self, lambda: {"": loss}, {"loss": loss})
         self._update()
         self.step += 1
         return errors

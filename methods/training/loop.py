@@ -161,16 +161,17 @@ def resume(training: Training, path: Path) -> None:
 
 
 def look(
-    training: Training, errors: Mapping[str, Tensor], tensors: Mapping[str, Tensor]
+    training: Training, errors: Callable[[], Mapping[str, Tensor]], tensors: Mapping[str, Tensor]
 ) -> dict[str, float]:
     """Return the `errors` of a step as numbers; raise `SteerbenchError` if one is not finite, with
     the names of the `tensors` that are not. On a GPU this happens every `LOOK_EVERY` steps, with
     the errors that were requested the time before, which have arrived meanwhile; in all other steps
     there are none."""
-    on_cpu = all(error.device.type == "cpu" for error in errors.values())
+    on_cpu = all(tensor.device.type == "cpu" for tensor in tensors.values())
     if not on_cpu and training.step % LOOK_EVERY:
         return {}
-    before, training.asked = training.asked, _ask(errors)
+    with torch.no_grad():
+        before, training.asked = training.asked, _ask(errors())
     asked = training.asked if on_cpu else before
     told = {} if asked is None else asked()
     if not all(map(math.isfinite, told.values())):

@@ -322,7 +322,7 @@ def test_by_triton_it_trains_and_renders_as_on_the_cpu(
 
 ROWS = {
     "ngp": "gpu, but reference: mlp",
-    "gaussians": "gpu, but reference: blending, mlp, projection, shade, ssim",
+    "gaussians": "gpu, but reference: blending, mlp, projection, ssim",
     "kilonerf": "gpu, but reference: grouped_mlp, mlp",
 }
 

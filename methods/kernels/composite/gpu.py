@@ -30,7 +30,8 @@ def light(
 ) -> tuple[Tensor, Tensor, Tensor]:
     check_float32(sigma=sigma, delta=intervals.delta, front=front)
     samples = [x.contiguous() for x in (sigma, intervals.delta, intervals.offsets, front)]
-    found = torch.zeros_like(samples[0]), samples[2].new_zeros(len(front)), samples[3].clone()
+    counts, left = samples[2].new_empty(len(front)), torch.empty_like(samples[3])
+    found = torch.zeros_like(samples[0]), counts, left
     launch(_light, (len(front),), *samples, stop, *found, num_warps=1)
     return found
 
@@ -39,22 +40,24 @@ class _TritonComposite(torch.autograd.Function):
     @staticmethod
     def forward(ctx, sigma, values, t, delta, offsets, stop, carry):
         rays, channels = len(offsets) - 1, values.shape[1]
-        pixels = Pixels.blank(rays, channels, sigma.device) if carry is None else carry.copy()
-        front = 1 - pixels.alpha
+        pixels = [sigma.new_empty(shape) for shape in ((rays, channels), rays, rays)]
+        before = [None] * 3 if carry is None else [x.contiguous() for x in carry.columns]
         samples = [x.contiguous() for x in (sigma, values, t, delta, offsets)]
-        given = *samples, front, stop, *pixels.columns
-        launch(_forward, (rays,), *given, CHANNELS=channels, num_warps=1)
-        ctx.save_for_backward(*samples, front)
+        launch(_forward, (rays,), *samples, *before, stop, *pixels, CHANNELS=channels, num_warps=1)
+        ctx.save_for_backward(*samples, before[2])
         ctx.stop = stop
-        return pixels.columns
+        return tuple(pixels)
 
     @staticmethod
     def backward(ctx, *grads):
-        *samples, front = ctx.saved_tensors
-        grad_sigma, grad_samples = torch.zeros_like(samples[0]), torch.zeros_like(samples[1])
-        given = *samples, front, ctx.stop, *(x.contiguous() for x in grads)
-        results, channels = (grad_sigma, grad_samples), samples[1].shape[1]
-        launch(_backward, (len(front),), *given, *results, CHANNELS=channels, num_warps=1)
+        *samples, before = ctx.saved_tensors
+        sizes = samples[0].numel(), samples[1].numel()
+        grad_sigma, grad_samples = samples[0].new_zeros(sum(sizes)).split(sizes)
+        grad_samples = grad_samples.view_as(samples[1])
+        given = *samples, before, ctx.stop, *(x.contiguous() for x in grads)
+        rays, channels = len(samples[4]) - 1, samples[1].shape[1]
+        results = grad_sigma, grad_samples
+        launch(_backward, (rays,), *given, *results, CHANNELS=channels, num_warps=1)
         return grad_sigma, grad_samples, None, None, None, None, None
 
 
@@ -81,15 +84,35 @@ def _block(sigma, delta, first, i, inside, light, stop):
 
 
 @triton.jit
+def _number(column, ray):
+    """That of a ray in a column, 0 without one."""
+    return tl.zeros([], tl.float32) if column is None else tl.load(column + ray)
+
+
+@triton.jit
 def _forward(
-    sigma, values, t, delta, offsets, front, stop, out, depth_sum, alpha, CHANNELS: tl.constexpr
+    sigma,
+    values,
+    t,
+    delta,
+    offsets,
+    values_before,
+    depth_before,
+    alpha_before,
+    stop,
+    out,
+    depth_sum,
+    alpha,
+    CHANNELS: tl.constexpr,
 ):
     ray = tl.program_id(0).to(tl.int64)
     first, end = tl.load(offsets + ray), tl.load(offsets + ray + 1)
-    light = tl.load(front + ray)
     channel, there = _channels(CHANNELS)
-    sums = tl.load(out + ray * CHANNELS + channel, mask=there, other=0.0)
-    depth, covered = tl.load(depth_sum + ray), tl.load(alpha + ray)
+    sums = tl.zeros_like(channel).to(tl.float32)
+    if values_before is not None:
+        sums = tl.load(values_before + ray * CHANNELS + channel, mask=there, other=0.0)
+    depth, covered = _number(depth_before, ray), _number(alpha_before, ray)
+    light = 1 - covered
     while (first < end) & (light > stop):
         i = first + tl.arange(0, BLOCK)
         weight, lit, _, light = _block(sigma, delta, first, i, i < end, light, stop)
@@ -146,7 +169,7 @@ def _backward(
     t,
     delta,
     offsets,
-    front,
+    alpha_before,
     stop,
     grad_out,
     grad_depth,
@@ -165,7 +188,7 @@ def _backward(
     shine = tl.load(grad_out + ray * CHANNELS + channel, mask=there, other=0.0)
     of_depth, of_alpha = tl.load(grad_depth + ray), tl.load(grad_alpha + ray)
 
-    first, light, rest = begin, tl.load(front + ray), 0.0
+    first, light, rest = begin, 1 - _number(alpha_before, ray), 0.0
     while (first < end) & (light > stop):
         i = first + tl.arange(0, BLOCK)
         weight, lit, _, light = _block(sigma, delta, first, i, i < end, light, stop)
@@ -176,7 +199,7 @@ def _backward(
         first += BLOCK
 
     # `rest` is now the sum over all samples; minus those passed, it is the sum behind.
-    first, light = begin, tl.load(front + ray)
+    first, light = begin, 1 - _number(alpha_before, ray)
     while (first < end) & (light > stop):
         i = first + tl.arange(0, BLOCK)
         weight, lit, behind, light = _block(sigma, delta, first, i, i < end, light, stop)

@@ -12,6 +12,7 @@ Where the grid is of contracted space, rays start at the camera, the steps are t
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -74,6 +75,13 @@ def longest_ray(step: float) -> int:
     return math.ceil(math.sqrt(3) / step) + 1
 
 
+@cache
+def _usual(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+    """Window, phase and first step of a ray for which none is given."""
+    window, jitter = (torch.tensor(x, dtype=dtype, device=device) for x in ([0, math.inf], [0.5]))
+    return window, jitter, torch.zeros(1, dtype=torch.int32, device=device)
+
+
 def _segments(
     rays: Rays,
     step: float,
@@ -83,14 +91,11 @@ def _segments(
     limit: int | None,
 ) -> Segments:
     """Check the arguments of `march` and fill in defaults."""
-    origins, count = rays.origins, check_rays(rays)
-    if window is None:
-        ends = origins.new_zeros(()), origins.new_full((), torch.inf)
-        window = torch.stack(ends).expand(count, 2)
-    if jitter is None:
-        jitter = origins.new_full((1,), 0.5).expand(count)
-    if start is None:
-        start = torch.zeros(1, dtype=torch.int32, device=origins.device).expand(count)
+    count = check_rays(rays)
+    every, middle, first = _usual(rays.origins.device, rays.origins.dtype)
+    window = every.expand(count, 2) if window is None else window
+    jitter = middle.expand(count) if jitter is None else jitter
+    start = first.expand(count) if start is None else start
     check_shape("window", window, count, 2)
     check_shape("jitter", jitter, count)
     check_shape("start", start, count)

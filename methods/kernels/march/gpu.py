@@ -8,71 +8,90 @@ from typing import Any
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
+from methods.kernels import types
 from methods.kernels.dispatch import interpreted
 from methods.kernels.gpu import check_float32, launch, vector
-from methods.kernels.march import Segments
-from methods.kernels.march.contraction import Course
-from methods.kernels.march.reference import clip, course_of, slopes
+from methods.kernels.march import LEAST_STEP, Segments, contraction
 from methods.kernels.types import BRICK, Occupancy, Samples, offsets_of, total_and_longest
 
 BLOCK = 128 if interpreted() else 32
 """Rays per program: one warp, which waits for its longest ray. The interpreter takes as long for
 many as for few."""
 
+PARALLEL, LEAST = tl.constexpr(types.PARALLEL), tl.constexpr(LEAST_STEP)
+HALF = tl.constexpr(contraction.HALF)
+
 
 def march(segments: Segments, occupancy: Occupancy) -> Samples:
-    course = course_of(segments, occupancy)
-    arguments = _arguments(segments, occupancy, course)
-    counts, resume = _counted(arguments)
-    device, (total, longest) = counts.device, total_and_longest(counts)
+    rays, window = segments.rays, segments.window
+    origins, directions = rays.origins.contiguous(), rays.directions.contiguous()
+    check_float32(origins=origins, directions=directions, window=window, jitter=segments.jitter)
+    count, device = len(origins), origins.device
+    arguments = [
+        *(
+            origins,
+            directions,
+            window,
+            *window.stride(),
+            segments.jitter,
+            *segments.jitter.stride(),
+        ),
+        *(segments.start, *segments.start.stride(), segments.step, segments.limit, count),
+        *(occupancy.words, occupancy.clearance, occupancy.resolution // BRICK),
+        occupancy.contracted,
+    ]
+    counts = torch.empty(count, dtype=torch.int64, device=device)
+    resume = torch.empty(count, dtype=torch.int32, device=device)
+    _launch(count, *arguments, counts, resume, *[None] * 5)
     offsets = offsets_of(counts)
+    total, longest = total_and_longest(counts, offsets)
     ray = torch.empty(total, dtype=torch.int32, device=device)
-    t, positions = (torch.empty(*shape, device=device) for shape in ((total,), (total, 3)))
-    _launch(arguments, counts, resume, offsets, ray, t, positions)
-    delta = torch.full_like(t, segments.step) if course is None else course.lengths(ray, t)
+    t, delta, positions = torch.empty(5 * total, device=device).split((total, total, 3 * total))
+    positions = positions.view(total, 3)
+    _launch(count, *arguments, None, None, offsets, ray, t, delta, positions)
     return Samples(t, delta, offsets, ray, positions, resume, longest=longest)
 
 
-def _arguments(segments: Segments, occupancy: Occupancy, course: Course | None) -> list[Any]:
-    """The arguments of `_march` for rays and grid; the last one is R."""
-    origins, directions = segments.rays.origins, segments.rays.directions
-    window, jitter = segments.window, segments.jitter
-    check_float32(origins=origins, directions=directions, window=window, jitter=jitter)
-    near, far, step_t, alive = clip(segments, course)
-    # Clamped to the cube: a window may lie outside it, beyond the range of integers.
-    lowest = torch.minimum(torch.maximum(window[:, 0], near), far)
-    if course is None:
-        along = slopes(directions)[0]
-    else:
-        along = torch.stack((course.middle, course.reach, course.first), dim=1)
-        step_t = torch.full_like(step_t, course.width)
-    given = (origins, directions, along, near, far, step_t, lowest, jitter)
-    return [
-        *(x.contiguous() for x in given),
-        torch.where(alive, segments.start, -1).int(),
-        occupancy.words,
-        occupancy.clearance,
-        occupancy.resolution // BRICK,
-        segments.limit,
-        occupancy.contracted,
-        len(origins),
-    ]
+def _launch(rays: int, *arguments: Any) -> None:
+    launch(_march, (triton.cdiv(rays, BLOCK),), *arguments, BLOCK=BLOCK, num_warps=1)
 
 
-def _counted(arguments: list[Any]) -> tuple[Tensor, Tensor]:
-    """How many samples each ray has, and where it resumes, [R] each."""
-    origins, rays = arguments[0], arguments[-1]
-    counts = torch.zeros(rays, dtype=torch.int64, device=origins.device)
-    resume = torch.full((rays,), -1, dtype=torch.int32, device=origins.device)
-    _launch(arguments, counts, resume, None, None, None, None)
-    return counts, resume
+@triton.jit
+def _finite(x):
+    return tl.abs(x) < float("inf")  # and not NaN
 
 
-def _launch(arguments: list[Any], *outputs: Tensor | None) -> None:
-    grid = (triton.cdiv(arguments[-1], BLOCK),)
-    launch(_march, grid, *arguments, *outputs, BLOCK=BLOCK, num_warps=1)
+@triton.jit
+def _crossed(o, d):
+    """Change of t per length along an axis, and the t at which a ray enters and leaves the cube
+    along it: `reference.slopes` and `reference.crossed`."""
+    parallel = tl.abs(d) < PARALLEL
+    slope = tl.where(parallel, 0.0, tl.div_rn(1.0, tl.where(parallel, 1.0, d)))
+    first, second = -o * slope, (1 - o) * slope
+    outside = tl.where((o >= 0) & (o <= 1), float("-inf"), float("inf"))
+    enter = tl.where(parallel, outside, tl.minimum(first, second))
+    return slope, enter, tl.where(parallel, -outside, tl.maximum(first, second))
+
+
+@triton.jit
+def _course(ox, oy, oz, dx, dy, dz, width):
+    """Middle, reach, first v, length of a step and end of rays: `contraction.Course`."""
+    ox, oy, oz = ox.to(tl.float64) - 0.5, oy.to(tl.float64) - 0.5, oz.to(tl.float64) - 0.5
+    dx, dy, dz = dx.to(tl.float64), dy.to(tl.float64), dz.to(tl.float64)
+    square = dx * dx + dy * dy + dz * dz
+    middle = -(ox * dx + oy * dy + oz * dz) / square
+    ox, oy, oz = ox + middle * dx, oy + middle * dy, oz + middle * dz
+    apart = tl.maximum(tl.sqrt(ox * ox + oy * oy + oz * oz), HALF)
+    reach = apart / tl.sqrt(square)
+    past = -middle / reach
+    beyond = 2 - 1 / tl.maximum(tl.abs(past), 1.0)
+    first = tl.where(past < 0, -beyond, beyond)
+    first = tl.where(tl.abs(past) <= 1, past, first)
+    end = middle + 2 / width.to(tl.float64) * reach
+    length = (width.to(tl.float64) * apart).to(tl.float32)
+    middle, reach, first = middle.to(tl.float32), reach.to(tl.float32), first.to(tl.float32)
+    return middle, reach, first, length, end.to(tl.float32)
 
 
 @triton.jit
@@ -142,41 +161,71 @@ def _steepness(px, py, pz, room):
 def _march(
     origins,
     directions,
-    slopes,
-    nearest,
-    farthest,
-    steps,
-    lowest,
-    phases,
+    window,
+    window_row,
+    window_column,
+    jitter,
+    jitter_row,
     starts,
+    starts_row,
+    step,
+    limit,
+    rays,
     words,
     clearance,
     side,
-    limit,
     contracted: tl.constexpr,
-    rays,
     counts,
     resume,
     offsets,
     ray_of,
     out_t,
+    out_delta,
     out_positions,
     BLOCK: tl.constexpr,
 ):
-    """Count samples and find where to resume; with `offsets`, write the samples there. In
-    `contracted` space, `slopes` are the middle, reach and first v of a `Course`."""
+    """Count samples and find where to resume; with `offsets`, write the samples there."""
     ray = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = ray < rays
-    k = tl.load(starts + ray, mask=inside, other=-1)
-    going = k >= 0
-    ox, oy, oz = vector(origins, ray, going)
-    dx, dy, dz = vector(directions, ray, going)
-    sx, sy, sz = vector(slopes, ray, going)
-    near = tl.load(nearest + ray, mask=going, other=0.0)
-    far = tl.load(farthest + ray, mask=going, other=0.0)
-    step = tl.load(steps + ray, mask=going, other=1.0)
-    low = tl.load(lowest + ray, mask=going, other=0.0)
-    phase = tl.load(phases + ray, mask=going, other=0.0)
+    ox, oy, oz = vector(origins, ray, inside)
+    dx, dy, dz = vector(directions, ray, inside)
+    low = tl.load(window + ray * window_row, mask=inside, other=0.0)
+    far = tl.load(window + ray * window_row + window_column, mask=inside, other=0.0)
+    phase = tl.load(jitter + ray * jitter_row, mask=inside, other=0.0)
+    k = tl.load(starts + ray * starts_row, mask=inside, other=-1)
+    # What is not finite ends a ray, whose numbers are replaced; minimum and maximum may drop NaN.
+    going = inside & (k >= 0) & (low == low) & (far == far) & (phase == phase)
+    going = (
+        going & _finite(ox) & _finite(oy) & _finite(oz) & _finite(dx) & _finite(dy) & _finite(dz)
+    )
+    length = dx.to(tl.float64) * dx + dy.to(tl.float64) * dy + dz.to(tl.float64) * dz
+    going = going & (length > 0)
+    length = tl.minimum(tl.sqrt(tl.where(going, length, 1.0)), 3e38).to(tl.float32)
+    delta = tl.zeros([BLOCK], tl.float32) + step
+    pace = tl.div_rn(delta, length)  # a step in t
+    going = going & (pace >= LEAST) & (pace < float("inf"))
+    ox, oy, oz = tl.where(going, ox, 0.0), tl.where(going, oy, 0.0), tl.where(going, oz, 0.0)
+    dx, dy, dz = tl.where(going, dx, 1.0), tl.where(going, dy, 0.0), tl.where(going, dz, 0.0)
+    # In contracted space, along the ray: middle, reach and first v; in a box, the slopes.
+    if contracted:
+        near, pace = delta * 0, delta * (1 / HALF)
+        sx, sy, sz, delta, end = _course(ox, oy, oz, dx, dy, dz, pace)
+        going = going & (end == end)
+    else:
+        sx, enter_x, leave_x = _crossed(ox, dx)
+        sy, enter_y, leave_y = _crossed(oy, dy)
+        sz, enter_z, leave_z = _crossed(oz, dz)
+        near = tl.maximum(tl.maximum(enter_x, enter_y), tl.maximum(enter_z, 0.0))
+        end = tl.minimum(leave_x, tl.minimum(leave_y, leave_z))
+    far = tl.minimum(end, far)
+    going = going & (near < far) & (far < float("inf"))
+    k, pace = tl.where(going, k, -1), tl.where(going, pace, 1.0)
+    near, far = tl.where(going, near, 0.0), tl.where(going, far, 0.0)
+    phase, low = tl.where(going, phase, 0.0), tl.where(going, low, 0.0)
+    ox, oy, oz = tl.where(going, ox, 0.0), tl.where(going, oy, 0.0), tl.where(going, oz, 0.0)
+    sx, sy, sz = tl.where(going, sx, 0.0), tl.where(going, sy, 1.0), tl.where(going, sz, 0.0)
+    # Clamped: a window may lie outside the cube, beyond the range of integers.
+    low = tl.minimum(tl.maximum(low, near), far)
     size = side * 4
     width = tl.div_rn(1.0, size.to(tl.float32))
     count = tl.zeros([BLOCK], tl.int64)
@@ -184,16 +233,15 @@ def _march(
     again = tl.full([BLOCK], -1, tl.int32)
     # One step less, because rounding may affect the step before.
     if contracted:
-        sy = tl.where(going, sy, 1.0)
-        ahead = tl.div_rn(_drawn_in(tl.div_rn(low - sx, sy)) - sz, step)
+        ahead = tl.div_rn(_drawn_in(tl.div_rn(low - sx, sy)) - sz, pace)
     else:
-        ahead = tl.div_rn(low - near, step)
+        ahead = tl.div_rn(low - near, pace)
     k = tl.where(going, tl.maximum(k, (ahead - phase).to(tl.int32) - 1), k)
     while tl.max(going.to(tl.int32), 0) > 0:
         if contracted:
-            t = sx + sy * _spread(sz + (k.to(tl.float32) + phase) * step)
+            t = sx + sy * _spread(sz + (k.to(tl.float32) + phase) * pace)
         else:
-            t = near + (k.to(tl.float32) + phase) * step
+            t = near + (k.to(tl.float32) + phase) * pace
         going = going & (t < far)
         t = tl.where(going, t, near)
         px, py, pz = ox + t * dx, oy + t * dy, oz + t * dz
@@ -210,6 +258,11 @@ def _march(
             place = begin + count
             tl.store(ray_of + place, ray.to(tl.int32), mask=hit)
             tl.store(out_t + place, t, mask=hit)
+            long = delta
+            if contracted:
+                r = tl.div_rn(t - sx, sy)
+                long *= tl.maximum(r * r, 1.0)
+            tl.store(out_delta + place, long, mask=hit)
             tl.store(out_positions + 3 * place, px, mask=hit)
             tl.store(out_positions + 3 * place + 1, py, mask=hit)
             tl.store(out_positions + 3 * place + 2, pz, mask=hit)
@@ -223,14 +276,14 @@ def _march(
                 room = tl.minimum(_room(px, x, free, width), _room(py, y, free, width))
                 room = tl.maximum(tl.minimum(room, _room(pz, z, free, width)), 0.0)
                 speed = tl.maximum(tl.abs(dx), tl.maximum(tl.abs(dy), tl.abs(dz)))
-                pace = tl.maximum(_steepness(px, py, pz, room) * speed, 1e-37)
-                leave = t + tl.div_rn(room, pace)
-                ahead = tl.div_rn(_drawn_in(tl.div_rn(leave - sx, sy)) - sz, step)
+                speed = tl.maximum(_steepness(px, py, pz, room) * speed, 1e-37)
+                leave = t + tl.div_rn(room, speed)
+                ahead = tl.div_rn(_drawn_in(tl.div_rn(leave - sx, sy)) - sz, pace)
             else:
                 leave = _leave_slab(ox, sx, x, free, width)
                 leave = tl.minimum(leave, _leave_slab(oy, sy, y, free, width))
                 leave = tl.minimum(leave, _leave_slab(oz, sz, z, free, width))
-                ahead = tl.div_rn(leave - near, step)
+                ahead = tl.div_rn(leave - near, pace)
             # Rounded down, so that the first step beyond the empty space is never skipped.
             ahead = tl.where(skips, ahead, 0.0) - phase
             k = tl.maximum(k, ahead.to(tl.int32))

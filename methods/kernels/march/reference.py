@@ -20,13 +20,14 @@ def march(segments: Segments, occupancy: Occupancy) -> Samples:
     steps = _Steps.of(segments, occupancy)
     parts = zip(*steps.taken(occupancy), strict=True)
     kept, counts, resume = (torch.cat(column) for column in parts)
-    total, longest = total_and_longest(counts)
+    offsets = offsets_of(counts)
+    total, longest = total_and_longest(counts, offsets)
     place = torch.nonzero_static(kept.flatten(), size=total).squeeze(1)
     ray, k = place // max(steps.most, 1), place % max(steps.most, 1)
     t, positions = steps.at(ray, k)
     course = steps.course
     delta = torch.full_like(t, segments.step) if course is None else course.lengths(ray, t)
-    where = t, delta, offsets_of(counts), ray.int(), positions, resume
+    where = t, delta, offsets, ray.int(), positions, resume
     return Samples(*where, longest=longest)
 
 

@@ -1,4 +1,4 @@
-"""Colours that change with the view direction: sums of spherical harmonics."""
+"""Spherical harmonics of view directions, and colours, which are sums of them."""
 
 from torch import Tensor
 
@@ -7,6 +7,13 @@ from methods.kernels.dispatch import implementation
 from methods.kernels.types import expect
 
 SIZES = (1, 4, 9, 16)  # number of harmonics up to degree 0, 1, 2 and 3
+
+
+def harmonics(directions: Tensor, *, backend: str = "auto") -> Tensor:
+    """`spherical_harmonics` of unit vectors `directions` [R, 3]: [R, 16]; differentiable with
+    backend="reference" only."""
+    check_shape("directions", directions, None, 3)
+    return implementation(__name__, backend, directions.device).harmonics(directions)
 
 
 def shade(coefficients: Tensor, directions: Tensor, *, backend: str = "auto") -> Tensor:

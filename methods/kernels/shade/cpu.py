@@ -24,11 +24,10 @@ def shade(coefficients: Tensor, directions: Tensor) -> Tensor:
     return _Shade.apply(coefficients, directions.contiguous())
 
 
-def basis_of(directions: Tensor) -> Tensor:
-    """`spherical_harmonics` of `directions` [R, 3]: [R, 16]."""
+def harmonics(directions: Tensor) -> Tensor:
     check_constant(directions)
     values = torch.empty(len(directions), CHANNELS)
-    _evaluate(*arrays(directions, values))
+    _evaluate(*arrays(directions.contiguous(), values))
     return values
 
 
@@ -57,7 +56,7 @@ class _Shade(torch.autograd.Function):
 
 
 @jit()
-def _harmonics(directions, first, size):
+def _block(directions, first, size):
     """A block with the harmonics of `size` directions, number k of direction i at k * `BLOCK` + i.
 
     The directions are copied into it first: in a loop over one array LLVM sees what it may
@@ -94,7 +93,7 @@ def _evaluate(directions, out):
     count = len(directions)
     for chunk in prange((count + BLOCK - 1) // BLOCK):
         first, size = chunk * BLOCK, min(BLOCK, count - chunk * BLOCK)
-        basis = _harmonics(directions, first, size)
+        basis = _block(directions, first, size)
         for i in range(size):
             for k in range(16):
                 out[first + i, k] = basis[k * BLOCK + i]
@@ -106,7 +105,7 @@ def _forward(coefficients, directions, terms, colours):
     count = len(directions)
     for chunk in prange((count + BLOCK - 1) // BLOCK):
         first, size = chunk * BLOCK, min(BLOCK, count - chunk * BLOCK)
-        basis = _harmonics(directions, first, size)
+        basis = _block(directions, first, size)
         for i in range(size):
             at, of = u64((first + i) * terms * 3), u64(i)
             red, green, blue = ZERO, ZERO, ZERO
@@ -125,7 +124,7 @@ def _backward(grad, directions, terms, grads):
     count = len(directions)
     for chunk in prange((count + BLOCK - 1) // BLOCK):
         first, size = chunk * BLOCK, min(BLOCK, count - chunk * BLOCK)
-        basis = _harmonics(directions, first, size)
+        basis = _block(directions, first, size)
         for i in range(size):
             at, of = u64((first + i) * terms * 3), u64(i)
             red, green, blue = grad[first + i, 0], grad[first + i, 1], grad[first + i, 2]

@@ -1,10 +1,14 @@
-"""Sums of harmonics in plain torch."""
+"""Harmonics and their sums in plain torch."""
 
 from torch import Tensor
 
 from methods.kernels.spherical import spherical_harmonics
 
 
+def harmonics(directions: Tensor) -> Tensor:
+    return spherical_harmonics(directions)
+
+
 def shade(coefficients: Tensor, directions: Tensor) -> Tensor:
-    basis = spherical_harmonics(directions)[:, : coefficients.shape[1]]
+    basis = harmonics(directions)[:, : coefficients.shape[1]]
     return (basis[:, :, None] * coefficients).sum(dim=1)

@@ -22,8 +22,9 @@ def walk(rays: Rays, voxels: Voxels) -> Crossings:
     ray = ray.repeat_interleave(counts, output_size=len(near))
     delta = (far - near) * lengths(rays.directions)[ray]
     middle = (near + far) * 0.5
-    _, longest = total_and_longest(counts)  # read once here, not in each composite
-    where = middle, delta, offsets_of(counts), near, far, ray.int(), voxel
+    offsets = offsets_of(counts)
+    _, longest = total_and_longest(counts, offsets)  # read once here, not in each composite
+    where = middle, delta, offsets, near, far, ray.int(), voxel
     return Crossings(*where, longest=longest)
 
 

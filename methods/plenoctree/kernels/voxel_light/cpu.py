@@ -24,7 +24,7 @@ from methods.kernels.cpu import (
     sigmoid,
     u64,
 )
-from methods.kernels.shade.cpu import basis_of
+from methods.kernels.shade.cpu import harmonics as basis_of
 from methods.kernels.spherical import CHANNELS
 from methods.kernels.types import Pixels
 from methods.kernels.voxel_walk import Voxels
