@@ -5,11 +5,12 @@
 #   PIP_ARGS="..."         further arguments for pip, e.g. an index of CPU-only wheels of torch
 #   DEMO_ARGS="..."        overrides for the demo, e.g. DEMO_ARGS="seed=1 scene=wires"
 #   PAPER_ARGS="..."       overrides for the paper's tables, e.g. PAPER_ARGS="budget=full data=DIR"
+#   GPU_ARGS="..."         of docs/gpu.py, e.g. GPU_ARGS="--data DIR/mic"
 #   FIGURES_ARGS="..."     of docs/figures.py, e.g. FIGURES_ARGS="--data DIR" or FIGURES_ARGS=--check
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
-.PHONY: help install demo paper figures test test-all fuzz lint format clean
+.PHONY: help install demo paper figures gpu test test-all fuzz lint format clean
 
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -17,6 +18,7 @@ PYTHON ?=
 PIP_ARGS ?=
 DEMO_ARGS ?=
 FIGURES_ARGS ?=
+GPU_ARGS ?=
 PAPER_ARGS ?= budget=paper protocol=paper-1 scene=totem,mill
 
 # A complete interpreter is one that is new enough and can make environments with pip in them.
@@ -44,6 +46,10 @@ test-all: lint ## lint, then all tests: what continuous integration runs
 
 figures: install ## measure all that the documents show, and put it there; in hours
 	@$(BIN)/python docs/figures.py $(FIGURES_ARGS)
+
+gpu: install ## check and measure all on the GPU of this machine, in 12 minutes; outputs/gpu/report.md
+	-$(BIN)/python -m pip install --disable-pip-version-check -q $(PIP_ARGS) -c constraints.txt -e ".[tensorrt]"
+	@$(BIN)/python docs/gpu.py $(GPU_ARGS)
 
 fuzz: install ## loaders and settings on whatever comes, for some minutes
 	$(BIN)/python -m pytest --hypothesis-profile=fuzz tests/bench/scenes/test_fuzz.py tests/sweeps/test_fuzz.py

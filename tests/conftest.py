@@ -9,6 +9,7 @@ import sys
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import wraps
 from pathlib import Path
 
 import hypothesis
@@ -83,11 +84,14 @@ def web() -> Iterator[Web]:
         yield web
 
 
+EMPTY = ((torch, "empty"), (torch, "empty_like"), (Tensor, "new_empty"))
+
+
 @pytest.fixture(scope="session", autouse=True)
 def poisoned_empty() -> Iterator[None]:
     """Fill what `torch.empty` and its kin return with NaN: an output nobody wrote then shows."""
     with pytest.MonkeyPatch.context() as patch:
-        for owner, name in ((torch, "empty"), (torch, "empty_like"), (Tensor, "new_empty")):
+        for owner, name in EMPTY:
             patch.setattr(owner, name, _poisoning(getattr(owner, name)))
         yield
 
@@ -103,6 +107,7 @@ def own_turns(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 def _poisoning(allocate):
+    @wraps(allocate)
     def allocate_poisoned(*args, **kwargs):
         tensor = allocate(*args, **kwargs)
         with torch.no_grad():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -28,6 +28,7 @@ from methods.instant_ngp.training import FieldTraining
 from methods.kernels import availability, multiplies_bf16
 from methods.kernels.encode import HashGrid
 from methods.kernels.march import longest_ray
+from methods.kernels.types import Samples
 from methods.kilonerf.field import KiloField
 from methods.nerf.field import NerfField
 from methods.nsvf.field import NsvfField
@@ -40,7 +41,7 @@ from methods.steernerf.stage2 import JointTraining
 from methods.steernerf.unet import UNet
 from methods.students.fields import StudentField
 from methods.training import loop
-from tests.conftest import QUICK
+from tests.conftest import EMPTY, QUICK
 from tests.methods.models import small_joint, small_model, small_motion, small_rendering
 from tests.methods.small_students import extraction
 from tests.methods.trainings import killed
@@ -318,6 +319,62 @@ def test_by_triton_it_trains_and_renders_as_on_the_cpu(
     here, there = here_and_there(drawn)
     assert here[0].std() > 0
     assert_equal(here, there)
+
+
+@pytest.fixture
+def multiplying_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[PretendedGpu]:
+    """With products of bfloat16, as real ones have."""
+    capabilities = {**torch.cpu.get_capabilities(), "avx512_bf16": True}
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities)
+    multiplies_bf16.cache_clear()
+    with pretended_gpu() as gpu:
+        yield gpu
+    multiplies_bf16.cache_clear()
+
+
+@pytest.mark.slow
+@needs_triton
+def test_steps_and_frames_are_few_launches(
+    multiplying_gpu: PretendedGpu,
+    ball_scene: Scene,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each takes some microseconds, whatever it computes."""
+    gpu = multiplying_gpu
+    steps: list[int] = []
+    rounds: list[Samples] = []
+
+    advance, march = FieldTraining.advance, frame.march
+
+    def advanced(training: FieldTraining) -> dict[str, float]:
+        before = gpu.launched
+        errors = advance(training)
+        steps.append(gpu.launched - before)
+        return errors
+
+    def marched(*given: Any, **options: Any) -> Samples:
+        rounds.append(march(*given, **options))
+        return rounds[-1]
+
+    for owner, name in EMPTY:  # without the launches that poison it
+        monkeypatch.setattr(owner, name, getattr(owner, name).__wrapped__)
+    monkeypatch.setattr(FieldTraining, "advance", advanced)
+    monkeypatch.setattr(frame, "march", marched)
+    splits = {name: fewer(split, 3, side=8) for name, split in ball_scene.splits.items()}
+    method = smallest("ngp", device="cuda", backend="gpu")
+    method.fit(
+        replace(ball_scene, splits=splits), replace(BUDGET, samples=64), ConsoleLog(tmp_path, True)
+    )
+    assert max(steps[1:]) <= 200  # the first updates the density grid
+    frames(method, replace(ball_scene, splits=splits))  # what later ones need is made once
+    for samples in longest_ray(STEP), 1:
+        monkeypatch.setattr(frame, "GPU_SAMPLES", samples)
+        rounds.clear()
+        before = gpu.launched
+        method.render(splits["test"].cameras[0], NullProbe())
+        assert gpu.launched - before <= 86 + 40 * len(rounds)
+    assert len(rounds) > 1
 
 
 ROWS = {
