@@ -21,7 +21,6 @@ REACHES = {
     "sweeps/commands/kernels.py": ("methods.checks", "methods.kernels.", "methods.trial."),
     "sweeps/commands/list.py": "methods.kernels.",
     "sweeps/commands/stress.py": "methods.checks",
-    "sweeps/commands/worth.py": "methods.kernels.",
 }
 """What measures and lists parts of methods reaches them directly; methods only through
 `_target_`."""

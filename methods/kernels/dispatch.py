@@ -4,8 +4,7 @@ import difflib
 import importlib
 import importlib.util
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -92,9 +91,7 @@ def implementation(kernel: str, backend: str, device: torch.device) -> ModuleTyp
     """The module that implements `kernel`, a package, for tensors on `device`. The reference
     computes a kernel that has no such version; see `by_kernel`. Raises `Unavailable` as `resolve`
     does."""
-    for called in _calls:
-        called.add(kernel)
-    name = _computing(kernel, resolve(_forced.get(kernel, backend), device), device)
+    name = _computing(kernel, resolve(backend, device), device)
     if name == "cpu":
         _load("methods.kernels.cpu").follow_torch_threads()
     return _load(f"{kernel}.{name}")
@@ -106,27 +103,6 @@ def _computing(kernel: str, backend: str, device: torch.device) -> str:
         verdict = _load("methods.trial").verdicts(str(device)).get(kernel)
         return "gpu" if verdict and verdict.trusted else "reference"
     return backend if backend in served(kernel) else "reference"
-
-
-@contextmanager
-def forced(kernel: str, backend: str) -> Iterator[None]:
-    """Inside, `backend` computes every call of `kernel`, a package, whatever the call asks for."""
-    _forced[kernel] = backend
-    try:
-        yield
-    finally:
-        del _forced[kernel]
-
-
-@contextmanager
-def kernel_calls() -> Iterator[set[str]]:
-    """The packages of all kernels that are called inside."""
-    called: set[str] = set()
-    _calls.append(called)
-    try:
-        yield called
-    finally:
-        _calls.remove(called)
 
 
 @cache
@@ -144,9 +120,6 @@ def compiled(device: str) -> list[str]:
             usable.append(resolve(name, device))
     return [name for name in usable if not (name == "gpu" and interpreted())]
 
-
-_forced: dict[str, str] = {}
-_calls: list[set[str]] = []
 
 # Imported on first use, because numba and Triton are heavy and not every machine has the latter.
 _load = cache(importlib.import_module)

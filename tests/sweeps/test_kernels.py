@@ -82,34 +82,6 @@ def test_a_filter_or_a_setting_that_fits_nothing_is_an_error(steerbench, asked, 
     assert said in steerbench(*argv.split()).refused()
 
 
-def test_what_a_kernel_brings_has_a_line_for_each_that_a_method_calls(steerbench, tmp_path):
-    small = ("scene.width=16", "scene.train=4", "scene.test=2", "budget.steps=2")
-    few = ("budget.samples=64", "budget.frames=2", "--repeats", "1", f"outputs={tmp_path}")
-    found = steerbench("worth", "method=ngp", *small, *few).ok().json
-    rows = {row["kernel"]: row for row in found}
-    assert set(rows) == {"adam", "composite", "encode", "march", "mlp"}
-    assert rows["adam"]["frame_ms_reference"] is None  # it is called in training alone
-    for row in rows.values():
-        assert row["method"] == "ngp"
-        assert min(row["frame_ms"], row["training_s"], row["training_s_reference"]) > 0
-    outcome = steerbench("worth", "--filter", "ada", "method=ngp", *small, *few)
-    assert [row["kernel"] for row in outcome.json] == ["adam"]
-    assert rows["march"]["frame_ms_reference"] > 0
-
-
-def test_methods_that_need_a_setting_are_left_out_unless_named(steerbench, monkeypatch):
-    asked = []
-
-    def rows(words, options):
-        asked.append(next(word for word in words if word.startswith("method=")))
-        return []
-
-    monkeypatch.setattr("sweeps.commands.worth._of_method", rows)
-    steerbench("worth")
-    assert {"method=ngp", "method=steernerf", "method=nsvf"} <= {*asked}
-    assert "method=external" not in asked
-
-
 def test_compiled_kernels_compute_their_quick_cases(monkeypatch):
     tolerances = {("cpu", "fp32"): 0.1, ("reference", "fp32"): 0.1}
     computed = []

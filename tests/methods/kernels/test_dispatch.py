@@ -40,17 +40,6 @@ def test_a_kernel_without_a_version_is_computed_by_its_reference(backend, monkey
     assert dispatch.implementation(kernel, backend, device).__name__ == f"{kernel}.reference"
 
 
-def test_for_a_while_a_kernel_is_computed_by_its_reference_whatever_is_asked_for():
-    """The reference alone gives a gradient for directions."""
-    given = torch.rand(3, 1, 3), torch.rand(3, 3, requires_grad=True)
-    kernel = "methods.kernels.shade"
-    with dispatch.forced(kernel, "reference"), dispatch.kernel_calls() as called:
-        assert shade(*given, backend="cpu").requires_grad
-    assert called == {kernel}
-    with pytest.raises(ValueError, match="no gradient for directions"):
-        shade(*given, backend="cpu")
-
-
 def test_an_interpreted_backend_is_not_compiled(monkeypatch):
     monkeypatch.setattr(dispatch, "resolve", lambda backend, device: backend)
     monkeypatch.setenv("TRITON_INTERPRET", "1")
