@@ -67,8 +67,8 @@ def test_all_cases_of_a_kernel_are_checked_and_those_that_are_long_enough_are_ti
 
 def test_what_agrees_and_is_faster_is_taken_and_kept(monkeypatch, tmp_path, capsys):
     """`auto` on a GPU; the verdicts are kept until the GPU changes, and the row names what ran."""
-    right = dict.fromkeys(("encode", "march", "shade"), [2.0, ""])
-    played = {"adam": [NAN, "off"], "composite": [0.5, ""], **right}
+    played = {name: [2.0, ""] for name in ("encode", "march", "shade")}
+    played |= {"adam": [NAN, "off"], "composite": [0.5, ""]}
     tries = []
 
     def play(kernels, command, limit_s):

@@ -8,7 +8,6 @@ import torch
 
 from bench.errors import Unavailable
 from methods.kernels import availability, dispatch, resolve
-from methods.kernels.shade import shade
 
 
 def test_auto_goes_by_the_device():
