@@ -40,18 +40,21 @@ class UNet(nn.Module):
 
     Its inputs are the features of all frames: those of the present frame at every s-th pixel, those
     of the preceding frames at the pixels where their points land, zero elsewhere. Its output is
-    added to the bilinearly enlarged RGB of the present frame, of which, as in the release, the
-    corners keep their places (`align_corners=True`): all pixels but the middle one move.
-    `channels`, `frames`, `scale` are K, L, s; `width` is the number of channels at full size. The
-    `engine` computes the `network`, if there is one.
+    added to the *base*, the bilinearly enlarged RGB of the present frame. If the base is `aligned`,
+    its pixels keep their places. In the release the corners of frame and patch do, so that the
+    others move by up to (s - 1) / 2 pixels, which the network cannot know: they move in a patch as
+    they never do in a frame. `channels`, `frames`, `scale` are K, L, s; `width` is the number of
+    channels at full size. The `engine` computes the `network`, if there is one.
     """
 
     engine: Built | None = None
 
-    def __init__(self, channels: int, frames: int, scale: int, *, width: int) -> None:
+    def __init__(
+        self, channels: int, frames: int, scale: int, *, width: int, aligned: bool
+    ) -> None:
         super().__init__()
         expect(1 <= width <= 4096, "renderer.width", "1 to 4096", width)
-        self.frames, self.scale = frames, scale
+        self.frames, self.scale, self.aligned = frames, scale, aligned
         self.network = _Layers(channels * (frames + 1), width)
 
     def forward(self, observations: Sequence[Observation], probe: Probe = UNWATCHED) -> Tensor:
@@ -95,7 +98,8 @@ class UNet(nn.Module):
         by less than a grey level, but such a line across a white background costs 0.01 of LPIPS."""
         rgb = shown.frame.values[..., :3].permute(2, 0, 1)[None]
         size = [self.scale * side for side in rgb.shape[2:]]
-        base = functional.interpolate(rgb, size, mode="bilinear", align_corners=True)
+        corners = not self.aligned
+        base = functional.interpolate(rgb, size, mode="bilinear", align_corners=corners)
         picture, inside, drawn = base[0].permute(1, 2, 0).contiguous(), [], []
         for one, side in zip(shown.part, rgb.shape[2:], strict=True):
             begin, end, _ = one.indices(side)

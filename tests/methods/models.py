@@ -87,5 +87,5 @@ def new_pipeline(model: ModelOptions = MODEL) -> Pipeline:
     """A misty field and an untrained U-Net on white; always the same weights."""
     torch.manual_seed(0)
     field = misty_field(channels=model.channels)
-    unet = UNet(model.channels, model.frames, model.scale, width=4)
+    unet = UNet(model.channels, model.frames, model.scale, width=4, aligned=True)
     return Pipeline(trained_field(field), torch.ones(3), unet, model)

@@ -67,7 +67,7 @@ def steernerf(field: str, **others: Any) -> Method:
         "training": STAGE1,
         "model": small_model(),
         "rendering": small_rendering(range=RangeReduction("paper", 0.03, "sum")),
-        "renderer": partial(UNet, width=4),
+        "renderer": partial(UNet, width=4, aligned=True),
         "joint": small_joint(field=field, jitter=True, grid_samples=512, **FEW),
         "engine": TorchEngine(),
         **{"name": "steernerf", "precision": "bf16", "seed": 0, "steps": None, "after": 1.0},

@@ -32,7 +32,7 @@ CPU = torch.device("cpu")
 def unet() -> tuple[nn.Module, list[Tensor]]:
     """The U-Net, and inputs of one size."""
     torch.manual_seed(1000)
-    renderer = shaken(UNet(6, 1, 4, width=64)).requires_grad_(False)
+    renderer = shaken(UNet(6, 1, 4, width=64, aligned=False)).requires_grad_(False)
     generator = torch.Generator().manual_seed(0)
     return renderer.network, list(torch.rand(3, 1, 12, 36, 44, generator=generator))
 

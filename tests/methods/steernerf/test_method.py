@@ -20,7 +20,7 @@ from tests.methods.models import small_joint, small_model, small_motion, small_r
 from tests.methods.trainings import GRID, QUICK
 
 BUDGET = Budget("test", steps=40, samples=1024, renderer_steps=4)
-RENDERER = partial(UNet, width=4)
+RENDERER = partial(UNet, width=4, aligned=True)
 RANGED = RangeReduction("paper", 0.03, "sum")
 
 

@@ -32,7 +32,7 @@ def new_training(
     torch.manual_seed(0)
     model = small_model(frames=frames)
     trained = trained_field(field or misty_field(channels=model.channels))
-    renderer = UNet(model.channels, frames, model.scale, width=8)
+    renderer = UNet(model.channels, frames, model.scale, width=8, aligned=True)
     pipeline = Pipeline(trained, scene.background, renderer, model)
     generator = torch.Generator().manual_seed(1)
     patches = Patches(pipeline, scene, Split([], [], []), options, generator)

@@ -18,8 +18,8 @@ RELEASE = np.load(Path(__file__).parents[2] / "data" / "steernerf_release.npz")
 """What the released code computes on the formulas below."""
 
 
-def unet(channels: int, frames: int, scale: int, width: int = 64) -> UNet:
-    return UNet(channels, frames, scale, width=width)
+def unet(channels: int, frames: int, scale: int, width: int = 64, aligned: bool = False) -> UNet:
+    return UNet(channels, frames, scale, width=width, aligned=aligned)
 
 
 def hashed(count: int, number: int) -> Tensor:
@@ -93,19 +93,22 @@ def test_a_batch_of_two_is_one_after_the_other():
     torch.testing.assert_close(renderer(observations), alone, rtol=0, atol=ROUNDING)
 
 
-def test_the_base_puts_the_corners_on_corners():
+@pytest.mark.parametrize("aligned", [True, False])
+def test_the_base_keeps_pixels_or_corners_in_their_places(aligned):
     """Without an output of the network, the picture is the base."""
     height, width, scale = 4, 6, 4
     observation = observe(height, width, frames=0)
     row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     observation.frame.values[..., 0], observation.frame.values[..., 1] = row / 8, column / 8
-    renderer = unet(6, 0, scale)
+    renderer = unet(6, 0, scale, aligned=aligned)
     for layer in renderer.network.last.parameters():
         nn.init.zeros_(layer)
     base = renderer([observation])
     for channel, size in ((0, height), (1, width)):
         pixel = torch.arange(size * scale)
         place = pixel * (size - 1) / (size * scale - 1)
+        if aligned:  # centres are at +1/2; beyond the outer ones it is as there
+            place = ((pixel + 0.5) / scale - 0.5).clamp(0, size - 1)
         ramp = base[0, :, 0, 0] if channel == 0 else base[0, 0, :, 1]
         torch.testing.assert_close(ramp, place / 8, rtol=0, atol=1e-6)
 
