@@ -139,7 +139,9 @@ def render_rays(
         chunk = slice(first, first + size)
         window = None if how.window is None else how.window[chunk]
         chunk_how = replace(how, window=window)
-        parts.append(_render_chunk(field, rays.take(chunk), occupancy, probe, chunk_how).columns)
+        some = rays.take(chunk)
+        some = Rays(some.origins.contiguous(), some.directions)  # once; kernels want them so
+        parts.append(_render_chunk(field, some, occupancy, probe, chunk_how).columns)
     return Pixels(*map(cat, zip(*parts, strict=True)))
 
 
@@ -156,7 +158,7 @@ def _render_chunk(
         index: Tensor | slice, front: Pixels, start: Tensor, limit: int
     ) -> tuple[int, Pixels, Tensor, Tensor]:
         """Composite the next samples of some rays behind `front`; return how many there were, the
-        pixels, where the rays resume, and which of them do."""
+        pixels, where the rays resume, and which of them still see something."""
         with probe.stage("march"):
             samples = march(
                 rays.take(index),
@@ -174,24 +176,23 @@ def _render_chunk(
                 front = composite(
                     sigma, values, samples, stop=how.stop, carry=front, backend=field.backend
                 )
-        open_ = (samples.resume >= 0) & (1 - front.alpha > how.stop)
-        return len(samples), front, samples.resume, open_
+        return len(samples), front, samples.resume, 1 - front.alpha > how.stop
 
     start = torch.zeros(count, dtype=torch.int32, device=device)
     if compacts(device):
         left = torch.arange(count)
         while len(left):
             limit = field.round_samples * max(count // (2 * len(left)), 1)
-            _, front, resume, open_ = advance(left, canvas.take(left), start, limit)
+            _, front, resume, sees = advance(left, canvas.take(left), start, limit)
             with probe.stage("composite"):
                 canvas.put(left, front)
-                going = open_.nonzero().squeeze(1)
+                going = (sees & (resume >= 0)).nonzero().squeeze(1)
                 left, start = left[going], resume[going]
         return canvas
     limit = taken = most = GPU_SAMPLES
     while taken >= limit:  # else no ray resumes: each would have taken as many as it may
-        taken, canvas, resume, open_ = advance(slice(None), canvas, start, limit)
-        start, most = torch.where(open_, resume, -1), max(most, taken)
+        taken, canvas, resume, sees = advance(slice(None), canvas, start, limit)
+        start, most = torch.where(sees, resume, -1), max(most, taken)
         limit *= max(most // (2 * taken), 2) if taken else 1
     return canvas
 
