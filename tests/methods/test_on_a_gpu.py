@@ -318,7 +318,7 @@ def test_by_triton_it_trains_and_renders_as_on_the_cpu(
 
     here, there = here_and_there(drawn)
     assert here[0].std() > 0
-    assert_equal(here, there)
+    assert_alike(here, there)  # only a CPU pads what it multiplies
 
 
 @pytest.fixture

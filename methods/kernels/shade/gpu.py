@@ -1,6 +1,5 @@
 """Harmonics with Triton: a program evaluates a block of directions."""
 
-import torch
 import triton
 import triton.language as tl
 from torch import Tensor
@@ -26,7 +25,7 @@ def harmonics(directions: Tensor) -> Tensor:
 
 def shade(coefficients: Tensor, directions: Tensor) -> Tensor:
     basis = harmonics(directions)[:, : coefficients.shape[1]]
-    return torch.einsum("nc,ncd->nd", basis, coefficients)
+    return (basis[:, :, None] * coefficients).sum(dim=1)
 
 
 @triton.jit
