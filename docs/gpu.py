@@ -1,7 +1,8 @@
 """Checks and measures steerbench on the GPU of this machine: `make gpu`, in about 12 minutes.
 
 Each step is a process of its own with a time limit, because a wrong kernel may crash or hang. After
-each, outputs/gpu/report.md is written anew: please send us that file. What is done is not repeated.
+each step the page outputs/gpu/report.md is written: please send us that file. A step that succeeded
+is not repeated at the same commit.
 """
 
 from __future__ import annotations
@@ -72,16 +73,19 @@ def main(argv: Sequence[str]) -> int:
         raise SystemExit("make gpu: torch sees no GPU here; `make install` gets torch for CUDA")
     scene = ("scene=blender", f"scene.path={options.data}") if options.data else ("scene=totem",)
     FOLDER.mkdir(parents=True, exist_ok=True)
+    commit = provenance.commit()
     done: dict[Step, Done] = {}
     for step in steps((*scene, *options.overrides), ("--filter", options.filter)):
         file = FOLDER / f"{step.name}.json"
         kept = json.loads(file.read_text()) if file.exists() else None
-        if kept and kept["words"] == [*step.words] and kept["done"][0] == 0:
+        if kept and kept["made"] == [commit, *step.words] and kept["done"][0] == 0:
             done[step] = Done(*kept["done"])
         else:
             print(f"{step.name}: steerbench {' '.join(step.words)}", file=sys.stderr)
             done[step] = taken(step)
-            file.write_text(json.dumps({"words": step.words, "done": done[step]}, indent=1))
+            file.write_text(
+                json.dumps({"made": [commit, *step.words], "done": done[step]}, indent=1)
+            )
         (FOLDER / PAGE).write_text(page(done), encoding="utf-8")
     print(FOLDER / PAGE)
     return int(any(end.status != 0 for end in done.values()))
@@ -112,7 +116,7 @@ def ran(step: Step) -> subprocess.CompletedProcess[str]:
 
 def page(done: dict[Step, Done]) -> str:
     """A table of the steps, then what each printed, without the JSON."""
-    machine = {**provenance.machine(), "torch": torch.__version__}
+    machine = {"commit": provenance.commit(), **provenance.machine(), "torch": torch.__version__}
     lines = ["# steerbench on a GPU", "", *(f"- {name}: {x}" for name, x in machine.items()), ""]
     lines += ["| step | question | ended | seconds |", "|---|---|---|---:|"]
     for step, end in done.items():

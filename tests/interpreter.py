@@ -75,7 +75,7 @@ def unforgiving(seed: int = 0) -> Iterator[None]:
         return
     random = np.random.default_rng(seed)
     launches: list[Launch] = []
-    run, ordered, moved = GridExecutor.__call__, InterpreterBuilder.set_grid_dim, "set_grid_idx"
+    run, ordered = GridExecutor.__call__, InterpreterBuilder.set_grid_dim
     place, load = InterpreterBuilder.set_grid_idx, InterpreterBuilder.create_masked_load
     store, add = InterpreterBuilder.create_masked_store, InterpreterBuilder.create_atomic_rmw
 
@@ -87,6 +87,9 @@ def unforgiving(seed: int = 0) -> Iterator[None]:
     def set_grid_dim(self: Any, *grid: int) -> None:
         launches[-1].ordered(*grid)
         ordered(self, *grid)
+
+    def set_grid_idx(self: Any, *at: int) -> None:
+        place(self, *launches[-1].next(*at))
 
     def create_masked_load(self: Any, pointers: Any, mask: Any, *rest: Any) -> Any:
         launches[-1].access(pointers, mask, READ)
@@ -104,10 +107,7 @@ def unforgiving(seed: int = 0) -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(GridExecutor, "__call__", launched)
-        patch.setattr(InterpreterBuilder, "set_grid_dim", set_grid_dim)
-        patch.setattr(
-            InterpreterBuilder, moved, lambda self, *at: place(self, *launches[-1].next(*at))
-        )
-        for made in (create_masked_load, create_masked_store, create_atomic_rmw):
-            patch.setattr(InterpreterBuilder, made.__name__, made)
+        accesses = create_masked_load, create_masked_store, create_atomic_rmw
+        for own in (set_grid_dim, set_grid_idx, *accesses):
+            patch.setattr(InterpreterBuilder, own.__name__, own)
         yield

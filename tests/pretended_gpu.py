@@ -385,11 +385,10 @@ def _patch_triton(patch: pytest.MonkeyPatch) -> None:
         if any(isinstance(x, Tensor) and not isinstance(x, GpuTensor) for x in args):
             raise ValueError("Pointer argument cannot be accessed from Triton (cpu tensor?)")
         held = _each(_held, args)
-        _gpu.launched += 1
         if _gpu.graph is not None:
             _gpu.graph.append((partial(run, self), held, kwargs, None))
-        launched = _gpu.launched
+        launched = _gpu.launched + 1  # one, whatever the interpreter does
         run(self, *held, **kwargs)
-        _gpu.launched = launched  # what the interpreter itself does is none
+        _gpu.launched = launched
 
     patch.setattr(GridExecutor, "__call__", launch)

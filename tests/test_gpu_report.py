@@ -70,4 +70,7 @@ def test_what_is_done_is_not_repeated(
     assert "| stopped after 90 s |" in Path("outputs/gpu/report.md").read_text()
     assert report.main([]) == 0
     assert taken[8:] == ["kernels"]
+    monkeypatch.setattr(report.provenance, "commit", lambda: "another")
+    assert report.main([]) == 0
+    assert len(taken) == 9 + 8
     assert sum(step.limit_s for step in report.steps([], [])) <= 720

@@ -159,20 +159,25 @@ def test_it_trains_and_renders_as_on_the_cpu(name: str, scene: Scene, tmp_path: 
     assert_alike(*drawn)
 
 
+@pytest.fixture
+def products_of_bfloat16(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """As real GPUs have."""
+    capabilities = {**torch.cpu.get_capabilities(), "avx512_bf16": True}
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities)
+    multiplies_bf16.cache_clear()
+    yield
+    multiplies_bf16.cache_clear()
+
+
+@pytest.mark.usefixtures("products_of_bfloat16")
 def test_with_products_of_bfloat16_it_trains_and_renders_as_on_the_cpu(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scene: Scene, tmp_path: Path
 ) -> None:
     def drawn(device: str) -> list[torch.Tensor]:
         assert multiplies_bf16(device)
         return frames(fitted("steernerf", device, scene, tmp_path), scene)
 
-    capabilities = {**torch.cpu.get_capabilities(), "avx512_bf16": True}
-    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities)
-    multiplies_bf16.cache_clear()
-    try:
-        assert_alike(*here_and_there(drawn))
-    finally:
-        multiplies_bf16.cache_clear()
+    assert_alike(*here_and_there(drawn))
 
 
 def test_its_rows_are_those_of_the_cpu(scene: Scene, tmp_path: Path) -> None:
@@ -321,27 +326,13 @@ def test_by_triton_it_trains_and_renders_as_on_the_cpu(
     assert_alike(here, there)  # only a CPU pads what it multiplies
 
 
-@pytest.fixture
-def multiplying_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[PretendedGpu]:
-    """With products of bfloat16, as real ones have."""
-    capabilities = {**torch.cpu.get_capabilities(), "avx512_bf16": True}
-    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities)
-    multiplies_bf16.cache_clear()
-    with pretended_gpu() as gpu:
-        yield gpu
-    multiplies_bf16.cache_clear()
-
-
 @pytest.mark.slow
 @needs_triton
+@pytest.mark.usefixtures("products_of_bfloat16")
 def test_steps_and_frames_are_few_launches(
-    multiplying_gpu: PretendedGpu,
-    ball_scene: Scene,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    gpu: PretendedGpu, ball_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each takes some microseconds, whatever it computes."""
-    gpu = multiplying_gpu
     steps: list[int] = []
     rounds: list[Samples] = []
 

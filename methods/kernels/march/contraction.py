@@ -65,7 +65,7 @@ class Course:
         reach = apart / square.sqrt()
         past = -middle / reach
         first = torch.where(past.abs() <= 1, past, past.sign() * (2 - 1 / past.abs()))
-        width = torch.tensor(step, dtype=torch.float32).item() / HALF
+        width = torch.tensor(step, dtype=torch.float32).item() / HALF  # a GPU is given a float32
         numbers = middle, reach, first, width * apart, middle + 2 / width * reach
         middle, reach, first, length, end = (x.to(rays.origins.dtype) for x in numbers)
         return cls(middle, reach, first, length, end, width)

@@ -24,20 +24,13 @@ HALF = tl.constexpr(contraction.HALF)
 
 
 def march(segments: Segments, occupancy: Occupancy) -> Samples:
-    rays, window = segments.rays, segments.window
+    rays, window, jitter, start = segments.rays, segments.window, segments.jitter, segments.start
     origins, directions = rays.origins.contiguous(), rays.directions.contiguous()
-    check_float32(origins=origins, directions=directions, window=window, jitter=segments.jitter)
+    check_float32(origins=origins, directions=directions, window=window, jitter=jitter)
     count, device = len(origins), origins.device
     arguments = [
-        *(
-            origins,
-            directions,
-            window,
-            *window.stride(),
-            segments.jitter,
-            *segments.jitter.stride(),
-        ),
-        *(segments.start, *segments.start.stride(), segments.step, segments.limit, count),
+        *(origins, directions, window, *window.stride(), jitter, *jitter.stride()),
+        *(start, *start.stride(), segments.step, segments.limit, count),
         *(occupancy.words, occupancy.clearance, occupancy.resolution // BRICK),
         occupancy.contracted,
     ]
