@@ -1,44 +1,55 @@
 """Muon (Jordan et al. 2024, kellerjordan.github.io/posts/muon) for the weights of convolutions."""
 
+import math
 from collections.abc import Iterable
-from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-MOMENTUM = 0.9  # torch: 0.95; chosen on held-out views after 500 steps
+MOMENTUM = 0.9  # published: 0.95; chosen on held-out views after 500 steps
+
+QUINTIC = 3.4445, -4.7750, 2.0315
+"""Published coefficients of the iteration: its slope at 0 is large, its limit only about 1."""
+
+ITERATIONS = 5
 
 
-class Muon(torch.optim.Muon):
-    """torch's Muon takes matrices: here, a convolution is one with a row for each output channel.
+class Muon(torch.optim.Optimizer):
+    """A convolution's weight is a matrix with a row for each output channel. A step subtracts the
+    gradient's momentum (Nesterov's) with all singular values set to about 1, scaled to a root mean
+    square of 0.2 times the learning rate `lr`.
 
-    A step subtracts the gradient's momentum with all singular values set to about 1, scaled to a
-    root mean square of 0.2 times the learning rate. The `weights` [out, in, height, width] must be
-    in channels-last memory, which the matrices share; ValueError otherwise.
+    `torch.optim.Muon` iterates in bfloat16, which takes a processor without such products 20 times
+    as long as float32.
     """
 
     def __init__(self, weights: Iterable[Tensor], lr: float) -> None:
-        self._weights = list(weights)
-        for weight in self._weights:
-            if not weight.is_contiguous(memory_format=torch.channels_last):
-                raise ValueError(f"expected channels-last weights, got strides {weight.stride()}")
-        matrices = [nn.Parameter(_matrix(weight.detach())) for weight in self._weights]
-        given: Any = {"weight_decay": 0.0, "momentum": MOMENTUM, "adjust_lr_fn": "match_rms_adamw"}
-        super().__init__(matrices, lr, **given)
+        super().__init__(weights, {"lr": lr})
 
+    @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
         """Update the weights by their gradients."""
-        for matrix, weight in zip(self.param_groups[0]["params"], self._weights, strict=True):
-            matrix.grad = None if weight.grad is None else _matrix(weight.grad)
-        super().step(closure)
+        for group in self.param_groups:
+            for weight in group["params"]:
+                if weight.grad is None:
+                    continue
+                state = self.state[weight]
+                if not state:
+                    state["momentum"] = torch.zeros_like(weight)
+                momentum = state["momentum"].lerp_(weight.grad, 1 - MOMENTUM)
+                matrix = weight.grad.lerp(momentum, MOMENTUM).flatten(1)
+                rate = group["lr"] * 0.2 * math.sqrt(max(matrix.shape))
+                weight.sub_(orthogonal(matrix).unflatten(1, weight.shape[1:]), alpha=rate)
 
-    def zero_grad(self, set_to_none: bool = True) -> None:
-        """Clear the gradients of the weights, too."""
-        super().zero_grad(set_to_none)
-        for weight in self._weights:
-            weight.grad = None
 
-
-def _matrix(x: Tensor) -> Tensor:
-    """[out, in, height, width] as [out, height width in], without a copy if channels last."""
-    return x.permute(0, 2, 3, 1).flatten(1)
+def orthogonal(matrix: Tensor) -> Tensor:
+    """About U V^T of `matrix` [M, N] = U S V^T: each of its singular values, all between 0.7 and
+    1.2 unless they were tiny, by the Newton-Schulz iteration x <- a x + b (x x^T) x + c (x x^T)^2
+    x."""
+    a, b, c = QUINTIC
+    wide = matrix if len(matrix) <= matrix.shape[1] else matrix.T
+    x = wide / matrix.norm().clamp(min=1e-7)
+    for _ in range(ITERATIONS):
+        gram = x @ x.T
+        x = torch.addmm(x, torch.addmm(gram, gram, gram, beta=b, alpha=c), x, beta=a)
+    return x if wide is matrix else x.T

@@ -1,15 +1,17 @@
-"""Muon for convolutions, against its definition by singular vectors."""
+"""Muon for convolutions, against its definition by singular vectors, and torch's for matrices."""
 
 import pytest
 import torch
+from torch import nn
 
-from methods.training.muon import Muon
+from methods.training.muon import MOMENTUM, Muon
+
+SHAPES = [(4, 3, 3, 3), (48, 2, 3, 3)]
 
 
-@pytest.mark.parametrize("shape", [(4, 3, 3, 3), (48, 2, 3, 3)])
+@pytest.mark.parametrize("shape", SHAPES)
 def test_the_first_step_is_the_gradient_with_all_singular_values_set_to_one(shape):
-    """One row for each output channel. Torch iterates to singular values of 0.5 to 1.5, in
-    bfloat16."""
+    """One row for each output channel. The published iteration ends between 0.68 and 1.21."""
     generator = torch.Generator().manual_seed(0)
     weight, gradient = (
         torch.randn(shape, generator=generator).to(memory_format=torch.channels_last)
@@ -19,19 +21,28 @@ def test_the_first_step_is_the_gradient_with_all_singular_values_set_to_one(shap
     optimiser = Muon([weight], lr=0.1)
     weight.grad = gradient.clone()
     optimiser.step()
-    optimiser.zero_grad()
-    assert weight.grad is None
 
     rows = torch.stack([(before - weight).flatten(1), gradient.flatten(1)])
     change, slope = rows / (0.2 * 0.1 * max(rows.shape[1:]) ** 0.5)
     left, _, right = torch.linalg.svd(slope, full_matrices=False)
     values = left.T @ change @ right.T
-    assert torch.all((values.diagonal() > 0.5) & (values.diagonal() < 1.5))
+    assert torch.all((values.diagonal() > 0.67) & (values.diagonal() < 1.22))
     off = values - values.diagonal().diag()
-    assert off.abs().max() < 0.05
+    assert off.abs().max() < 1e-3  # 15 products of float32
 
 
-def test_weights_in_another_memory_order_are_refused():
-    """Their matrices would be copies, and steps without effect."""
-    with pytest.raises(ValueError, match=r"^expected channels-last weights, got strides \(27, 9,"):
-        Muon([torch.zeros(4, 3, 3, 3)], lr=0.1)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_steps_are_those_of_torch_for_matrices(shape):
+    """Momentum and scale; torch iterates in bfloat16, with 8 bits, whose errors five iterations
+    multiply by 3.4 each where a singular value is small."""
+    weight = torch.zeros(shape)
+    matrix = nn.Parameter(torch.zeros_like(weight).flatten(1))
+    given = {"weight_decay": 0.0, "momentum": MOMENTUM, "adjust_lr_fn": "match_rms_adamw"}
+    both = Muon([weight], 0.1), torch.optim.Muon([matrix], 0.1, **given)
+    for seed in range(3):
+        weight.grad = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+        matrix.grad = weight.grad.flatten(1)
+        for optimiser in both:
+            optimiser.step()
+    lost = torch.linalg.norm(weight.flatten(1) - matrix) / torch.linalg.norm(matrix)
+    assert lost < 0.03
