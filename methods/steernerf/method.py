@@ -38,8 +38,8 @@ class SteerNerf(OnField):
 
     `grid`, `training` and `precision` are those of the field of stage 1, which other methods share.
     Stage 2 trains the U-Net that `renderer` makes, and the field, for `model`, as `joint` says, in
-    `steps` steps (None: `budget.renderer_steps`), of which `Stage2` uses a share `after`. `engine`
-    then computes the network of the U-Net. `rendering` may be replaced between frames.
+    `steps` steps (None: `budget.renderer_steps`). `engine` then computes the network of the U-Net.
+    `rendering` may be replaced between frames.
     """
 
     model: ModelOptions
@@ -48,7 +48,6 @@ class SteerNerf(OnField):
     joint: JointOptions
     engine: Engine | Auto
     steps: Steps
-    after: float
     name: str
 
     study = Study(
@@ -77,14 +76,14 @@ class SteerNerf(OnField):
             "renderer2d/network": "network",
             "finish": "finish",
         },
-        chosen=("rendering", "after", "engine"),
+        chosen=("rendering", "engine"),
     )
 
     def __post_init__(self) -> None:
         frames, mode = self.model.frames, self.rendering.range.mode
         possible = "off without preceding frames (L = 0)"
         expect(frames > 0 or mode == "off", "rendering.range.mode", possible, mode)
-        self.stage2 = Stage2(self.model, self.renderer, self.joint, self.after)
+        self.stage2 = Stage2(self.model, self.renderer, self.joint)
         super().__post_init__()
         self.engine.check(self.setup.device)
         with torch.random.fork_rng(devices=[]):  # refuses before hours of training

@@ -1,10 +1,8 @@
 """Stage 2: the 2D renderer and the field, trained together on patches (Section 3.4)."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
-from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -16,7 +14,6 @@ from bench.types import Budget, Log, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.instant_ngp.training import FieldOptimiser, restore_field
 from methods.kernels import multiplies_bf16
-from methods.kernels.settings import Checked, Only
 from methods.rendering.batch import opacity_entropy
 from methods.rendering.occupancy import EVERY
 from methods.steernerf.distillation import distilled_views
@@ -27,24 +24,18 @@ from methods.steernerf.unet import UNet
 from methods.training import checkpoint, loop
 from methods.training.muon import Muon
 
-MARKS = (0.125, 0.25, 0.5)
-"""Shares of the steps after which the weights are saved as well: an ablation becomes a curve."""
-
-SAVED = Only(f"{', '.join(map(str, MARKS))} or 1", lambda x: x in (*MARKS, 1))
-
 MUON = 5
 """Muon's learning rate, in those of Adam: the root mean square of its updates is then Adam's
 rate."""
 
 
 @dataclass(frozen=True)
-class Stage2(Checked):
+class Stage2:
     """What is trained in stage 2, and how."""
 
     model: ModelOptions  # the settings it is trained for
     renderer: partial[UNet]  # makes the 2D renderer for K, L and s
     joint: JointOptions  # how it is trained
-    after: Annotated[float, SAVED]  # share of the steps whose weights are used
 
     def key(self, budget: Budget) -> dict[str, object]:
         """Everything that the training depends on, besides the field of stage 1."""
@@ -87,12 +78,8 @@ def train_stage2(
     training = JointTraining(renderer, patches, steps, trained if patches.learning else None)
     training.seconds, training.meter = distilled_s, meter
 
-    marks = {folder / f"after-{share}.safetensors": math.ceil(share * steps) for share in MARKS}
     with meter:
-        loop.train(training, finished, "training the 2D renderer", log, marks)
-    if stage2.after < 1:
-        loop.load_result(training, folder / f"after-{stage2.after}.safetensors")
-        key["after"] = stage2.after
+        loop.train(training, finished, "training the 2D renderer", log)
     trained.field.requires_grad_(False).gradients = None
     renderer.requires_grad_(False)
     return pipeline, key, training.seconds, training.peak_bytes

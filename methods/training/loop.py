@@ -82,31 +82,22 @@ def trained(
         return tensors, figures["seconds"], figures["peak_bytes"]
 
 
-def train(
-    training: Training,
-    finished: Path,
-    label: str,
-    log: Log,
-    marks: Mapping[Path, int] | None = None,
-) -> None:
+def train(training: Training, finished: Path, label: str, log: Log) -> None:
     """Drive `training` to its end and write its result to `finished`, or load the result there.
 
-    On the way, the results after the numbers of steps in `marks` are written as well. If another
-    process runs the same training, this one waits for it. A killed training resumes from the
-    checkpoint beside `finished`. `SteerbenchError` is raised if something is not finite; the last
-    good checkpoint is kept.
+    If another process runs the same training, this one waits for it. A killed training resumes from
+    the checkpoint beside `finished`. `SteerbenchError` is raised if something is not finite; the
+    last good checkpoint is kept.
     """
     with missing(finished, log) as to_train:
         if to_train:
-            _drive(training, finished, label, log, marks or {})
+            _drive(training, finished, label, log)
         else:
             load_result(training, finished)
             log.info(f"{label}: found in {finished}")
 
 
-def _drive(
-    training: Training, finished: Path, label: str, log: Log, marks: Mapping[Path, int]
-) -> None:
+def _drive(training: Training, finished: Path, label: str, log: Log) -> None:
     unfinished = finished.with_name("checkpoint.safetensors")
     if unfinished.exists():
         resume(training, unfinished)
@@ -121,9 +112,6 @@ def _drive(
             shown = {k: -10 * math.log10(max(mse, 1e-10)) for k, mse in means.items()}
             progress.advance(note=", ".join(f"{k} {db:.1f} dB".strip() for k, db in shown.items()))
             training.seconds = time.monotonic() - began
-            for path, step in marks.items():
-                if training.step == step:
-                    save(training, path, done=True)
             if time.monotonic() - saved > CHECKPOINT_S:
                 save(training, unfinished)
                 saved = time.monotonic()

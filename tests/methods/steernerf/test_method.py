@@ -29,7 +29,6 @@ def new_method(
     rate: float = 1e-3,
     engine: Engine | None = None,
     device: str = "cpu",
-    after: float = 1.0,
     steps: int | None = None,
     **rendering: Any,
 ) -> SteerNerf:
@@ -42,7 +41,6 @@ def new_method(
         renderer=RENDERER,
         joint=small_joint(patch=4, rate=rate, distilled_views=2, motion=motion),
         engine=engine or TorchEngine(),
-        after=after,
         steps=steps,
         device=device,
         **{"name": "steernerf", "precision": "bf16", "backend": "auto", "seed": 0},
@@ -136,26 +134,8 @@ def test_a_training_depends_on_its_model_and_on_nothing_that_is_chosen_afterward
     assert key_of(usual, model=model) != key_of(usual)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("after", [0.125, 0.5, 1.0])
-def test_the_weights_after_a_share_of_the_steps_are_of_the_same_training(
-    ball_scene, log, tmp_path, after
-):
-    whole, part = new_method(), new_method(after=after)
-    assert part.stage2.key(BUDGET) == whole.stage2.key(BUDGET)
-    for method in (whole, part):
-        method.fit(ball_scene, BUDGET, log)
-    assert stages(tmp_path).count("steernerf") == 1
-    one, other = (m.pipeline.renderer.state_dict() for m in (whole, part))
-    same = all(torch.equal(one[name], other[name]) for name in one)
-    assert same == (after == 1)
-    assert (part.train_s < whole.train_s) == (after < 1)
-
-
 def test_settings_that_do_not_fit_are_refused():
-    """Range reduction needs preceding frames; weights are kept after some shares of the steps."""
+    """Range reduction needs preceding frames."""
     new_method(frames=1, range=RANGED)
-    with pytest.raises(ValueError, match=r"^after: expected 0\.125, 0\.25, 0\.5 or 1, got 0\.3$"):
-        new_method(after=0.3)
     with pytest.raises(ValueError, match=r"range.mode: expected off without .* got paper"):
         new_method(frames=0, range=RANGED)

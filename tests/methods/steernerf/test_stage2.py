@@ -14,7 +14,6 @@ from methods.steernerf.patches import Patches
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.stage2 import JointTraining
 from methods.steernerf.unet import UNet
-from methods.training import loop
 from tests.methods.models import misty_field, small_joint, small_model, small_motion, trained_field
 from tests.methods.trainings import does_not_see_what_masks_hide, goes_on_after_a_kill
 
@@ -152,20 +151,6 @@ def test_the_density_grid_follows_the_field_if_it_is_to(ball_scene):
         assert training.patches.pipeline.occupancy is (
             training.trained.grid.occupancy if visits else occupancy
         )
-
-
-def test_weights_on_the_way_are_kept(ball_scene, tmp_path, quiet_log):
-    """And put back by `load`, with the seconds that they took."""
-    training, marks = new_training(ball_scene, steps=4), {tmp_path / "half.safetensors": 2}
-    loop.train(training, tmp_path / "whole.safetensors", "training", quiet_log, marks)
-    half = new_training(ball_scene, steps=4)
-    for _ in range(2):
-        half.advance()
-    found = new_training(ball_scene, steps=4)
-    loop.load_result(found, tmp_path / "half.safetensors")
-    assert 0 < found.seconds < training.seconds
-    for name, tensor in half.result().items():
-        assert torch.equal(tensor, found.result()[name]), name
 
 
 @pytest.mark.parametrize("optimiser", ["muon", "adam"])
