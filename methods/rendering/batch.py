@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from bench.types import Rays
-from methods.kernels.composite import composite, visible
+from methods.kernels.composite import composite, visibility
 from methods.kernels.march import march
 from methods.kernels.march.contraction import HALF
 from methods.kernels.types import Occupancy, Pixels, Samples, offsets_of
@@ -120,7 +120,8 @@ def visible_samples(
             parts = pad(samples.positions).split(CHUNK_SAMPLES)
             judge = field if teacher is None else teacher
             sigma = cat([judge.density(part)[0] for part in parts])[: len(samples)]
-        counts, left = visible(sigma, samples, stop=how.stop, front=front, backend=field.backend)
+        seen = visibility(sigma, samples, stop=how.stop, front=front, backend=field.backend)
+        counts, left = seen.counts, seen.left
         rounds.append(Round(chosen, samples, sigma, counts))
         if limit is None:
             break
