@@ -1,18 +1,16 @@
 """Which Triton kernels a GPU is trusted with: `backend=auto` takes those that are right and faster.
 
 Before the kernels are first used on a GPU, their cases run there, against the reference and in
-turns with it. A child process does that, because a wrong kernel may crash or never end. The
+turns with it. Child processes do that, because a wrong kernel may crash or never end. The
 verdicts are kept in Triton's cache, until the GPU, its driver, torch, Triton or the code changes.
 """
 
 import json
 import math
-import select
 import statistics
 import subprocess
 import sys
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
 from functools import cache, partial
 from hashlib import sha256
@@ -87,41 +85,20 @@ def _file(device: str) -> Path:
 
 
 def tried(kernels: Sequence[str], command: Sequence[str], limit_s: float) -> dict[str, Verdict]:
-    """The verdicts of a child, `command` with the names of the `kernels`; it has `limit_s` seconds
-    for each. If it ends early, another one goes on behind the kernel at which it was."""
-    found: dict[str, Verdict] = {}
-    while left := [kernel for kernel in kernels if kernel not in found]:
-        found |= _answers(command, left, limit_s)
-    return found
+    """The verdicts of children, `command` with the name of one of the `kernels` each, which have
+    `limit_s` seconds."""
+    return {kernel: _answer([*command, kernel], limit_s) for kernel in kernels}
 
 
-def _answers(
-    command: Sequence[str], kernels: Sequence[str], limit_s: float
-) -> Iterator[tuple[str, Verdict]]:
-    """What one child finds: of at least one kernel."""
-    with (
-        tempfile.TemporaryFile() as errors,
-        subprocess.Popen(
-            [*command, *kernels], stdout=subprocess.PIPE, stderr=errors, bufsize=0
-        ) as child,
-    ):
-        assert child.stdout is not None
-        for kernel in kernels:
-            ready, _, _ = select.select([child.stdout], [], [], limit_s)
-            if not ready:
-                child.kill()
-                yield kernel, Verdict(math.nan, f"not done after {limit_s:.0f} s")
-                return
-            if not (line := child.stdout.readline()):
-                errors.seek(0)
-                last = errors.read().decode(errors="replace").strip().rpartition("\n")[2]
-                yield kernel, Verdict(math.nan, f"exit status {child.wait()}: {last}")
-                return
-            verdict = Verdict(*json.loads(line))
-            yield kernel, verdict
-            if verdict.fault:
-                child.kill()
-                return
+def _answer(command: Sequence[str], limit_s: float) -> Verdict:
+    try:
+        done = subprocess.run(command, capture_output=True, timeout=limit_s, errors="replace")
+    except subprocess.TimeoutExpired:
+        return Verdict(math.nan, f"not done after {limit_s:.0f} s")
+    if done.returncode:
+        last = done.stderr.strip().rpartition("\n")[2]
+        return Verdict(math.nan, f"exit status {done.returncode}: {last}")
+    return Verdict(*json.loads(done.stdout))
 
 
 def examined(cases: Sequence[Case], device: str) -> Verdict:
@@ -140,16 +117,11 @@ def examined(cases: Sequence[Case], device: str) -> Verdict:
     return Verdict(took["reference"] / took["gpu"] if took["gpu"] else math.nan, "")
 
 
-def main(device: str, *kernels: str) -> None:
-    """Print the verdict of each kernel as a line of JSON, up to the first that is wrong: an error
-    may have spoilt what follows in this process."""
-    for kernel in kernels:
-        with redirect_stdout(sys.stderr):
-            cases = import_module(f"{kernel}.cases").cases()
-            verdict = examined(cases, device)
-        print(json.dumps(verdict), flush=True)
-        if verdict.fault:
-            return
+def main(device: str, kernel: str) -> None:
+    """Print the verdict of a kernel as JSON."""
+    with redirect_stdout(sys.stderr):
+        verdict = examined(import_module(f"{kernel}.cases").cases(), device)
+    print(json.dumps(verdict))
 
 
 if __name__ == "__main__":

@@ -63,9 +63,10 @@ def checked_settings(config: DictConfig) -> Settings:
     settings = Settings(**values)
     if not 0 <= settings.seed < 2**63:
         raise unexpected("seed", "0 or more, below 2^63", settings.seed)
-    precisions = target_of(config.engine).precisions if "engine" in config else ()
-    if precisions and config.precision not in precisions:
-        raise unexpected("precision", " or ".join(precisions), config.precision)
+    if "engine" in config:
+        precisions = target_of(config.engine).precisions
+        if config.precision not in precisions:
+            raise unexpected("precision", " or ".join(precisions), config.precision)
     if settings.threads is not None and settings.threads < 1:
         raise unexpected("threads", "1 or more, or null", settings.threads)
     if settings.pictures < 0:

@@ -280,11 +280,9 @@ def target_of(node: Mapping[str, Any] | DictConfig) -> Any:
 
 
 def engine_kinds(words: Sequence[str]) -> dict[str, Any]:
-    """The class of each engine by name, but for one without precisions, which chooses among the
-    others; torch, the standard, comes first."""
+    """The class of each engine by name; torch, the standard, comes first."""
     files = sorted(choices("engine", words).items(), key=lambda file: (file[0] != "torch", file))
-    kinds = {name: target_of(loaded(path)) for name, path in files}
-    return {name: kind for name, kind in kinds.items() if kind.precisions}
+    return {name: target_of(loaded(path)) for name, path in files}
 
 
 def folder_words(words: Sequence[str]) -> list[str]:

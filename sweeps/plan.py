@@ -8,7 +8,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-from bench.errors import SteerbenchError, Unavailable, unexpected
+from bench.errors import Unavailable, unexpected
 from reports.paper_tables import CURVES, METHOD, SHARES, Line, PaperTable, point
 from sweeps import experiments
 from sweeps.configured import build
@@ -75,12 +75,7 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
         return composed([*fixed, *groups])
 
     jobs = []
-    wanted = list(_wanted(table))
-    if not precisions and any("precision" in line.job for _, _, line, _ in wanted):
-        raise SteerbenchError(
-            f"engine: {table.name} has lines at several precisions, and this engine chooses one"
-        )
-    for block, key, line, data_set in wanted:
+    for block, key, line, data_set in _wanted(table):
         if "precision" in line.job and line.job["precision"] not in precisions:
             continue
         own_settings = {name: of for name, of in line.job.items() if name not in asked}

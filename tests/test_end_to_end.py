@@ -28,9 +28,7 @@ def called(folder: Path, *words: str | Path) -> subprocess.CompletedProcess[str]
 
 
 def demo(folder: Path, weights: Path, *more: str) -> subprocess.CompletedProcess[str]:
-    chosen = "engine=torch"  # the demo chooses the fastest, which may be another one next time
-    words = (*SMALL, chosen, f"weights_dir={weights}", *more)
-    return called(folder, "run", "+experiment=demo", *words)
+    return called(folder, "run", "+experiment=demo", *SMALL, f"weights_dir={weights}", *more)
 
 
 def rows(folder: Path) -> pd.DataFrame:

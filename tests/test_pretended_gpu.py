@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from bench.waits import device_waits
 from methods.engines.torch_engine import TorchEngine
 from methods.kernels.encode import HashGrid, encode
-from tests.pretended_gpu import pretended_gpu
 
 
 def there(*values: float) -> Tensor:
@@ -25,15 +24,6 @@ LATTICE, MIDDLE = (
     HashGrid(levels=1, features=2, log2_table=6, n_min=4, n_max=4),
     torch.full((2, 3), 0.5),
 )
-
-
-def test_a_tensor_there_says_so_and_so_does_what_is_computed_from_it(gpu):
-    x = torch.arange(3.0, device="cuda")
-    for result in (x + 1, x.sum(), x.new_zeros(2), torch.zeros_like(x), x.view(3, 1), x[1:]):
-        assert result.device == torch.device("cuda", 0)
-        assert result.is_cuda
-    assert torch.arange(3.0).device.type == "cpu"
-    assert x.new_zeros(2, device="cpu").device.type == "cpu"
 
 
 REFUSED: dict[str, Callable[[], object]] = {
@@ -122,32 +112,6 @@ def test_told_to_raise_it_raises_where_it_would_wait(gpu):
         there(1)
 
 
-def captured(compute: Callable[[], Tensor]) -> tuple[torch.cuda.CUDAGraph, Tensor]:
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        return graph, compute()
-
-
-def test_a_graph_computes_again_from_what_is_in_its_memory(gpu):
-    x = there(1, 2, 3)
-    graph, result = captured(lambda: (x * 2).sum().expand(2) + torch.ones(2, device="cuda"))
-    x.fill_(10)
-    assert result.tolist() == [13, 13]
-    graph.replay()
-    assert result.tolist() == [61, 61]
-
-
-def test_a_graph_launches_kernels_of_triton_again(gpu):
-    pytest.importorskip("triton")
-    table, positions = torch.ones(LATTICE.entries, 2, device="cuda"), MIDDLE.to("cuda")
-    encode(positions, table, LATTICE, backend="gpu")  # what never changes is copied once
-    graph, features = captured(lambda: encode(positions, table, LATTICE, backend="gpu"))
-    table.fill_(3)
-    assert features.tolist() == [[1, 1], [1, 1]]
-    graph.replay()
-    assert features.tolist() == [[3, 3], [3, 3]]
-
-
 @pytest.mark.parametrize("enabled", [True, False])
 def test_autocast_lowers_products(gpu, enabled):
     x = torch.eye(2, device="cuda", requires_grad=True)
@@ -156,15 +120,6 @@ def test_autocast_lowers_products(gpu, enabled):
     product.float().sum().backward()
     assert product.dtype == (torch.bfloat16 if enabled else torch.float32)
     assert x.grad.dtype == torch.float32
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
-def test_afterwards_there_is_none():
-    with pretended_gpu():
-        x = there(1)
-    assert not torch.cuda.is_available()
-    with pytest.raises(RuntimeError, match="is gone"):
-        x + 1
 
 
 class Asking(nn.Module):

@@ -11,7 +11,7 @@ from methods.diver.kernels.segments import as_intervals
 from methods.diver.model import CornerModel
 from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.adam import AdamState, sparse_adam_
-from methods.kernels.composite import STOP, composite, visible, weights
+from methods.kernels.composite import STOP, composite, visibility
 from methods.kernels.settings import Count, Fraction, NotNegative, Positive, Share
 from methods.kernels.types import Pixels
 from methods.kernels.voxel_walk import Crossings, walk
@@ -60,8 +60,8 @@ class DiverTraining(PixelTraining):
         crossings = walk(rays, model.voxels, backend=backend)
         sigma = self._densities(rays, crossings)
         # What lies behind an opaque surface has neither weight nor gradient.
-        counts, _ = visible(sigma, as_intervals(crossings), stop=STOP, backend=backend)
-        crossings = crossings.front(counts)
+        seen = visibility(sigma, as_intervals(crossings), stop=STOP, backend=backend)
+        crossings = crossings.front(seen.counts)
         count = len(crossings)
         weight = model.weights(rays, crossings)
         features = model.features(pad(crossings.voxel), pad(weight), self.grad)
@@ -96,7 +96,8 @@ class DiverTraining(PixelTraining):
 
         def weigh(rays: Rays, crossings: Crossings) -> Tensor:
             sigma = self._densities(rays, crossings)
-            return weights(sigma, as_intervals(crossings), stop=STOP, backend=model.backend)
+            every = as_intervals(crossings)
+            return visibility(sigma, every, stop=STOP, backend=model.backend).weights
 
         rays = self.batches, options.prune_rays, self.generator
         kept = largest_weights(model.voxels, weigh, *rays, model.backend) >= options.prune_below

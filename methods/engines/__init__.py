@@ -55,9 +55,6 @@ class Engine(ABC):
         self.precision = precision
         self.uncalibrated = precision == "int8" and calibration == "none"
 
-    def __str__(self) -> str:
-        return f"{self.name}, {self.precision}"
-
     def import_library(self, library: str) -> ModuleType:
         """Import a library of the engine; raise `Unavailable` if it is not installed."""
         try:

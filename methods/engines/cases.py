@@ -13,8 +13,12 @@ from torch.nn import functional
 
 from bench.case import Case, Cell
 from bench.console import ConsoleLog
-from methods.engines.auto import KINDS
+from methods.engines import Engine
+from methods.engines.openvino_engine import OpenVino
+from methods.engines.tensorrt_engine import TensorRt
+from methods.engines.torch_engine import TorchEngine
 
+KINDS: tuple[type[Engine], ...] = (TorchEngine, OpenVino, TensorRt)
 CELLS: list[Cell] = [(kind.name, precision) for kind in KINDS for precision in kind.precisions]
 TOLERANCE = {"fp32": 1e-5, "bf16": 0.03, "fp16": 0.03, "int8": 0.1}
 SHARE = (

@@ -15,7 +15,7 @@ from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.adam import AdamState, sparse_adam_
-from methods.kernels.composite import STOP, composite, visible
+from methods.kernels.composite import STOP, composite, visibility
 from methods.kernels.settings import Count, NotNegative
 from methods.kernels.types import Occupancy, Pixels
 from methods.kernels.voxel_walk import walk
@@ -65,13 +65,13 @@ class OctreeTraining(PixelTraining):
         light, backend = self.octree.light, self.backend
         crossings = walk(rays, self.octree.voxels, backend=backend)
         sigma = light.density[crossings.voxel].relu()
-        counts, _ = visible(sigma, crossings, stop=STOP, backend=backend)
-        crossings = crossings.front(counts)
+        seen = visibility(sigma, crossings, stop=STOP, backend=backend)
+        crossings = crossings.front(seen.counts)
         self._sigma = light.density[crossings.voxel].requires_grad_()
         self.visited = crossings.voxel  # [S] int32
-        seen = crossings.voxel, crossings.ray, functional.normalize(rays.directions, dim=1)
+        where = crossings.voxel, crossings.ray, functional.normalize(rays.directions, dim=1)
         buffer = self.gradients["harmonics"].view_as(light.harmonics)
-        colours = shade_voxels(light.harmonics, *seen, grad_buffer=buffer, backend=backend)
+        colours = shade_voxels(light.harmonics, *where, grad_buffer=buffer, backend=backend)
         pixels = composite(self._sigma.relu(), colours, crossings, stop=STOP, backend=backend)
         return pixels.over(background), len(crossings)
 

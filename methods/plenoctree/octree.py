@@ -16,7 +16,7 @@ from torch import Tensor
 from bench.types import Rays, SteerbenchError
 from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import TrainedField
-from methods.kernels.composite import STOP, weights
+from methods.kernels.composite import STOP, visibility
 from methods.kernels.settings import Checked, Count, Degree, NotNegative, multiple
 from methods.kernels.spherical import spherical_harmonics
 from methods.kernels.types import Occupancy, expect
@@ -117,7 +117,8 @@ def extract(
     density = _densities(field, voxels, options.points, generator)
 
     def weigh(_: Rays, crossings: Crossings) -> Tensor:
-        return weights(density[crossings.voxel], crossings, stop=STOP, backend=backend)
+        sigma = density[crossings.voxel]
+        return visibility(sigma, crossings, stop=STOP, backend=backend).weights
 
     seen = largest_weights(voxels, weigh, batches, options.rays, generator, backend)
     kept = (seen >= options.least_weight) & (density > 0)

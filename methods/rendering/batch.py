@@ -1,13 +1,12 @@
 """Volume rendering in training: all samples of a batch of rays at once, with a gradient."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from bench.types import Rays
-from methods.kernels.composite import composite, visible
+from methods.kernels.composite import composite, visibility
 from methods.kernels.march import march
 from methods.kernels.march.contraction import HALF
 from methods.kernels.types import Occupancy, Pixels, Samples, offsets_of
@@ -51,29 +50,16 @@ def render_batch(
     samples = visible_samples(field, rays, occupancy, how, jitter=jitter, teacher=teacher)
     directions = field.encode_directions(rays.directions)
     sigma, values = query(field, samples.positions, samples.ray, directions, samples.encoded)
-    if occupancy.contracted:
+    if occupancy.contracted and sigma.requires_grad:
+        # Near a camera a sample is met by many rays of one picture, and learns fog before the lens
+        # from their sum; in proportion to the squared distance, all samples learn alike (Philip and
+        # Deschaintre 2023, "Floaters No More").
         away = samples.t * rays.directions.norm(dim=1).index_select(0, samples.ray)
         share = (away / NEAR).square().clamp(max=1)
-        sigma, values = _Scaled.apply(sigma, values, share)
+        sigma.register_hook(lambda gradient: gradient * share)
+        values.register_hook(lambda gradient: gradient * share[:, None])
     pixels = composite(sigma, values, samples, stop=how.stop, backend=field.backend)
     return pixels if background is None else pixels.over(background), len(samples)
-
-
-class _Scaled(torch.autograd.Function):
-    """Densities [S] and values [S, K] as they are, their gradients times `share` [S]. Near a camera
-    a sample is met by many rays of one picture, and learns fog before the lens from their sum; in
-    proportion to the squared distance, all samples learn alike (Philip and Deschaintre 2023,
-    "Floaters No More")."""
-
-    @staticmethod
-    def forward(ctx: Any, sigma: Tensor, values: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
-        ctx.save_for_backward(share)
-        return sigma.view_as(sigma), values.view_as(values)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:
-        (share,) = ctx.saved_tensors
-        return gradients[0] * share, gradients[1] * share[:, None], None
 
 
 @dataclass(frozen=True)
@@ -120,7 +106,8 @@ def visible_samples(
             parts = pad(samples.positions).split(CHUNK_SAMPLES)
             judge = field if teacher is None else teacher
             sigma = cat([judge.density(part)[0] for part in parts])[: len(samples)]
-        counts, left = visible(sigma, samples, stop=how.stop, front=front, backend=field.backend)
+        seen = visibility(sigma, samples, stop=how.stop, front=front, backend=field.backend)
+        counts, left = seen.counts, seen.left
         rounds.append(Round(chosen, samples, sigma, counts))
         if limit is None:
             break

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bench.cameras import cast, project
 from bench.types import EMPTY_ALPHA, Camera, Frame, Probe, Rays
-from methods.kernels.composite import composite, weights
+from methods.kernels.composite import composite, visibility
 from methods.kernels.march import march
 from methods.kernels.types import BRICK, Occupancy, Pixels, Samples
 from methods.rendering.compaction import compacts
@@ -205,8 +205,8 @@ def _evaluated(
 
     def bright(sigma: Tensor) -> Tensor:
         through = 1 - front.alpha
-        weight = weights(sigma, samples, stop=how.stop, front=through, backend=field.backend)
-        return weight > how.least_weight
+        seen = visibility(sigma, samples, stop=how.stop, front=through, backend=field.backend)
+        return seen.weights > how.least_weight
 
     with probe.stage("field"):
         if compacts(samples.t.device):

@@ -1,18 +1,17 @@
 """SteerNeRF (Li et al. 2022), as a `bench.types.Method`."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from bench.provenance import digest
 from bench.study import Study, Variant, turned
 from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
-from methods.engines import Built, Engine
-from methods.engines.auto import Auto, EngineFigures
+from methods.engines import Engine
 from methods.instant_ngp.stage1 import OnField, train_field
 from methods.kernels.settings import Steps
 from methods.kernels.types import expect
@@ -20,7 +19,7 @@ from methods.steernerf.buffer import Buffer
 from methods.steernerf.options import JointOptions, ModelOptions, Rendering
 from methods.steernerf.stage2 import Stage2, train_stage2
 from methods.steernerf.unet import UNet
-from methods.steernerf.views import TrainingViews
+from methods.steernerf.views import recorded_inputs
 
 HOW = "method.rendering"
 SKIPS = {
@@ -46,7 +45,7 @@ class SteerNerf(OnField):
     rendering: Rendering
     renderer: partial[UNet]
     joint: JointOptions
-    engine: Engine | Auto
+    engine: Engine
     steps: Steps
     name: str
 
@@ -88,7 +87,6 @@ class SteerNerf(OnField):
         self.engine.check(self.setup.device)
         with torch.random.fork_rng(devices=[]):  # refuses before hours of training
             self.stage2.make(self.setup)
-        self.chosen = self.engine  # `chosen` computes the network after `fit`
         self.memory, self.buffer = frames, Buffer(maxlen=frames)
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
@@ -101,27 +99,16 @@ class SteerNerf(OnField):
             self.pipeline, trained, seconds, peak = train_stage2(*given)
         self.train_s = self.trained.train_s + seconds
         self.train_peak_bytes = max(self.trained.train_peak_bytes, peak)
-        views = TrainingViews(self.pipeline, scene, self.stage2.joint, self.setup.seed, log)
-        renderer, device = self.pipeline.renderer, self.setup.device
+        renderer, views = self.pipeline.renderer, (self.engine.samples, self.setup.seed)
 
-        def folder(engine: dict[str, object]) -> Path:
-            key = {"trained": trained, "engine": engine, "recorded": digest(type(self))}
+        def samples() -> list[Tensor]:
+            return recorded_inputs(self.pipeline, scene, self.stage2.joint, *views, log)
+
+        def folder() -> Path:
+            key = {"trained": trained, "engine": self.engine.key(), "recorded": digest(type(self))}
             return log.stage_dir("network", key)
 
-        inputs = cache(views.inputs)  # engines that need as many share them
-
-        @cache  # what was measured is not built again
-        def build(engine: Engine) -> Built:
-            samples = partial(inputs, engine.samples)
-            return engine.build(renderer.network, samples, lambda: folder(engine.key()), log)
-
-        def measure(engines: Sequence[Engine]) -> Sequence[EngineFigures]:
-            return views.compare([build(engine) for engine in engines])
-
-        if isinstance(engine := self.engine, Auto):
-            engine = engine.chosen(device, measure, folder(engine.key(device)), log)
-        self.chosen = engine
-        renderer.engine = self.built = build(engine)
+        renderer.engine = self.built = self.engine.build(renderer.network, samples, folder, log)
 
     def reset(self) -> None:
         self.buffer.clear()
@@ -134,5 +121,5 @@ class SteerNerf(OnField):
 
     def settings(self) -> dict[str, str]:
         """Those of the field, with the engine and precision of the 2D renderer."""
-        engine, computed = self.chosen.name, self.chosen.computed(self.setup.device)
-        return super().settings() | {"engine": engine, "precision": computed}
+        computed = self.engine.computed(self.setup.device)
+        return super().settings() | {"engine": self.engine.name, "precision": computed}

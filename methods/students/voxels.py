@@ -8,19 +8,17 @@ from torch.nn import functional
 
 from bench.types import Rays
 from methods.instant_ngp.pixels import PixelBatches
+from methods.kernels.corner_gather import OFFSETS
 from methods.kernels.types import Occupancy
 from methods.kernels.voxel_walk import Crossings, Voxels, walk
 
 CHUNK_RAYS = 1 << 15  # rays that are traced together: bounds the memory
 
-OFFSETS = tuple((c & 1, c >> 1 & 1, c >> 2 & 1) for c in range(8))
-"""Offsets of a voxel's corners; in the index of a corner, bit 0 is +x, bit 1 +y, bit 2 +z."""
-
 
 def corners_of(coordinates: Tensor) -> tuple[Tensor, Tensor]:
     """The corners of V voxels at `coordinates` [V, 3], from 0 to 2^20: [V, 8] int32, which vertices
     each has, and [C, 3] int32, the coordinates of all vertices, ordered by x, then y, then z."""
-    offsets = torch.tensor(OFFSETS, device=coordinates.device)
+    offsets = OFFSETS.to(coordinates.device)
     x, y, z = (coordinates.long()[:, None] + offsets).unbind(dim=-1)  # [V, 8]
     keys, corners = torch.unique((x << 42) + (y << 21) + z, return_inverse=True)
     mask = (1 << 21) - 1

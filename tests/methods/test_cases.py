@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bench.case import Difference, nearest
-from methods.checks import found, kernels, modules
+from methods.checks import found, kernels
 from methods.kernels import availability, dispatch
 from tests.interpreter import unforgiving
 
@@ -84,13 +84,6 @@ def test_zeros_for_any_result_exceed_the_tolerance(case):
 def test_no_two_cases_have_the_same_name():
     names = [(case.subject, case.name) for case in CASES]
     assert len(set(names)) == len(names)
-
-
-@pytest.mark.parametrize("name", ["cases", "experiments"])
-def test_every_file_of_checks_has_some(name):
-    files = modules(name)
-    assert files
-    assert all(getattr(importlib.import_module(module), name)() for module in files)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)

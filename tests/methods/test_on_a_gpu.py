@@ -368,21 +368,6 @@ def test_steps_and_frames_are_few_launches(
     assert len(rounds) > 1
 
 
-ROWS = {
-    "ngp": "gpu, but reference: mlp",
-    "gaussians": "gpu, but reference: blending, mlp, projection, ssim",
-    "kilonerf": "gpu, but reference: grouped_mlp, mlp",
-}
-
-
-@needs_triton
-@pytest.mark.parametrize("name", ROWS)
-def test_rows_name_what_triton_does_not_compute(gpu: PretendedGpu, name: str) -> None:
-    method = METHODS[name](device="cuda", backend="gpu")
-    assert method.settings()["backend"] == ROWS[name]
-    assert METHODS[name](device="cuda", backend="auto").settings()["backend"] == "reference"
-
-
 GO_ON = [
     ("adam", "30% of 70, 3 features"),
     ("composite backward", "one sample a ray"),

@@ -150,12 +150,6 @@ def test_a_setting_that_cannot_be_had_is_named(override, said):
         plan(TABLES["table3"], [override])
 
 
-def test_an_engine_that_chooses_the_precision_is_refused_where_lines_have_one():
-    with pytest.raises(SteerbenchError, match="engine: table1 has lines at several precisions"):
-        plan(TABLES["table1"], ["engine=auto"])
-    assert len(plan(TABLES["table2"], ["engine=auto", "seed=0"])) > 0
-
-
 @pytest.mark.parametrize(("gpu", "asked"), [(False, []), (True, []), (False, ["engine=torch"])])
 def test_the_engine_of_the_first_table_is_one_for_device_and_precision(gpu, asked, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)

@@ -6,9 +6,11 @@ configuration; `iterations`, null for as many as the method wants; `weights`, a 
 files of a checkpoint that rendering needs.
 """
 
+import importlib
 import random
 import sys
 from contextlib import ExitStack
+from importlib.util import find_spec
 from pathlib import Path
 
 sys.path.pop(0)  # this folder: its names are those of packages
@@ -30,7 +32,8 @@ class NerfBaselines:
         self.name, self.backend, self.presets = id, backend, presets
         self.overrides, self.iterations, self.weights = overrides or {}, iterations, weights
         self.spec, self.stack = nerfbaselines.get_method_spec(id), ExitStack()
-        self.torch = _torch()  # which a method loads only when it is built
+        # Which a method loads only when it is built.
+        self.torch = importlib.import_module("torch") if find_spec("torch") else None
         self.device = "cuda" if self.torch and self.torch.cuda.is_available() else "cpu"
         if backend != "python":  # the model is in another process
             self.peak_bytes = lambda: None
@@ -109,14 +112,6 @@ class NerfBaselines:
             image_sizes=np.array([(camera.width, camera.height) for camera in cameras], np.int32),
             nears_fars=np.stack((near, away + radius), axis=1).astype(np.float32),
         )
-
-
-def _torch():
-    try:
-        import torch
-    except ImportError:
-        return None
-    return torch
 
 
 if __name__ == "__main__":

@@ -4,6 +4,8 @@ alpha_i = 1 - exp(-sigma_i delta_i),  T_i = prod_{j<i} (1 - alpha_j),  w_i = T_i
 values = sum w_i f_i,  depth_sum = sum w_i t_i,  alpha = sum w_i
 """
 
+from typing import NamedTuple
+
 from torch import Tensor
 
 from bench.types import check_shape
@@ -45,44 +47,32 @@ def composite(
     return kernel.composite(sigma, values, intervals, stop, carry)
 
 
-def weights(
+class Visibility(NamedTuple):
+    """What `composite` sees of samples, computed without values. No gradient."""
+
+    weights: Tensor  # [S]
+    # [R] int64, how many samples of a ray get a weight. They are its first ones; those behind have
+    # neither weight nor gradient.
+    counts: Tensor
+    left: Tensor  # [R] transmittance behind them
+
+
+def visibility(
     sigma: Tensor,
     intervals: Intervals,
     *,
     stop: float = STOP,
     front: Tensor | None = None,
     backend: str = "auto",
-) -> Tensor:
-    """The weights [S] that `composite` gives to samples, computed without values. No gradient.
-    `front` [R] is the transmittance in front of each ray's first sample; None: 1."""
-    return _light(sigma, intervals, stop, front, backend)[0]
-
-
-def visible(
-    sigma: Tensor,
-    intervals: Intervals,
-    *,
-    stop: float = STOP,
-    front: Tensor | None = None,
-    backend: str = "auto",
-) -> tuple[Tensor, Tensor]:
-    """How many samples of each ray get a weight from `composite`, [R] int64, and the transmittance
-    behind them, [R]. No gradient. They are the first samples of the ray; those behind have neither
-    weight nor gradient. `front` is as for `weights`."""
-    _, counts, left = _light(sigma, intervals, stop, front, backend)
-    return counts, left
-
-
-def _light(
-    sigma: Tensor, intervals: Intervals, stop: float, front: Tensor | None, backend: str
-) -> tuple[Tensor, Tensor, Tensor]:
-    """What `weights` and `visible` return."""
+) -> Visibility:
+    """The visibility of samples as for `composite`. `front` [R] is the transmittance in front of
+    each ray's first sample; None: 1."""
     _check_samples(sigma, intervals)
     rays = len(intervals.offsets) - 1
     front = sigma.new_ones(rays) if front is None else front
     check_shape("front", front, rays)
     kernel = implementation(__name__, backend, sigma.device)
-    return kernel.light(sigma.detach(), intervals, stop, front)
+    return Visibility(*kernel.visibility(sigma.detach(), intervals, stop, front))
 
 
 def _check_samples(sigma: Tensor, intervals: Intervals) -> None:

@@ -20,7 +20,7 @@ from bench.case import (
     on_backends,
     placed,
 )
-from methods.kernels.composite import composite, visible, weights
+from methods.kernels.composite import composite, visibility
 from methods.kernels.dispatch import served
 from methods.kernels.types import Intervals, Pixels, offsets_of
 
@@ -85,11 +85,10 @@ def _composite(given: Given, backend: str) -> tuple[Tensor, ...]:
     return composite(given["sigma"], given["values"], _intervals(given), **how).columns
 
 
-def _light(given: Given, backend: str) -> tuple[Tensor, ...]:
+def _visibility(given: Given, backend: str) -> tuple[Tensor, ...]:
     front = None if given["carry"] is None else 1 - given["carry"].alpha
     how = {"stop": given["stop"], "front": front, "backend": backend}
-    samples = given["sigma"], _intervals(given)
-    return weights(*samples, **how), *visible(*samples, **how)
+    return visibility(given["sigma"], _intervals(given), **how)
 
 
 def _roundings(given: Given) -> float:
@@ -136,7 +135,7 @@ COMPOSITE = Operation(
 WEIGHTS = Operation(
     "composite weights",
     served(__package__),
-    _light,
+    _visibility,
     {
         "weights": Bound(OF_A_WEIGHT, _of_weights),
         "counts": Bound("no transmittance is within rounding of the stop: 0", 0.0),

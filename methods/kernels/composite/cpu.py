@@ -25,7 +25,7 @@ def composite(
     return Pixels(*_Composite.apply(sigma, values, *samples, stop, carry))
 
 
-def light(
+def visibility(
     sigma: Tensor, intervals: Intervals, stop: float, front: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     weights, left = torch.zeros(len(sigma)), torch.empty(len(front))

@@ -25,7 +25,7 @@ def composite(
     return Pixels(*_TritonComposite.apply(sigma, values, t, delta, intervals.offsets, stop, carry))
 
 
-def light(
+def visibility(
     sigma: Tensor, intervals: Intervals, stop: float, front: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     check_float32(sigma=sigma, delta=intervals.delta, front=front)

@@ -20,7 +20,7 @@ def composite(
     return Pixels(*(sums if carry is None else map(torch.add, carry.columns, sums)))
 
 
-def light(
+def visibility(
     sigma: Tensor, intervals: Intervals, stop: float, front: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     slots, starts = _padded_rays(intervals), intervals.offsets[:-1]

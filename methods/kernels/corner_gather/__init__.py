@@ -13,6 +13,7 @@ from methods.kernels.dispatch import implementation
 from methods.kernels.types import expect
 
 CORNERS = 8
+OFFSETS = torch.arange(CORNERS)[:, None] >> torch.arange(3) & 1  # [8, 3] of the corners of a voxel
 
 
 def corner_gather(

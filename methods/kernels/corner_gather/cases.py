@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from bench.case import U32, Bound, Case, Given, Operation
-from methods.kernels.corner_gather import CORNERS, corner_gather
+from methods.kernels.corner_gather import CORNERS, OFFSETS, corner_gather
 from methods.kernels.dispatch import served
 
 VIEW = 1 << 17  # samples of one view, for which the throughput is measured
@@ -55,8 +55,7 @@ def _given(count: int, channels: int) -> Given:
     """No number is larger than 1; samples on neighbouring rays, ray by ray, half a voxel apart."""
     generator = torch.Generator().manual_seed(count)
     voxel = torch.cartesian_prod(*[torch.arange(SIDE)] * 3)
-    bits = torch.arange(CORNERS)[:, None] >> torch.arange(3) & 1
-    x, y, z = (voxel[:, None] + bits).unbind(dim=-1)
+    x, y, z = (voxel[:, None] + OFFSETS).unbind(dim=-1)
     steps = min(count, 2 * SIDE)
     rays = math.ceil(math.sqrt(count / max(steps, 1)))
     across = torch.linspace(0.1, 0.7, rays) * SIDE

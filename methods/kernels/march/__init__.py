@@ -65,7 +65,18 @@ def march(
             negative: no samples; None: 0.
         limit: maximum number of samples per ray; None: all.
     """
-    segments = _segments(rays, step, window, jitter, start, limit)
+    count = check_rays(rays)
+    every, middle, first = _usual(rays.origins.device, rays.origins.dtype)
+    window = every.expand(count, 2) if window is None else window
+    jitter = middle.expand(count) if jitter is None else jitter
+    start = first.expand(count) if start is None else start
+    check_shape("window", window, count, 2)
+    check_shape("jitter", jitter, count)
+    check_shape("start", start, count)
+    expect(step > 0, "step", "a positive length", step)
+    limit = longest_ray(step) if limit is None else limit
+    expect(limit >= 1, "limit", "1 or more", limit)
+    segments = Segments(rays, step, window, jitter, start, limit)
     kernel = implementation(__name__, backend, rays.origins.device)
     return kernel.march(segments, occupancy)
 
@@ -80,26 +91,3 @@ def _usual(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor, Te
     """Window, phase and first step of a ray for which none is given."""
     window, jitter = (torch.tensor(x, dtype=dtype, device=device) for x in ([0, math.inf], [0.5]))
     return window, jitter, torch.zeros(1, dtype=torch.int32, device=device)
-
-
-def _segments(
-    rays: Rays,
-    step: float,
-    window: Tensor | None,
-    jitter: Tensor | None,
-    start: Tensor | None,
-    limit: int | None,
-) -> Segments:
-    """Check the arguments of `march` and fill in defaults."""
-    count = check_rays(rays)
-    every, middle, first = _usual(rays.origins.device, rays.origins.dtype)
-    window = every.expand(count, 2) if window is None else window
-    jitter = middle.expand(count) if jitter is None else jitter
-    start = first.expand(count) if start is None else start
-    check_shape("window", window, count, 2)
-    check_shape("jitter", jitter, count)
-    check_shape("start", start, count)
-    expect(step > 0, "step", "a positive length", step)
-    limit = longest_ray(step) if limit is None else limit
-    expect(limit >= 1, "limit", "1 or more", limit)
-    return Segments(rays, step, window, jitter, start, limit)

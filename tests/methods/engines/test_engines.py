@@ -1,14 +1,12 @@
 """Engines: every one computes what the network does, as closely as its precision allows."""
 
-from collections.abc import Callable
-
 import pytest
 import torch
 from torch import Tensor, nn
 
 from bench.errors import Unavailable
 from methods.engines.openvino_engine import OpenVino, _capabilities
-from methods.engines.torch_engine import Replay, Replayed, TorchEngine
+from methods.engines.torch_engine import TorchEngine
 from methods.steernerf.unet import UNet
 from tests.methods.observations import shaken
 
@@ -100,26 +98,16 @@ def test_rows_say_what_torch_multiplies_in_bfloat16(products, computed, monkeypa
     assert TorchEngine("fp32").computed(CPU) == "fp32"
 
 
-class ReplayedHere(Replayed):
-    """Records on a CPU: to replay is to compute again, from the same input to the same output."""
-
-    recorded = 0
-
-    def record(self, run: Callable[[], Tensor]) -> Replay:
-        self.recorded += 1
-        output = torch.full_like(run(), torch.nan)
-        return lambda: output.copy_(run()), output
-
-
-def test_a_replay_gives_the_output_of_the_network_and_leaves_the_input_alone():
+def test_a_replay_gives_the_output_of_the_network_and_leaves_the_input_alone(gpu, build):
     network, pictures = unet()
-    replayed = ReplayedHere(network)
-    for whole in pictures:
-        for picture in (whole, whole[..., :28, :40].contiguous()):
-            before = picture.clone()
-            assert torch.equal(replayed(picture), network(picture))
-            assert torch.equal(picture, before)
-    assert replayed.recorded == 2  # sizes
+    given = [picture for x in pictures for picture in (x, x[..., :28, :40].contiguous())]
+    wanted = [network(picture) for picture in given]
+    run = build(TorchEngine(), network.to("cuda"), pictures).run
+    for picture, want in zip(given, wanted, strict=True):
+        there = picture.cuda()
+        assert torch.equal(run(there).cpu(), want)
+        assert torch.equal(there.cpu(), picture)
+    assert len(run._recordings) == 2  # sizes
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="for a machine with a GPU")

@@ -208,16 +208,6 @@ def test_a_checkpoint_that_cannot_be_written_says_so(tmp_path):
         checkpoint.write(tmp_path / "gone" / "field.safetensors", {}, {})
 
 
-def test_pictures_without_alpha_are_trained_on_as_they_are(ball_scene):
-    split = ball_scene.splits["train"]
-    opaque = replace(split, images=[image[..., :3] for image in split.images])
-    training = new_training(replace(ball_scene, splits={"train": opaque}))
-    colours = torch.rand(9, 3)
-    target, background = training._target(colours)
-    assert torch.equal(target, colours)
-    assert torch.equal(background, ball_scene.background)
-
-
 def test_a_random_background_is_one_colour_for_a_ray_and_its_truth(ball_scene):
     training = new_training(ball_scene)
     clear = torch.cat((torch.rand(9, 3), torch.zeros(9, 1)), dim=1)
@@ -228,12 +218,15 @@ def test_a_random_background_is_one_colour_for_a_ray_and_its_truth(ball_scene):
     assert torch.equal(target, clear[:, :3])
 
 
-def test_where_space_has_no_end_opaque_pictures_hide_a_random_background(ball_scene):
-    training = new_training(replace(ball_scene, space="all"))
+@pytest.mark.parametrize(("space", "backgrounds"), [("box", 1), ("all", 9)])
+def test_opaque_colours_stay_and_where_space_has_no_end_hide_a_random_background(
+    space, backgrounds, ball_scene
+):
+    training = new_training(replace(ball_scene, space=space))
     colours = torch.rand(9, 3)
     target, background = training._target(colours)
     assert torch.equal(target, colours)
-    assert len(set(map(tuple, background.tolist()))) == 9
+    assert len(set(map(tuple, background.expand(9, 3).tolist()))) == backgrounds
 
 
 STRESS = [case for case in cases() if case.subject == "training"]

@@ -11,7 +11,7 @@ from scipy import integrate
 from torch import Tensor
 
 from bench.case import U32
-from methods.kernels.composite import composite, visible, weights
+from methods.kernels.composite import composite, visibility
 from methods.kernels.composite.experiments import exact, slope
 from methods.kernels.types import Intervals, Pixels, offsets_of
 
@@ -106,9 +106,8 @@ def test_visible_samples_are_those_with_a_weight_which_is_the_gradient_of_their_
     pixels = composite(sigma, values, where, stop=0.05, carry=carry, backend=backend)
     assert torch.equal(carry.alpha, alpha)
     (gradient,) = torch.autograd.grad(pixels.values.sum(), values)
-    found = weights(sigma, where, stop=0.05, front=1 - alpha, backend=backend)
+    found, counts, left = visibility(sigma, where, stop=0.05, front=1 - alpha, backend=backend)
     torch.testing.assert_close(found, gradient[:, 0], rtol=1e-5, atol=1e-7)
-    counts, left = visible(sigma, where, stop=0.05, front=1 - alpha, backend=backend)
     torch.testing.assert_close(left, 1 - pixels.alpha, rtol=0, atol=1e-6)
     assert 0 < counts[0] < 40
     ends = zip(found.split([40, 0, 1, 25]), counts.tolist(), strict=True)

@@ -18,7 +18,7 @@ from bench.case import U32, largest_error
 from methods.checks import kernels
 from methods.kernels import availability
 from methods.kernels.adam import AdamState, sparse_adam_
-from methods.kernels.composite import composite, visible, weights
+from methods.kernels.composite import composite, visibility
 from methods.kernels.encode import HashGrid, encode
 from methods.kernels.types import Intervals
 
@@ -34,12 +34,12 @@ def test_what_is_not_a_number_shows_and_what_is_behind_it_does_not() -> None:
     sigma = torch.full((202,), 0.01, device=DEVICE)
     sigma[10], sigma[200] = torch.nan, torch.inf
     intervals = Intervals(sigma, torch.ones_like(sigma), offsets)
-    found = weights(sigma, intervals, backend="gpu").cpu()
+    seen = visibility(sigma, intervals, backend="gpu")
+    found = seen.weights.cpu()
     assert (found[:10] > 0).all()
     assert found[10].isnan()
     assert found[11:].tolist() == [0] * 189 + [1, 0]
-    counts, _ = visible(sigma, intervals, backend="gpu")
-    assert counts.tolist() == [11, 1]
+    assert seen.counts.tolist() == [11, 1]
     pixels = composite(sigma, torch.ones_like(sigma)[:, None], intervals, backend="gpu")
     assert pixels.alpha[0].isnan()
     assert pixels.alpha[1] == 1
@@ -64,7 +64,7 @@ def test_a_thin_haze_keeps_its_light_to_the_last_digits() -> None:
     sigma = torch.logspace(-30, 0, 61, device=DEVICE)
     offsets = torch.arange(62, device=DEVICE)
     intervals = Intervals(sigma, torch.full_like(sigma, 0.25), offsets)
-    found = weights(sigma, intervals, backend="gpu").double().cpu()
+    found = visibility(sigma, intervals, backend="gpu").weights.double().cpu()
     exact = -torch.expm1(-(0.25 * sigma.double())).cpu()
     # The series has twelve operations; 1 - exp is off by itself and 2 ulp of an exp below 1.
     assert ((found - exact).abs() / exact).max() <= (12 + 3 / 0.06) * U32

@@ -9,7 +9,7 @@ from torch import Tensor
 from bench.cameras import cast, place_camera
 from bench.types import Rays
 from methods.instant_ngp.field import HashField
-from methods.kernels.composite import composite, visible
+from methods.kernels.composite import composite, visibility
 from methods.kernels.march import march
 from methods.kernels.types import Occupancy, Pixels
 from methods.rendering.batch import (
@@ -78,7 +78,7 @@ def test_thin_samples_are_kept_in_turn_for_the_others(cloud, device):
     jitter = torch.full((len(rays.origins),), 0.5, device=device)
     samples = march(rays, occupancy, STEP, jitter=jitter)
     sigma = field.density(samples.positions)[0].detach()
-    counts, _ = visible(sigma, samples)
+    counts = visibility(sigma, samples).counts
     every, depth = samples.front(counts), (sigma * samples.delta).median().item()
 
     # The turns of one phase take all thin samples once, each with the length of all.

@@ -5,9 +5,10 @@ import torch
 
 from bench.types import Rays
 from methods.instant_ngp.pixels import PixelBatches
+from methods.kernels.corner_gather import OFFSETS
 from methods.kernels.types import Occupancy
 from methods.kernels.voxel_walk import Crossings, Voxels
-from methods.students.voxels import OFFSETS, corners_of, largest_weights, occupied_voxels
+from methods.students.voxels import corners_of, largest_weights, occupied_voxels
 
 
 def scattered(share: float, size: int = 16) -> Occupancy:
@@ -18,7 +19,7 @@ def scattered(share: float, size: int = 16) -> Occupancy:
 def test_corners_are_where_they_belong_and_none_is_there_twice():
     voxels = scattered(0.1).cells.nonzero()
     corners, vertices = corners_of(voxels)
-    want = voxels[:, None] + torch.tensor(OFFSETS)
+    want = voxels[:, None] + OFFSETS
     assert torch.equal(vertices[corners.long()].long(), want)
     assert torch.equal(vertices, vertices.unique(dim=0))
     assert len(vertices) == len(corners.unique())

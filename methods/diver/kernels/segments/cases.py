@@ -23,7 +23,7 @@ from bench.case import (
 )
 from bench.types import Rays
 from methods.diver.kernels.segments import Corners, Layers, render_segments, segment_weights
-from methods.kernels.corner_gather import CORNERS
+from methods.kernels.corner_gather import CORNERS, OFFSETS
 from methods.kernels.dispatch import served
 from methods.kernels.march.cases import some_rays
 from methods.kernels.voxel_walk import Crossings, Voxels, walk
@@ -34,9 +34,6 @@ SIDE = 16  # voxels along the grid of the small cases
 DENSEST = 1 / 4  # largest density of a segment: sums of 32 products of at most 1 / 128
 
 FARTHEST = 3  # largest depth of a segment
-
-BITS = torch.arange(CORNERS)[:, None] >> torch.arange(3) & 1
-"""Where the corners of a voxel are in it, [8, 3]."""
 
 WEIGHTS = (
     "ends of a segment, its middle and its nodes are off by 3 u along each of 3 axes, along which "
@@ -148,7 +145,7 @@ def _quadrature_error(
     exact = torch.zeros(len(ray), CORNERS, dtype=torch.float64, device=device)
     for place, share in zip(*np.polynomial.legendre.leggauss(4), strict=True):
         point = (near + far + place * (far - near))[:, None] / 2  # [S, 1, 3]
-        exact += share / 2 * torch.where(BITS.to(device) > 0, point, 1 - point).prod(dim=2)
+        exact += share / 2 * torch.where(OFFSETS.to(device) > 0, point, 1 - point).prod(dim=2)
     rays = Rays(rays.origins.to(dtype), rays.directions.to(dtype))
     crossings = replace(crossings, near=crossings.near.to(dtype), far=crossings.far.to(dtype))
     return largest_error((segment_weights(rays, crossings, voxels, backend=backend),), (exact,))
@@ -162,7 +159,7 @@ def scene(side: int, count: int, dtype: torch.dtype, stop: float, faint: float) 
         return torch.rand(*shape, generator=generator) * (high - low) + low
 
     cells = (torch.rand(side, side, side, generator=generator) < 1 / 3).nonzero().int()
-    rows = (cells[:, None] + BITS) @ torch.tensor([(side + 1) ** 2, side + 1, 1])
+    rows = (cells[:, None] + OFFSETS) @ torch.tensor([(side + 1) ** 2, side + 1, 1])
     table = between(-1, 1, (side + 1) ** 3, FEATURES).to(dtype)
     layers = Layers(
         between(-1, 1, HIDDEN, FEATURES) / FEATURES,

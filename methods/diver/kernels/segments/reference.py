@@ -6,7 +6,7 @@ from torch.nn.functional import linear
 
 from bench.types import Rays
 from methods.diver.kernels.segments import Corners, Layers, as_intervals
-from methods.kernels.composite import composite, visible, weights
+from methods.kernels.composite import composite, visibility
 from methods.kernels.corner_gather import corner_gather, trilinear
 from methods.kernels.types import Pixels
 from methods.kernels.voxel_walk import Crossings, Voxels, walk
@@ -51,7 +51,7 @@ def render_segments(
     hidden = linear(features.relu(), layers.hidden, layers.hidden_bias).relu()
     density = linear(hidden, layers.density, layers.density_bias).relu().squeeze(1)
     intervals = as_intervals(crossings)
-    weight = weights(density, intervals, stop=stop, backend="reference")
+    weight, crossed, _ = visibility(density, intervals, stop=stop, backend="reference")
     shown = (linear(hidden, layers.geometry) + towards[ray]).relu()
     colour = linear(shown, layers.colour, layers.colour_bias).sigmoid()
     seen = weight > faint
@@ -59,5 +59,4 @@ def render_segments(
     pixels = composite(density, colour, intervals, stop=stop, backend="reference")
     shaded = torch.zeros(len(towards), dtype=torch.int32, device=towards.device)
     shaded.index_add_(0, ray, seen.int())
-    crossed, _ = visible(density, intervals, stop=stop, backend="reference")
     return pixels, crossed.int(), shaded

@@ -5,7 +5,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from bench.types import Rays
-from methods.kernels.composite import composite, visible, weights
+from methods.kernels.composite import composite, visibility
 from methods.kernels.shade import shade
 from methods.kernels.types import Pixels
 from methods.kernels.voxel_walk import Voxels, walk
@@ -18,8 +18,7 @@ def render_voxels(
 ) -> tuple[Pixels, Tensor, Tensor]:
     crossings = walk(rays, voxels, backend="reference")
     sigma = light.density[crossings.voxel.long()]
-    crossed, _ = visible(sigma, crossings, stop=stop, backend="reference")
-    weight = weights(sigma, crossings, stop=stop, backend="reference")
+    weight, crossed, _ = visibility(sigma, crossings, stop=stop, backend="reference")
     shown = weight > faint
     seen = shown.nonzero().squeeze(1)
     values = sigma.new_zeros(len(sigma), 3)
