@@ -14,7 +14,6 @@ from omegaconf import OmegaConf
 from reports import figures
 from reports.claims import NOT_MEASURED, Comparison, claim_table, finding_table
 from reports.images import Part, Picture, frame_section, kept_frames
-from reports.outliers import Outlier, outlier_table
 from reports.paper_tables import (
     CURVES,
     SHARES,
@@ -35,20 +34,16 @@ PAGE: Any = OmegaConf.to_container(OmegaConf.load(Path(__file__).parent / "paper
 def write_paper_page(
     tables: Sequence[PaperTable],
     measured: Measured,
-    found: Sequence[Outlier],
     folder: Path,
     missing: Mapping[str, str] = {},
 ) -> Path:
     """Write `folder/report.md` with its pictures, and the same as `report.html`; return the former.
 
-    The page shows `tables` in this order, with what was `measured`, and the outliers `found` among
-    their runs; `missing` says why scenes are left out, by name. Raises SteerbenchError if `folder`
-    cannot be written to.
+    The page shows `tables` in this order, with what was `measured`; `missing` says why scenes are
+    left out, by name. Raises SteerbenchError if `folder` cannot be written to.
     """
     runs = list({run.key: run for line in measured.values() for run in line.measured}.values())
     left_out = "\n".join(f"- missing: {name}: {why}" for name, why in missing.items())
-    listed = outlier_table(found, runs)
-    flagged: list[Part] = [f"## {listed.title}", listed] if listed.lines else []
     sources = "\n".join(f"{run.key}  {run.record['command']}" for run in runs)
     compared = [each for table in tables for each in comparisons(table, measured)]
     if all(each.here is NOT_MEASURED for each in compared):
@@ -64,7 +59,6 @@ def write_paper_page(
         f"# {title}",
         *_conclusions(compared),
         *([f"## Scenes that are left out\n\n{left_out}"] if left_out else []),
-        *flagged,
         "## The tables",
         *reading,
         PAGE["reading"].strip(),

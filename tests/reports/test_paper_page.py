@@ -1,4 +1,4 @@
-"""The page about the paper's tables: its pictures, its curves, its outliers."""
+"""The page about the paper's tables: its pictures, its curves."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -8,7 +8,6 @@ import pytest
 
 from reports import figures
 from reports.images import Picture
-from reports.outliers import Outlier
 from reports.paper_page import PAGE, _curves, write_paper_page
 from reports.paper_tables import CURVES, Line, PaperTable, Place, point
 from reports.runs import Repeated, Run
@@ -33,17 +32,13 @@ def test_the_page_has_every_table_and_every_figure(run, tmp_path):
     measured: dict[Place, Repeated] = {}
     for table in TABLES.values():
         measured |= measured_of(table, dict.fromkeys(table.lines, run))
-    found = [Outlier(run.key, "13 dB among 30s"), Outlier("another", "not of this page")]
-    page = write_paper_page([*TABLES.values()], measured, found, tmp_path)
+    page = write_paper_page([*TABLES.values()], measured, tmp_path)
     text = page.read_text()
     shown = re.findall(r"!\[[^]]*\]\((.+?)\)", text)
     assert len(shown) == 6
     assert {page.parent / name for name in shown} == set((tmp_path / "pictures").iterdir())
     assert all(f"## Table {number}" in text for number in range(1, 7))
     assert text.count(f"{run.key}  steerbench run method=offset") == 1
-    assert "## Outliers: runs that look broken" in text
-    assert "13 dB among 30s" in text
-    assert "not of this page" not in text
     html = (tmp_path / "report.html").read_text()
     assert html.count("<svg") == 4
     assert html.count('<div class="frame"') == 2
@@ -62,7 +57,7 @@ def test_a_method_has_one_mark_at_its_first_measured_line_and_an_added_one_too(
         return real(shown, metric)
 
     monkeypatch.setattr(figures, "quality_plot", watched)
-    write_paper_page([table], measured, [], tmp_path)
+    write_paper_page([table], measured, tmp_path)
     methods = ["NeRF", "NSVF", "KiloNeRF", "PlenOctree", "DIVeR", "Instant-NGP", "3D Gaussians"]
     assert drawn == 2 * [[*methods, "SteerNeRF", "x"]]
 
@@ -76,7 +71,7 @@ def test_findings_come_first_all_comparisons_last(run, tmp_path):
         )
         for place, (key, line) in enumerate(reversed(table.lines.items()))
     }
-    text = write_paper_page([table], measured, [], tmp_path).read_text()
+    text = write_paper_page([table], measured, tmp_path).read_text()
     before, after = text.split("## The tables")
     says = "PSNR lost by a hash table of 2^16 against 2^19"
     assert f"| **{says} (dB)** | +0.02 | +0.11 | " in before
@@ -89,16 +84,15 @@ def test_findings_come_first_all_comparisons_last(run, tmp_path):
 def test_a_page_of_nothing_still_says_what_is_missing(tmp_path):
     lines = [Repeated("with joint training", [], ["not measured yet"])]
     measured = {Place("table5", TABLES["table5"].data_sets[0], "joint"): lines[0]}
-    text = write_paper_page([*TABLES.values()], measured, [], tmp_path).read_text()
+    text = write_paper_page([*TABLES.values()], measured, tmp_path).read_text()
     assert "| with joint training: not measured yet | – (+1.07) |" in text
     assert "comparisons" not in text
     assert "![" not in text
-    assert "Outliers" not in text
 
 
 def test_a_page_of_ones_own_table_has_its_title(run, tmp_path):
     table = PaperTable("mine", "My table", ["psnr"], {"a": Line("here", {})})
-    text = write_paper_page([table], measured_of(table, {"a": run}), [], tmp_path).read_text()
+    text = write_paper_page([table], measured_of(table, {"a": run}), tmp_path).read_text()
     assert text.startswith("# My table\n")
     assert "paper" not in text
 

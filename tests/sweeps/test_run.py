@@ -13,7 +13,6 @@ import torch
 
 import steerbench as python
 from bench.errors import SteerbenchError
-from reports.trackers import TRACKERS
 from tests.sweeps.conftest import CONFIGS, STAND_INS
 
 
@@ -75,23 +74,6 @@ def test_a_job_that_says_nothing_of_threads_has_the_usual_ones(run, tmp_path):
     asked = [record["made_of"]["config"]["threads"] for record in records]
     had = [record["machine"]["threads"] for record in records]
     assert dict(zip(asked, had, strict=True)) == {2: 2, None: usual}
-
-
-def test_a_run_is_sent_each_time_and_stands_where_that_cannot_be_done(run, tmp_path, monkeypatch):
-    sent = []
-
-    def send(run, outputs):
-        sent.append((run.key, run.label, outputs / "runs" / run.key))
-        if len(sent) == 1:
-            raise ConnectionError("no route to host")
-
-    monkeypatch.setattr("reports.trackers.find_spec", lambda name: name)
-    monkeypatch.setitem(TRACKERS, "wandb", send)
-    first = run("tracker=wandb")
-    (folder,) = stored(tmp_path)
-    assert f"not sent to wandb: {folder.name}: no route to host" in first.err
-    assert (first.status, run("tracker=wandb").status, run("tracker=comet").status) == (0, 0, 2)
-    assert sent == [(folder.name, "grey", Path("outputs/runs") / folder.name)] * 2
 
 
 def test_a_sweep_takes_flags_after_overrides_and_leaves_nothing_but_outputs(run, tmp_path):
