@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
-from hydra.core.config_loader import ConfigLoader
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString, Sweep
@@ -93,14 +92,13 @@ def changed(config: DictConfig, words: Sequence[str]) -> DictConfig:
     return copy
 
 
-def swept(words: Sequence[str], loader: ConfigLoader | None = None) -> dict[str, list[str]]:
+def swept(words: Sequence[str]) -> dict[str, list[str]]:
     """The values of every setting with several values (seed=0,1,2); the last word for it counts.
 
-    Hydra's `loader` is needed if a choice may be a pattern (method=*). SteerbenchError if a word
-    cannot be read.
+    SteerbenchError if a word cannot be read.
     """
     try:
-        parsed = OverridesParser.create(loader).parse_overrides(_overrides(words))
+        parsed = OverridesParser.create().parse_overrides(_overrides(words))
     except Exception as error:
         if not of_hydra(error):
             raise

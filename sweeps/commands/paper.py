@@ -16,7 +16,7 @@ from reports.paper_page import write_paper_page
 from reports.paper_tables import Place
 from reports.runs import Repeated, Run, over_common_frames, over_scenes
 from sweeps.data_sets import DataSet, data_sets, find
-from sweeps.execute import Launcher, divided, run_jobs
+from sweeps.execute import Ended, divided, launcher_of, run_jobs
 from sweeps.measurement import newest, of_scene
 from sweeps.overrides import unquoted
 from sweeps.plan import Planned, plan, scenes_of
@@ -40,9 +40,9 @@ def main(options: argparse.Namespace) -> int:
     tables = chosen(one, words, options.beside, shown)
     jobs = [job for table in tables for job in plan(table, words, data)]
     outputs = Path(jobs[0].config.outputs)
-    failed = 0
+    ended: list[Ended] = []
     if options.command != "report":
-        failed = run_jobs(jobs, Launcher([*options.config_dir, *of_hydra], outputs))
+        ended = run_jobs(jobs, launcher_of([*options.config_dir, *of_hydra], outputs))
     runs = newest(existing_store(outputs) if options.command == "report" else Store(outputs))
     folder = options.report or outputs / (one or "paper")
     measured = gather(jobs, runs)
@@ -50,7 +50,7 @@ def main(options: argparse.Namespace) -> int:
     if options.format or options.command == "table":
         print(export.exported_tables(tables, measured, options.format or "markdown"), end="")
     print(f"report: {page}", file=sys.stderr)
-    return int(failed > 0)
+    return int(any(each.failed for each in ended))
 
 
 def data_set(words: Sequence[str]) -> tuple[list[str], DataSet | None]:

@@ -16,7 +16,7 @@ from reports.images import Part
 from reports.publish import publish
 from reports.studies import VIEWS, Measured, by_method
 from reports.tables import Table
-from sweeps.execute import Launcher, divided, run_jobs
+from sweeps.execute import divided, launcher_of, run_jobs
 from sweeps.measurement import newest, of_scene
 from sweeps.studies import StudyJob, jobs_of, subjects
 from sweeps.terminal import say, show
@@ -34,7 +34,7 @@ def main(options: argparse.Namespace) -> int:
     found = subjects(study, words)
     jobs = jobs_of(study, found, given)
     outputs = Path(jobs[0].config.outputs)
-    failed = run_jobs(jobs, Launcher([*options.config_dir, *of_hydra], outputs))
+    ended = run_jobs(jobs, launcher_of([*options.config_dir, *of_hydra], outputs))
     lines = list(_measured(jobs))
     if not lines:
         return 1
@@ -48,7 +48,7 @@ def main(options: argparse.Namespace) -> int:
     folder = options.report or outputs / study
     page = publish(_page(options, parts), folder, [line.run for line in lines])
     print(f"report: {page}", file=sys.stderr)
-    return int(failed > 0)
+    return int(any(each.failed for each in ended))
 
 
 def _measured(jobs: Sequence[StudyJob]) -> Iterator[Measured]:
