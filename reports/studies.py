@@ -12,17 +12,15 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from bench.clock import OTHER
 from bench.convergence import observed_order
 from reports.figures import frontier_plot
 from reports.images import Part, Picture
 from reports.runs import Run
-from reports.tables import Table, amount, decimal, megabytes, share, spread
+from reports.tables import DENSE, Table, amount, decimal, megabytes, share, spread
 
 ON_FRONTIER = "— (frontier)"
-WORK, DENSE = "work.", ".dense"
+WORK = "work."
 
 
 @dataclass(frozen=True)
@@ -30,8 +28,7 @@ class StudyLine:
     """A variant of a method, and with which others it is compared.
 
     `settings` are words of `steerbench run`; `value` is its place on the axis that the study
-    varies. Lines with the same `group` (a knob, an axis) are compared with each other, those
-    `in_turns` frame by frame.
+    varies. Lines with the same `group` (a knob, an axis) are compared with each other.
     """
 
     method: str
@@ -39,7 +36,6 @@ class StudyLine:
     label: str
     settings: tuple[str, ...] = ()
     value: float = math.nan
-    in_turns: bool = True
 
 
 @dataclass(frozen=True)
@@ -148,12 +144,14 @@ def accuracy(found: Sequence[Measured]) -> list[Part]:
 
 
 def on_frontier(lines: Sequence[Measured]) -> list[Measured]:
-    """The lines, each with the best one that takes no longer."""
-    best = best_instead([x.ms for x in lines], [-x.figure("psnr") for x in lines])
-    return [
-        line if place == number else replace(line, better=lines[place].line)
-        for number, (line, place) in enumerate(zip(lines, best, strict=True))
-    ]
+    """The lines, each with the best one that takes no longer: of the highest PSNR, then the least
+    time. On the Pareto frontier that is the line itself."""
+    rated = []
+    for line in lines:
+        no_longer = (each for each in lines if each.ms <= line.ms)
+        best = min(no_longer, key=lambda each: (-each.figure("psnr"), each.ms))
+        rated.append(line if best is line else replace(line, better=best.line))
+    return rated
 
 
 def _point(line: Measured) -> dict[str, Any]:
@@ -314,22 +312,6 @@ def _where(lines: Sequence[Measured]) -> str:
     facts = ("scene", "trajectory", "resolution")
     several = [dict.fromkeys(str(line.run.facts[name]) for line in lines) for name in facts]
     return ", ".join(next(iter(of)) for of in several if len(of) == 1)
-
-
-def best_instead(cost: Sequence[float], error: Sequence[float]) -> list[int]:
-    """For each setting, the index of the best setting that costs no more.
-
-    Best is the least `error`, then the least `cost`, then the lowest index: on the Pareto frontier
-    the setting itself, elsewhere one that dominates it.
-    """
-    costs, errors = np.asarray(cost, float), np.asarray(error, float)
-    best: list[int] = [0] * len(costs)
-    least = -1
-    for index in np.lexsort((errors, costs)):  # the cheapest first; lexsort keeps the order of ties
-        if least < 0 or errors[index] < errors[least]:
-            least = int(index)
-        best[index] = least
-    return best
 
 
 def growth(values: Sequence[float], figures: Sequence[float]) -> float:

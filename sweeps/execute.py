@@ -7,9 +7,9 @@ import os
 import sys
 import time
 import uuid
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import as_completed
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
@@ -178,8 +178,10 @@ def attempt(group: Group, total: int, folder: Path, begun: float) -> dict[str, E
             failed = [each for each in left if alone is None or each[1] is alone]
             for number, job in failed:
                 print(f"steerbench: failed: {job.name}: {cause}", file=sys.stderr)
-                with _printed():
+                try:
                     job.keep_failure(reason(cause))
+                except SteerbenchError as problem:  # does not hide the failure
+                    print(f"steerbench: {problem}", file=sys.stderr)
                 ended[job.key] = Ended(error=cause)
                 _count(folder, number)
             left = [each for each in left if each not in failed]
@@ -191,15 +193,6 @@ def attempt(group: Group, total: int, folder: Path, begun: float) -> dict[str, E
                 say(job, run, _progress(folder, total, begun))
             left = []
     return ended
-
-
-@contextmanager
-def _printed() -> Iterator[None]:
-    """Print an error of the body and go on, so that it does not hide the failure being recorded."""
-    try:
-        yield
-    except Exception as error:
-        print(f"steerbench: {reason(error)}", file=sys.stderr)
 
 
 def say(job: Job, run: str, more: str = "") -> None:

@@ -119,17 +119,12 @@ def _named(found: Sequence[tuple[Job, str]]) -> list[Job]:
 
 
 def label(method: str, overrides: Sequence[str], names: Collection[str]) -> str:
-    """The label of a job among others: its method, and its values of the settings `names`.
+    """The label of a job among others: its method, and its values of the settings `names`."""
+    from reports.lines import shortened
 
-    A name is shortened to its last part unless that is ambiguous.
-    """
     settings = dict(word.split("=", 1) for word in overrides if "=" in word)
-    names = [name for name in names if name in settings and name != "method"]
-    ends = [name.rpartition(".")[2] for name in names]
-    shown = [
-        f"{end if ends.count(end) == 1 else name}={settings[name]}"
-        for name, end in zip(names, ends, strict=True)
-    ]
+    short = shortened([name for name in names if name in settings and name != "method"])
+    shown = [f"{end}={settings[name]}" for name, end in short.items()]
     return f"{method} ({', '.join(shown)})" if shown else method
 
 
