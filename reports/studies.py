@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -17,7 +17,7 @@ from bench.convergence import observed_order
 from reports.figures import frontier_plot
 from reports.images import Part, Picture
 from reports.runs import Run
-from reports.tables import DENSE, Table, amount, decimal, megabytes, share, spread
+from reports.tables import BOLD, DENSE, Table, amount, decimal, megabytes, share, spread
 
 ON_FRONTIER = "— (frontier)"
 WORK = "work."
@@ -133,7 +133,7 @@ def accuracy(found: Sequence[Measured]) -> list[Part]:
     for method, lines in by_method(found).items():
         rated = on_frontier(lines)
         fastest_first = sorted(rated, key=lambda line: line.ms)
-        best = frozenset((row, 0) for row, x in enumerate(fastest_first) if x.better is None)
+        best = [line.line for line in rated if line.better is None]
         title = f"{method}: run time against error of a frame,"
         parts.append(_table(title, "setting", columns, fastest_first, best))
         if sum(math.isfinite(line.figure("psnr")) for line in rated) > 1:
@@ -262,12 +262,14 @@ def _table(
     head: str,
     columns: Columns,
     lines: Sequence[Measured],
-    bold: frozenset[tuple[int, int]] = frozenset(),
+    best: Collection[StudyLine] = (),
 ) -> Table:
-    """The `lines` below `head`, and what each of the `columns` says of them."""
-    cells = tuple((x.line.label, *(write(x) for write in columns.values())) for x in lines)
+    """The `lines` below `head`, the `best` in bold, and what each of the `columns` says of them."""
+    labels = (BOLD[0] % x.line.label if x.line in best else x.line.label for x in lines)
+    figures = ((write(x) for write in columns.values()) for x in lines)
+    cells = tuple((label, *of) for label, of in zip(labels, figures, strict=True))
     sources = tuple((line.run.key,) for line in lines)
-    return Table(f"{title} {_where(lines)}", (head, *columns), cells, bold, sources)
+    return Table(f"{title} {_where(lines)}", (head, *columns), cells, sources)
 
 
 def _apart(line: Measured) -> str:
