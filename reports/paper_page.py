@@ -96,8 +96,10 @@ def _plot(
         drawn = Picture(plot["file"], plot["title"], draw)
     else:
         curves = {x.called: found for x in tables if x.curve and (found := _curves(x, measured))}
-        some = [curve for of_table in curves.values() for curve in of_table]
-        views = {line.runs[0].views for curve in some for line in curve.points.values()}
+        some = [
+            line for of in curves.values() for points in of.values() for line in points.values()
+        ]
+        views = {line.runs[0].views for line in some}
         fields = _chosen({"": plot["ceiling"]}, tables, measured)
         ceiling = next((line for line in fields if line.runs[0].views in views), None)
         draw = partial(figures.quality_over_training, curves, ceiling)
@@ -106,9 +108,9 @@ def _plot(
         yield from (f"## {plot['title']}", drawn, plot["caption"].strip())
 
 
-def _curves(table: PaperTable, measured: Measured) -> list[figures.Curve]:
+def _curves(table: PaperTable, measured: Measured) -> figures.Curves:
     """The measured lines of `table` over the course of their training."""
-    curves = []
+    curves = {}
     for key, line in table.lines.items():
         of_shares = {x: measured.get(Place(table.name, CURVES, point(key, x))) for x in SHARES}
         of_shares[1.0] = table.measured(key, measured)
@@ -120,7 +122,7 @@ def _curves(table: PaperTable, measured: Measured) -> list[figures.Curve]:
             runs = [run for run in mark.runs if run.facts["seed"] in common]
             points[_steps(runs[0]) * share] = replace(mark, runs=runs)
         if points:
-            curves.append(figures.Curve(line.label, points))
+            curves[line.label] = points
     return curves
 
 

@@ -137,10 +137,10 @@ def test_a_curve_has_a_point_for_every_measured_share(of_method, of_budget, run,
     halves = {key: {0.5: [trained], 1.0: [trained]} for key in table.lines}
     halves["joint"][0.25] = [trained]
     curves = _curves(table, on_curves(table, halves))
-    assert [(curve.label, list(curve.points)) for curve in curves] == [
-        ("with joint training", [20, 40, 80]),
-        ("without joint training", [40, 80]),
-    ]
+    assert {label: list(points) for label, points in curves.items()} == {
+        "with joint training": [20, 40, 80],
+        "without joint training": [40, 80],
+    }
     ceiling = Repeated("field", [changed(run, {"psnr": 99.0})])
     figures.quality_over_training({"Table 5": curves}, ceiling, tmp_path / "curves.png")
     (axes,) = drawn[0].axes
@@ -149,23 +149,22 @@ def test_a_curve_has_a_point_for_every_measured_share(of_method, of_budget, run,
     assert set(release.get_xdata()) == {300_000}
     assert axes.get_xlim()[1] > 300_000
     assert axes.get_title() == "Table 5"
-    for line, curve in zip(lines, curves, strict=True):
-        assert list(line.get_xdata()) == list(curve.points)
+    for line, points in zip(lines, curves.values(), strict=True):
+        assert list(line.get_xdata()) == list(points)
         assert set(line.get_ydata()) == {run.values["psnr"]}
 
 
 def test_all_points_of_a_curve_are_of_the_same_seeds(run):
     table, seeds = TABLES["table5"], {0.25: (0, 1), 0.5: (0, 2), 1.0: (0, 1, 2)}
     runs = {share: [changed(run, {}, seed=x) for x in some] for share, some in seeds.items()}
-    (curve,) = _curves(table, on_curves(table, {"joint": runs}))
-    assert [[r.facts["seed"] for r in x.runs] for x in curve.points.values()] == 3 * [[0]]
+    (points,) = _curves(table, on_curves(table, {"joint": runs})).values()
+    assert [[r.facts["seed"] for r in x.runs] for x in points.values()] == 3 * [[0]]
 
 
 def test_several_seeds_have_bars_on_a_curve_and_one_has_none(run, tmp_path, drawn):
     seeds = [shifted(run, by, seed=seed) for seed, by in enumerate((0.0, 1.0, 2.0))]
     points = {10.0: Repeated("a", seeds), 20.0: Repeated("b", [run])}
-    curves = {"Table 9": [figures.Curve("L = 2", points)]}
-    figures.quality_over_training(curves, None, tmp_path / "curves.png")
+    figures.quality_over_training({"Table 9": {"L = 2": points}}, None, tmp_path / "curves.png")
     (axes,) = drawn[0].axes
     low, high = axes.collections[0].get_segments()[0][:, 1]
     assert high - low == pytest.approx(2 * points[10.0].half("psnr"))
