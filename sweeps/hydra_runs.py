@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextvars import ContextVar
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import hydra
@@ -24,17 +24,9 @@ if TYPE_CHECKING:  # these load torch, which --help and completion do not need
     from sweeps.measurement import Job
 
 
-@dataclass
-class RunningSweep:
-    """The sweep of a call: Hydra's `config`, None without a sweep, and its jobs, each
-    with its choice of a method."""
-
-    config: DictConfig | None = None
-    jobs: list[tuple[Job, str]] = field(default_factory=list)
-
-
-_sweep: ContextVar[RunningSweep] = ContextVar("sweep")
-"""The sweep of the present call. Hydra itself makes the object that learns of a sweep."""
+_sweeps: ContextVar[list[DictConfig]] = ContextVar("sweeps")
+"""Hydra's configurations of the sweeps of the present call: Hydra itself makes the object that
+learns of one."""
 
 
 class SweepCallback(Callback):
@@ -45,7 +37,7 @@ class SweepCallback(Callback):
         from sweeps.execute import own_folder
 
         own_folder(config)
-        _sweep.get().config = config.copy()
+        _sweeps.get().append(config.copy())
         with flag_override(config, ["readonly", "struct"], False):
             basic = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
             config.hydra.launcher = {"_target_": basic}
@@ -70,6 +62,7 @@ def run_hydra(
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its errors instead of printing them
     _hide_subcommand_from_completion()
     errors: list[Exception] = []
+    found: list[tuple[Job, str]] = []  # each with its choice of a method
 
     def job(config: DictConfig) -> None:
         present = HydraConfig.get()
@@ -79,25 +72,26 @@ def run_hydra(
         try:
             config = settled(config, further(folders))
             if present.mode == RunMode.MULTIRUN:
-                sweep.jobs.append((_job(config, command), present.runtime.choices["method"]))
+                found.append((_job(config, command), present.runtime.choices["method"]))
             else:
                 alone(config, command)
         except Exception as error:
             errors.append(error)  # bypasses Hydra, which would print it in its own way
 
-    token = _sweep.set(sweep := RunningSweep())
+    sweeps: list[DictConfig] = []
+    token = _sweeps.set(sweeps)
     try:
         hydra.main(str(CONFIGS), "run", version_base="1.3")(job)()
     except Exception as error:
         errors.append(explain(error, argv) if of_hydra(error) else error)
     finally:
-        _sweep.reset(token)
-    if not sweep.jobs or sweep.config is None:
+        _sweeps.reset(token)
+    if not found:
         return [], errors
     from sweeps.execute import Launcher, run_jobs
 
-    jobs = _named(sweep.jobs)
-    ended = run_jobs(jobs, Launcher(sweep.config, argv))
+    jobs = _named(found)
+    ended = run_jobs(jobs, Launcher(sweeps[0], argv))
     errors += [each.error for each in ended if each.error]
     return list(zip(jobs, ended, strict=True)), errors
 
@@ -115,16 +109,18 @@ def _named(found: Sequence[tuple[Job, str]]) -> list[Job]:
     """The jobs with labels, made of what differs between them."""
     settings = [dict(x.split("=", 1) for x in job.command if "=" in x) for job, _ in found]
     names = [x for x in settings[0] if len({of.get(x) for of in settings}) > 1]
-    return [replace(job, name=label(method, job.command, names)) for job, method in found]
+    return [
+        replace(job, name=label(method, {name: of[name] for name in names if name in of}))
+        for (job, method), of in zip(found, settings, strict=True)
+    ]
 
 
-def label(method: str, overrides: Sequence[str], names: Collection[str]) -> str:
-    """The label of a job among others: its method, and its values of the settings `names`."""
+def label(method: str, varied: Mapping[str, str]) -> str:
+    """The label of a job among others: its method, and what it has of the settings that vary."""
     from reports.lines import shortened
 
-    settings = dict(word.split("=", 1) for word in overrides if "=" in word)
-    short = shortened([name for name in names if name in settings and name != "method"])
-    shown = [f"{end}={settings[name]}" for name, end in short.items()]
+    short = shortened([name for name in varied if name != "method"])
+    shown = [f"{end}={varied[name]}" for name, end in short.items()]
     return f"{method} ({', '.join(shown)})" if shown else method
 
 

@@ -94,7 +94,6 @@ class Job:
     command: Sequence[str]  # the words that make it alone, for the record
     name: str = ""  # at the terminal
     turns: str = ""
-    scene: str = ""  # its scene in a data set, empty without a data set
 
     @cached_property
     def settings(self) -> dict[str, Any]:
