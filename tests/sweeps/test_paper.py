@@ -2,7 +2,6 @@
 
 import math
 import re
-import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +20,7 @@ from sweeps.commands.paper import gather, newest
 from sweeps.data_sets import DataSet
 from sweeps.measurement import Job, JobFailed, described
 from sweeps.plan import Planned, plan
-from tests.reports.conftest import changed, rewrite
+from tests.reports.conftest import changed, copied, rewrite
 from tests.sweeps.conftest import CONFIGS
 from tests.sweeps.test_plan import TABLES, blender
 
@@ -61,10 +60,7 @@ def put(store: Store, source: str, job: Job, key: str = "") -> str:
     parts = {"config": described(job.config), "turns": job.turns}
     key = key or store.key(parts)
     if store.find(key) is None:
-        folder = shutil.copytree(store.folder / source, store.folder / key)
-        for file in ("rows.csv", "record.json"):
-            text = (folder / file).read_text().replace(source, key)
-            (folder / file).write_text(text)
+        copied(store, source, key)
         rewrite(store, key, made_of=parts)
     return key
 

@@ -6,6 +6,7 @@ import math
 import shlex
 import signal
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -18,6 +19,10 @@ from tests.sweeps.conftest import CONFIGS, STAND_INS
 
 def stored(tmp_path: Path) -> list[Path]:
     return sorted(path.parent for path in tmp_path.glob("outputs/runs/*/record.json"))
+
+
+def records(tmp_path: Path) -> list[dict[str, Any]]:
+    return [json.loads((folder / "record.json").read_text()) for folder in stored(tmp_path)]
 
 
 def test_a_run_prints_its_table_and_is_stored_and_not_measured_again(run, tmp_path):
@@ -60,8 +65,8 @@ def test_another_content_of_a_file_that_the_method_reads_makes_another_run(run, 
 
 def test_the_record_holds_the_command_that_was_typed(run, tmp_path):
     run("seed=3", "scene.path=.")
-    (folder,) = stored(tmp_path)
-    command = json.loads((folder / "record.json").read_text())["command"]
+    (record,) = records(tmp_path)
+    command = record["command"]
     assert command.startswith("steerbench run ")
     assert command.endswith("seed=3 scene.path=.")
     assert f"{CONFIGS} method=grey" in command
@@ -70,10 +75,8 @@ def test_the_record_holds_the_command_that_was_typed(run, tmp_path):
 def test_a_job_that_says_nothing_of_threads_has_the_usual_ones(run, tmp_path):
     usual = torch.get_num_threads()
     run("-m", "threads=2,null")
-    records = [json.loads((folder / "record.json").read_text()) for folder in stored(tmp_path)]
-    asked = [record["made_of"]["config"]["threads"] for record in records]
-    had = [record["machine"]["threads"] for record in records]
-    assert dict(zip(asked, had, strict=True)) == {2: 2, None: usual}
+    had = {x["made_of"]["config"]["threads"]: x["machine"]["threads"] for x in records(tmp_path)}
+    assert had == {2: 2, None: usual}
 
 
 def test_a_sweep_takes_flags_after_overrides_and_leaves_nothing_but_outputs(run, tmp_path):
@@ -145,17 +148,6 @@ def test_a_store_is_named_in_either_form(run, steerbench, tmp_path, form):
     assert "grey" in steerbench("results", *form).ok().out
 
 
-@pytest.mark.parametrize(
-    ("word", "said"),
-    [
-        ("precision=fp8", "precision: expected fp32"),
-        (f"seed={2**63}", "seed: expected 0 or more, below 2^63"),
-    ],
-)
-def test_a_setting_that_nothing_here_has_is_refused(run, word, said):
-    assert said in run(word).refused()
-
-
 def test_more_threads_than_cores_are_named(run):
     assert "threads=500: more than the" in run("threads=500").ok().err
 
@@ -186,7 +178,7 @@ def test_a_sweep_in_turns_measures_together_what_differs_in_the_method_alone(run
     outcome = run("-m", "method.level=0.5,0.25,7", "seed=0,1", "in_turns=true")
     assert outcome.status == 2
     assert outcome.err.count("failed: grey (level=7") == 2
-    made_of = [json.loads((x / "record.json").read_text())["made_of"] for x in stored(tmp_path)]
+    made_of = [record["made_of"] for record in records(tmp_path)]
     assert len(made_of) == 4
     for seed in (0, 1):
         beside = {tuple(x["beside"]) for x in made_of if x["config"]["seed"] == seed}
