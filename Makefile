@@ -81,6 +81,6 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	  fi; \
 	  echo "making $(VENV) with $$($$found --version)"; \
 	  $$found -m venv --clear $(VENV); }
-	$(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c constraints.txt -e ".[dev,openvino,video,viewer,colmap,tensorboard]"
+	$(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c constraints.txt -e ".[dev,openvino,video,viewer,colmap]"
 	-$(BIN)/steerbench compile
 	@touch $@

@@ -107,8 +107,8 @@ def sweep(*settings: str) -> Sweep:
     ended, errors = run_hydra(["-m", *settings], alone=lambda config, command: None)
     if errors:
         raise errors[0]
-    keys = dict.fromkeys(job.run for job in ended if job.run)
-    lines = as_lines(load_runs(existing_store(Path(ended[0].outputs)), keys))
+    keys = dict.fromkeys(end.run for _, end in ended if end.run)
+    lines = as_lines(load_runs(ended[0][0].store, keys))
     return Sweep(lines.runs, lines.frame(columns_of(lines)))
 
 

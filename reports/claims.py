@@ -11,7 +11,7 @@ import pandas as pd
 from bench.rows import half_interval, path_interval
 from reports.comparison import shown_as
 from reports.runs import Repeated, Run
-from reports.tables import ABSENT, Table, decimal
+from reports.tables import ABSENT, BOLD, Table, decimal
 
 AS, LARGER, SMALLER = "as in the paper", "larger", "smaller"
 AT_MOST = "smaller, if any"
@@ -237,14 +237,14 @@ def finding_table(comparisons: Sequence[Comparison]) -> Table:
             first.setdefault((each.claim.says, *_figures(each), each.verdict), each)
     columns = ("quantity", "paper", "here", "95 % interval", "against the paper")
     lines = tuple((_quantity(each), *figures) for (_, *figures), each in first.items())
-    bold = frozenset((row, 0) for row, each in enumerate(first.values()) if each.claim.main)
-    return Table("What the paper says, and what was found", columns, lines, bold)
+    return Table("What the paper says, and what was found", columns, lines)
 
 
 def _quantity(each: Comparison) -> str:
-    """What a finding is about, on which further data set, in which unit."""
+    """What a finding is about, on which further data set, in which unit; main ones are bold."""
     unit = " (dB)" if each.claim.metric == "psnr" else ""
-    return ", ".join(filter(None, (each.claim.says, each.data_set))) + unit
+    quantity = ", ".join(filter(None, (each.claim.says, each.data_set))) + unit
+    return BOLD[0] % quantity if each.claim.main else quantity
 
 
 def _figures(each: Comparison) -> tuple[str, str, str]:

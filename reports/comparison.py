@@ -11,7 +11,7 @@ from bench.errors import SteerbenchError
 from bench.rows import UNITS, half_interval
 from reports.lines import COMMON, Lines
 from reports.runs import Repeated, Run
-from reports.tables import NOT_AVAILABLE, QUALITY, Metric, Table, decimal, megabytes
+from reports.tables import BOLD, NOT_AVAILABLE, QUALITY, Metric, Table, decimal, megabytes
 
 Write = Callable[[float], str]
 
@@ -69,17 +69,12 @@ def _table(
     if any(len(line.runs) > 1 for line in lines):
         columns["seeds"] = [str(len(line.runs)) for line in lines]
     figures = {
-        metric: [written(line, metric) or NOT_AVAILABLE for line in lines] for metric in metrics
+        metric: [text or NOT_AVAILABLE for text in marked(lines, metric, BOLD[:1])]
+        for metric in metrics
     }
     heads = (*columns, *(shown_as(metric).heading for metric in metrics))
     cells = tuple(zip(*columns.values(), *figures.values(), strict=True))
-    bold = frozenset(
-        (row, column)
-        for column, metric in enumerate(metrics, len(columns))
-        for row, place in ranks(lines, metric).items()
-        if place == 1
-    )
-    return Table(title, heads, cells, bold=bold, sources=tuple(line.keys for line in lines))
+    return Table(title, heads, cells, sources=tuple(line.keys for line in lines))
 
 
 def shown_as(metric: str) -> Metric:

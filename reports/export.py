@@ -41,11 +41,8 @@ def exported(table: Table, figures: pd.DataFrame, form: str) -> str:
     if form != "latex":
         return _for_programs(figures, form)
     rows = [
-        [
-            MARKS[0] % escaped(text) if (row, column) in table.bold else escaped(text)
-            for column, text in enumerate(line)
-        ]
-        for row, line in enumerate(table.lines)
+        [re.sub(r"^\*\*(.*)\*\*$", lambda x: MARKS[0] % x[1], escaped(text)) for text in line]
+        for line in table.lines
     ]
     sides = "".join("lr"[table.right(column)] for column in range(len(table.columns)))
     return _tabular(f"{table.title}.", "", sides, table.columns, [rows])

@@ -3,7 +3,6 @@
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import cycle
 from pathlib import Path
@@ -112,17 +111,19 @@ def quality_against(
     axes = figure.subplots()
     _label(axes, label)
     first = next(iter(settings.values()), range(len(lines)))  # methods
-    legend = _Legend(settings) if len(set(first)) < len(lines) or len(lines) > MOST_NAMES else None
+    styles: Sequence[Mapping[str, Any]] = [_style(number) for number in range(len(lines))]
+    handles: Sequence[Line2D] = ()
+    if len(set(first)) < len(lines) or len(lines) > MOST_NAMES:
+        styles, handles = _legend(settings)
     points = []
     for number, line in enumerate(lines):
         across, up = line.mean(metric), line.mean("psnr")
         if across is None or up is None:
             continue
         bars = [half if half > 0 else None for half in (line.half(metric), line.half("psnr"))]
-        own = _style(number) if legend is None else legend.style(number)
         # On a logarithmic axis, an interval over two seeds may reach below any time.
         reach = bars[0] and [[min(bars[0], across / 2) / unit], [min(bars[0], across) / unit]]
-        style = {**own, "xerr": reach, "yerr": bars[1]}
+        style = {**styles[number], "xerr": reach, "yerr": bars[1]}
         drawn = axes.errorbar(across / unit, up, **style, markersize=8, elinewidth=0.8)
         drawn[0].set_gid(MARK.format(number))
         points.append((line.label, (across / unit, up)))
@@ -134,35 +135,31 @@ def quality_against(
     axes.xaxis.set_major_locator(LogLocator(subs=ticks))
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_locator(NullLocator())
-    if legend is None:
-        _name(axes, points)
+    if handles:
+        figure.legend(handles=handles, loc="outside right upper", frameon=False)
     else:
-        figure.legend(handles=legend.handles, loc="outside right upper", frameon=False)
+        _name(axes, points)
     _save(figure, path)
 
 
-class _Legend:
-    """Styles of lines by their settings: the first that differs has colours, the others markers."""
-
-    def __init__(self, settings: Mapping[str, Sequence[str]]) -> None:
-        differ = {name: of for name, of in settings.items() if len(set(of)) > 1}
-        named = [[f"{name}={value}" for value in of] for name, of in differ.items()]
-        first, *rest = named
-        others = list(map(", ".join, zip(*rest, strict=True))) if rest else [""] * len(first)
-        self._of_lines = list(zip(first, others, strict=True))
-        self._colours = dict(zip(dict.fromkeys(first), cycle(COLOURS), strict=False))
-        self._markers = dict(zip(dict.fromkeys(others), cycle(MARKERS), strict=False))
-
-    def style(self, number: int) -> dict[str, Any]:
-        first, other = self._of_lines[number]
-        colour, marker = self._colours[first], self._markers[other]
-        return {"marker": marker, "color": colour, "linestyle": "none"}
-
-    @property
-    def handles(self) -> list[Line2D]:
-        styles = [(name, {"color": of, "marker": "o"}) for name, of in self._colours.items()]
-        styles += [(name, {"color": "grey", "marker": of}) for name, of in self._markers.items()]
-        return [Line2D([], [], linestyle="none", label=x, **style) for x, style in styles if x]
+def _legend(
+    settings: Mapping[str, Sequence[str]],
+) -> tuple[Sequence[Mapping[str, Any]], Sequence[Line2D]]:
+    """The style of each line by its settings, and what a legend says of them: the first setting
+    that differs has colours, the others markers."""
+    differ = {name: of for name, of in settings.items() if len(set(of)) > 1}
+    first, *rest = ([f"{name}={value}" for value in of] for name, of in differ.items())
+    others = list(map(", ".join, zip(*rest, strict=True))) if rest else [""] * len(first)
+    colours = dict(zip(dict.fromkeys(first), cycle(COLOURS), strict=False))
+    markers = dict(zip(dict.fromkeys(others), cycle(MARKERS), strict=False))
+    of_lines = zip(first, others, strict=True)
+    styles = [{"color": colours[x], "marker": markers[y], "linestyle": "none"} for x, y in of_lines]
+    shown = [(name, colour, "o") for name, colour in colours.items()]
+    shown += [(name, "grey", marker) for name, marker in markers.items() if name]
+    return styles, [
+        Line2D([], [], linestyle="none", label=name, color=colour, marker=marker)
+        for name, colour, marker in shown
+    ]
 
 
 def _name(axes: Axes, points: Sequence[tuple[str, tuple[float, float]]]) -> None:
@@ -199,16 +196,12 @@ def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
     _save(figure, path)
 
 
-@dataclass(frozen=True)
-class Curve:
-    """A line of `quality_over_training`: what was measured, by the number of training steps."""
-
-    label: str
-    points: Mapping[float, Repeated]
+Curves = Mapping[str, Mapping[float, Repeated]]
+"""Lines by their label: what was measured, by the number of training steps."""
 
 
 def quality_over_training(
-    curves: Mapping[str, Sequence[Curve]], ceiling: Repeated | None, path: Path
+    curves: Mapping[str, Curves], ceiling: Repeated | None, path: Path
 ) -> None:
     """Write a PNG: PSNR over training steps (log scale), a panel for each title in `curves`.
 
@@ -224,11 +217,11 @@ def quality_over_training(
     for axes, (title, of_panel) in zip(panels, curves.items(), strict=False):
         _label(axes, "steps of stage 2, log scale")
         axes.set_title(title, fontsize="medium")
-        for number, curve in enumerate(of_panel):
-            bars = np.nan_to_num([line.half("psnr") for line in curve.points.values()])
-            psnr = [line.mean("psnr") for line in curve.points.values()]
-            style = {**_style(number), "capsize": 3, "label": curve.label, "linestyle": "-"}
-            axes.errorbar(list(curve.points), psnr, yerr=bars if bars.any() else None, **style)
+        for number, (label, points) in enumerate(of_panel.items()):
+            bars = np.nan_to_num([line.half("psnr") for line in points.values()])
+            psnr = [line.mean("psnr") for line in points.values()]
+            style = {**_style(number), "capsize": 3, "label": label, "linestyle": "-"}
+            axes.errorbar(list(points), psnr, yerr=bars if bars.any() else None, **style)
         if ceiling and (top := ceiling.mean("psnr")) is not None:
             axes.axhline(top, color="black", linestyle="--", linewidth=1, label="the field")
         axes.set_xscale("log")

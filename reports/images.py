@@ -16,9 +16,8 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import uniform_filter
 
 from bench.results import COLD
-from bench.scenes.images import contents, decode_bytes
 from bench.trajectories import spread
-from reports.runs import Run
+from reports.runs import Run, read_picture
 from reports.tables import Table
 
 MOST_FRAMES = 3  # maximum number of frames of a run on a page
@@ -95,7 +94,7 @@ def kept_frames(runs: Sequence[Run]) -> list[str]:
 def frame_section(runs: Sequence[Run], frame: str, stem: str) -> Iterator[str | ComparedFrame]:
     """`frame` of `runs` as parts of a page: heading, pictures and caption."""
     first = runs[0]
-    truth = _read(first.pictures / f"{frame}-truth.png")
+    truth = read_picture(first.pictures / f"{frame}-truth.png")
     views = [_view(run, frame) for run in runs]
     box, where = find_detail(truth, [view.rendering for view in views])
     view = first.frames.set_index("frame")["name"][int(frame)]
@@ -115,12 +114,10 @@ def _view(run: Run, frame: str) -> RunView:
     cold = figures["phase"] == COLD
     ms = figures["frame_ms"] if cold else run.values["frame_ms"]
     title = f"PSNR {figures['psnr']:.2f} dB, {ms:,.1f} ms{', cold' if cold else ''}"
-    pictures = [_read(run.pictures / f"{frame}-{kind}.png") for kind in ("rendered", "error")]
+    pictures = [
+        read_picture(run.pictures / f"{frame}-{kind}.png") for kind in ("rendered", "error")
+    ]
     return RunView((run.label, title), *pictures)
-
-
-def _read(path: Path) -> np.ndarray:
-    return decode_bytes(contents(path), path)[..., :3].numpy()
 
 
 def find_detail(truth: np.ndarray, renderings: Sequence[np.ndarray]) -> tuple[Box, str]:

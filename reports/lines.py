@@ -77,12 +77,16 @@ def differing(runs: Sequence[Run]) -> dict[str, list[str]]:
     """What `varied` finds, under short names: the symbol of the paper, or the last part."""
     columns = varied(runs)
     symbols = {name: of for run in runs for name, of in run.record.get("axes", {}).items()}
-    ends = [name.rpartition(".")[2] for name in columns]
-    short = {
-        name: symbols.get(name) or (end if ends.count(end) == 1 else name)
-        for name, end in zip(columns, ends, strict=True)
-    }
+    short = shortened(list(columns)) | symbols
     return {short[name]: values for name, values in columns.items()}
+
+
+def shortened(names: Sequence[str]) -> dict[str, str]:
+    """The last part of each of the `names` of settings or, if several end so, all of it."""
+    ends = [name.rpartition(".")[2] for name in names]
+    return {
+        name: end if ends.count(end) == 1 else name for name, end in zip(names, ends, strict=True)
+    }
 
 
 def varied(runs: Sequence[Run]) -> dict[str, list[str]]:

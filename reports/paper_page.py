@@ -14,7 +14,6 @@ from omegaconf import OmegaConf
 from reports import figures
 from reports.claims import NOT_MEASURED, Comparison, claim_table, finding_table
 from reports.images import Part, Picture, frame_section, kept_frames
-from reports.outliers import Outlier, outlier_table
 from reports.paper_tables import (
     CURVES,
     SHARES,
@@ -35,20 +34,16 @@ PAGE: Any = OmegaConf.to_container(OmegaConf.load(Path(__file__).parent / "paper
 def write_paper_page(
     tables: Sequence[PaperTable],
     measured: Measured,
-    found: Sequence[Outlier],
     folder: Path,
     missing: Mapping[str, str] = {},
 ) -> Path:
     """Write `folder/report.md` with its pictures, and the same as `report.html`; return the former.
 
-    The page shows `tables` in this order, with what was `measured`, and the outliers `found` among
-    their runs; `missing` says why scenes are left out, by name. Raises SteerbenchError if `folder`
-    cannot be written to.
+    The page shows `tables` in this order, with what was `measured`; `missing` says why scenes are
+    left out, by name. Raises SteerbenchError if `folder` cannot be written to.
     """
     runs = list({run.key: run for line in measured.values() for run in line.measured}.values())
     left_out = "\n".join(f"- missing: {name}: {why}" for name, why in missing.items())
-    listed = outlier_table(found, runs)
-    flagged: list[Part] = [f"## {listed.title}", listed] if listed.lines else []
     sources = "\n".join(f"{run.key}  {run.record['command']}" for run in runs)
     compared = [each for table in tables for each in comparisons(table, measured)]
     if all(each.here is NOT_MEASURED for each in compared):
@@ -64,7 +59,6 @@ def write_paper_page(
         f"# {title}",
         *_conclusions(compared),
         *([f"## Scenes that are left out\n\n{left_out}"] if left_out else []),
-        *flagged,
         "## The tables",
         *reading,
         PAGE["reading"].strip(),
@@ -102,8 +96,10 @@ def _plot(
         drawn = Picture(plot["file"], plot["title"], draw)
     else:
         curves = {x.called: found for x in tables if x.curve and (found := _curves(x, measured))}
-        some = [curve for of_table in curves.values() for curve in of_table]
-        views = {line.runs[0].views for curve in some for line in curve.points.values()}
+        some = [
+            line for of in curves.values() for points in of.values() for line in points.values()
+        ]
+        views = {line.runs[0].views for line in some}
         fields = _chosen({"": plot["ceiling"]}, tables, measured)
         ceiling = next((line for line in fields if line.runs[0].views in views), None)
         draw = partial(figures.quality_over_training, curves, ceiling)
@@ -112,9 +108,9 @@ def _plot(
         yield from (f"## {plot['title']}", drawn, plot["caption"].strip())
 
 
-def _curves(table: PaperTable, measured: Measured) -> list[figures.Curve]:
+def _curves(table: PaperTable, measured: Measured) -> figures.Curves:
     """The measured lines of `table` over the course of their training."""
-    curves = []
+    curves = {}
     for key, line in table.lines.items():
         of_shares = {x: measured.get(Place(table.name, CURVES, point(key, x))) for x in SHARES}
         of_shares[1.0] = table.measured(key, measured)
@@ -126,7 +122,7 @@ def _curves(table: PaperTable, measured: Measured) -> list[figures.Curve]:
             runs = [run for run in mark.runs if run.facts["seed"] in common]
             points[_steps(runs[0]) * share] = replace(mark, runs=runs)
         if points:
-            curves.append(figures.Curve(line.label, points))
+            curves[line.label] = points
     return curves
 
 

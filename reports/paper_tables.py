@@ -11,7 +11,7 @@ from reports.claims import Claim, Comparison, apart, compare, gap, told
 from reports.comparison import conditions, machines, marked, shown_as, written
 from reports.lines import COMMON
 from reports.runs import Repeated, Run, missing_figures
-from reports.tables import ABSENT, Table
+from reports.tables import ABSENT, BOLD, Table
 
 METHOD = "method"  # the setting of a line that is another method
 
@@ -221,8 +221,7 @@ def figure_table(block: Shown) -> Table:
     Among measured figures under the same conditions, the best of a column is bold and, of at least
     three, the second best is italic.
     """
-    marks = ("**%s**", "*%s*")
-    columns = {metric: marked(block.measured, metric, marks) for metric in block.table.metrics}
+    columns = {metric: marked(block.measured, metric, BOLD) for metric in block.table.metrics}
     title = block.title or block.table.title
     return _of_columns(title, "measured", block.measured, columns)
 

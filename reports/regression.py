@@ -12,7 +12,7 @@ import numpy as np
 from bench.errors import SteerbenchError, unexpected, unknown
 from bench.rows import half_interval, path_interval
 from reports.runs import Run
-from reports.tables import QUALITY, Table
+from reports.tables import NETS, QUALITY, Table
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,7 @@ class Limit:
 LIMITS: Mapping[str, Limit] = {
     "psnr": Limit(1, absolute=0.1, unit="dB"),
     "ssim": Limit(1, absolute=0.002),
-    "lpips_alex": Limit(-1, absolute=0.003),
-    "lpips_vgg": Limit(-1, absolute=0.003),
-    "lpips_squeeze": Limit(-1, absolute=0.003),
+    **{f"lpips_{net}": Limit(-1, absolute=0.003) for net in NETS},
     "flicker": Limit(-1, relative=0.05),
     "size_bytes.total": Limit(-1, relative=0.001, unit="bytes"),
     "work.samples": Limit(-1, relative=0.05),

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from torch import Tensor
+import torch
 
 from bench.clock import OTHER
 from bench.errors import SteerbenchError
@@ -134,7 +134,11 @@ class Run:
         there are none."""
         kept = sorted(self.pictures.glob("*-rendered.png"))
         pairs = [(path, other.pictures / path.name) for path in kept]
-        found = [psnr(_read(one), _read(two)) for one, two in pairs if two.exists()]
+        found = [
+            psnr(*(torch.from_numpy(read_picture(path)) / 255 for path in pair))
+            for pair in pairs
+            if pair[1].exists()
+        ]
         return float(np.mean(found)) if found else math.nan
 
     @property
@@ -375,8 +379,9 @@ def _record(runs: Sequence[Run]) -> dict[str, Any]:
     }
 
 
-def _read(picture: Path) -> Tensor:
-    return decode_bytes(contents(picture), picture)[..., :3] / 255.0
+def read_picture(path: Path) -> np.ndarray:
+    """uint8 [H, W, 3]"""
+    return decode_bytes(contents(path), path)[..., :3].numpy()
 
 
 def _joined(values: Sequence[Any]) -> Any:

@@ -7,22 +7,20 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
-
-import numpy as np
 
 from bench.clock import OTHER
 from bench.convergence import observed_order
 from reports.figures import frontier_plot
 from reports.images import Part, Picture
 from reports.runs import Run
-from reports.tables import Table, amount, decimal, megabytes, share, spread
+from reports.tables import BOLD, DENSE, Table, amount, decimal, megabytes, share, spread
 
 ON_FRONTIER = "— (frontier)"
-WORK, DENSE = "work.", ".dense"
+WORK = "work."
 
 
 @dataclass(frozen=True)
@@ -30,8 +28,7 @@ class StudyLine:
     """A variant of a method, and with which others it is compared.
 
     `settings` are words of `steerbench run`; `value` is its place on the axis that the study
-    varies. Lines with the same `group` (a knob, an axis) are compared with each other, those
-    `in_turns` frame by frame.
+    varies. Lines with the same `group` (a knob, an axis) are compared with each other.
     """
 
     method: str
@@ -39,7 +36,6 @@ class StudyLine:
     label: str
     settings: tuple[str, ...] = ()
     value: float = math.nan
-    in_turns: bool = True
 
 
 @dataclass(frozen=True)
@@ -137,7 +133,7 @@ def accuracy(found: Sequence[Measured]) -> list[Part]:
     for method, lines in by_method(found).items():
         rated = on_frontier(lines)
         fastest_first = sorted(rated, key=lambda line: line.ms)
-        best = frozenset((row, 0) for row, x in enumerate(fastest_first) if x.better is None)
+        best = [line.line for line in rated if line.better is None]
         title = f"{method}: run time against error of a frame,"
         parts.append(_table(title, "setting", columns, fastest_first, best))
         if sum(math.isfinite(line.figure("psnr")) for line in rated) > 1:
@@ -148,12 +144,14 @@ def accuracy(found: Sequence[Measured]) -> list[Part]:
 
 
 def on_frontier(lines: Sequence[Measured]) -> list[Measured]:
-    """The lines, each with the best one that takes no longer."""
-    best = best_instead([x.ms for x in lines], [-x.figure("psnr") for x in lines])
-    return [
-        line if place == number else replace(line, better=lines[place].line)
-        for number, (line, place) in enumerate(zip(lines, best, strict=True))
-    ]
+    """The lines, each with the best one that takes no longer: of the highest PSNR, then the least
+    time. On the Pareto frontier that is the line itself."""
+    rated = []
+    for line in lines:
+        no_longer = (each for each in lines if each.ms <= line.ms)
+        best = min(no_longer, key=lambda each: (-each.figure("psnr"), each.ms))
+        rated.append(line if best is line else replace(line, better=best.line))
+    return rated
 
 
 def _point(line: Measured) -> dict[str, Any]:
@@ -264,12 +262,14 @@ def _table(
     head: str,
     columns: Columns,
     lines: Sequence[Measured],
-    bold: frozenset[tuple[int, int]] = frozenset(),
+    best: Collection[StudyLine] = (),
 ) -> Table:
-    """The `lines` below `head`, and what each of the `columns` says of them."""
-    cells = tuple((x.line.label, *(write(x) for write in columns.values())) for x in lines)
+    """The `lines` below `head`, the `best` in bold, and what each of the `columns` says of them."""
+    labels = (BOLD[0] % x.line.label if x.line in best else x.line.label for x in lines)
+    figures = ((write(x) for write in columns.values()) for x in lines)
+    cells = tuple((label, *of) for label, of in zip(labels, figures, strict=True))
     sources = tuple((line.run.key,) for line in lines)
-    return Table(f"{title} {_where(lines)}", (head, *columns), cells, bold, sources)
+    return Table(f"{title} {_where(lines)}", (head, *columns), cells, sources)
 
 
 def _apart(line: Measured) -> str:
@@ -314,22 +314,6 @@ def _where(lines: Sequence[Measured]) -> str:
     facts = ("scene", "trajectory", "resolution")
     several = [dict.fromkeys(str(line.run.facts[name]) for line in lines) for name in facts]
     return ", ".join(next(iter(of)) for of in several if len(of) == 1)
-
-
-def best_instead(cost: Sequence[float], error: Sequence[float]) -> list[int]:
-    """For each setting, the index of the best setting that costs no more.
-
-    Best is the least `error`, then the least `cost`, then the lowest index: on the Pareto frontier
-    the setting itself, elsewhere one that dominates it.
-    """
-    costs, errors = np.asarray(cost, float), np.asarray(error, float)
-    best: list[int] = [0] * len(costs)
-    least = -1
-    for index in np.lexsort((errors, costs)):  # the cheapest first; lexsort keeps the order of ties
-        if least < 0 or errors[index] < errors[least]:
-            least = int(index)
-        best[index] = least
-    return best
 
 
 def growth(values: Sequence[float], figures: Sequence[float]) -> float:

@@ -37,16 +37,12 @@ class Metric:
 
 @dataclass(frozen=True)
 class Table:
-    """Lines of text under columns: a label, then figures or text.
-
-    `bold` has line and column, both from 0, of every bold cell; `sources` has the keys of the runs
-    behind each line, or is empty.
-    """
+    """Lines under columns, in Markdown: a label, then figures or text. `sources` has the keys of
+    the runs behind each line, or is empty."""
 
     title: str
     columns: tuple[str, ...]
     lines: tuple[tuple[str, ...], ...]
-    bold: frozenset[tuple[int, int]] = frozenset()
     sources: tuple[tuple[str, ...], ...] = ()
 
     def right(self, column: int) -> bool:
@@ -62,13 +58,13 @@ class Table:
     def markdown(self) -> str:
         """The table in GitHub's Markdown, without its title."""
         rules = ("---:" if self.right(column) else "---" for column in range(len(self.columns)))
-        rows = [self.columns]
-        for row, line in enumerate(self.lines):
-            texts = [text.replace("|", "\\|") for text in line]
-            bold = ((row, column) in self.bold for column in range(len(line)))
-            rows.append(tuple(f"**{x}**" if b else x for x, b in zip(texts, bold, strict=True)))
-        head, *lines = (f"| {' | '.join(row)} |" for row in rows)
+        cells = ((text.replace("|", "\\|") for text in line) for line in self.lines)
+        head, *lines = (f"| {' | '.join(row)} |" for row in (self.columns, *cells))
         return "\n".join((head, f"|{'|'.join(rules)}|", *lines))
+
+
+BOLD = ("**%s**", "*%s*")
+"""What the best and, where that is shown, the second-best figure of a column look like."""
 
 
 def spread(low: float, high: float) -> str:

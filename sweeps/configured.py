@@ -27,7 +27,6 @@ from bench.records import fits
 from bench.scenes.assemble import hold_out
 from bench.trajectories import Trajectory
 from bench.types import DEVICE, Log, Method, Scene
-from reports.trackers import tracker
 from sweeps.overrides import CONFIGS, VALIDATION, target_of
 from sweeps.processes import device_lock
 
@@ -50,7 +49,6 @@ class Settings:
     frame_size: Sequence[int] | None
     outputs: str
     weights_dir: str | None
-    tracker: str | None
     report: str | None
 
 
@@ -74,8 +72,6 @@ def checked_settings(config: DictConfig) -> Settings:
     size = settings.frame_size
     if size is not None and (len(size) != 2 or min(size) < 1):
         raise unexpected("frame_size", "[WIDTH, HEIGHT], each 1 or more, or null", size)
-    if settings.tracker is not None:
-        tracker(settings.tracker)
     if not DEVICE.fullmatch(settings.device):
         raise unexpected("device", "auto, cpu, cuda or cuda:N", settings.device)
     _, _, number = settings.device.partition(":")

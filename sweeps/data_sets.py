@@ -13,9 +13,8 @@ from bench.scenes.blender import camera_file
 from bench.scenes.files import data_folder, frames_of
 from bench.scenes.lookup import find_all
 from bench.scenes.nsvf import picture_files
-from reports.outliers import REFERENCES
 
-DATA_SETS: Any = OmegaConf.to_container(OmegaConf.load(REFERENCES))["data_sets"]  # type: ignore[index,call-overload]
+DATA_SETS: Any = OmegaConf.load(Path(__file__).parents[1] / "reports/paper/scenes.yaml").data_sets
 FIRST = next(iter(DATA_SETS))
 """The paper's data sets by name; scenes that none of them names are compared with the first."""
 

@@ -1,18 +1,16 @@
 """Runs jobs where Hydra's launcher puts them: in this process, in others, or on other machines.
 
-Jobs in other processes share with this one only the store, and the folder in which they record how
-they ended.
+Jobs in other processes share with this one only the store, and a folder in which they count.
 """
 
-import json
 import os
 import sys
 import time
 import uuid
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import as_completed
-from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from contextlib import suppress
+from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
 from itertools import groupby
@@ -29,9 +27,8 @@ from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf, flag_override, open_dict
 
 from bench.console import ConsoleLog
-from bench.errors import SteerbenchError, Unavailable, explained
+from bench.errors import SteerbenchError, Unavailable
 from bench.results import content_key
-from bench.sharing import whole
 from bench.study import study_of
 from reports.runs import load_runs
 from reports.tables import decimal
@@ -43,6 +40,9 @@ from sweeps.terminal import time_left
 
 OF_MEASUREMENT = ("engine", "precision", "protocol", "pictures", "exclusive")
 """Settings of run.yaml that no training depends on."""
+
+OF_METHOD = ("method", "engine", "precision")
+"""Settings in which jobs may differ that are measured in turns."""
 
 Group = list[tuple[int, Job]]
 """Jobs that are measured together, each with its number among all."""
@@ -56,19 +56,15 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class Launcher:
-    """Where work is done.
+    """Where work is done, as Hydra's `config` says; errors quote the `words` of the command."""
 
-    `words` are the settings of Hydra among those of a command (`hydra/launcher=joblib`), and the
-    folders with further choices. Notes on the work go below `outputs`, the folder of the store.
-    """
-
+    config: DictConfig
     words: Sequence[str]
-    outputs: Path
 
     @property
     def in_process(self) -> bool:
         """Whether the work is done by this process, one piece after the other."""
-        return self._config().hydra.runtime.choices["hydra/launcher"] == "basic"
+        return self.config.hydra.runtime.choices["hydra/launcher"] == "basic"
 
     def run(self, work: Callable[[W], R], on: Sequence[W]) -> list[R]:
         """The results of `work` on each of the things in `on`.
@@ -80,7 +76,7 @@ class Launcher:
             return []
         with initialize_config_dir(str(CONFIGS), version_base="1.3"):
             loader = GlobalHydra.instance().config_loader()
-        config = self._config()
+        config = self.config.copy()
         own_folder(config)
         join_cluster(config)
         try:
@@ -98,20 +94,22 @@ class Launcher:
                 raise result
         return results
 
-    def _config(self) -> DictConfig:
-        words = [*self.words, setting("outputs", str(self.outputs))]
-        return composed(words, return_hydra_config=True)
+
+def launcher_of(words: Sequence[str], outputs: Path) -> Launcher:
+    """The launcher that `words` choose among those of a command (`hydra/launcher=joblib`), which
+    may name folders with further choices. Notes on the work go below `outputs`."""
+    words = [*words, setting("outputs", str(outputs))]
+    return Launcher(composed(words, return_hydra_config=True), words)
 
 
-def own_folder(config: DictConfig) -> Path:
-    """Give the sweep a folder that no other has, for how its jobs end; it is below that in `config`
-    and takes its place, also in the configurations of the jobs."""
+def own_folder(config: DictConfig) -> None:
+    """Give the sweep a folder that no other has; it is below that in `config` and takes its place,
+    also in the configurations of the jobs."""
     name = f"{datetime.now():%Y-%m-%d_%H-%M-%S}-{uuid.uuid4().hex[:6]}"
     folder = Path(config.hydra.sweep.dir).resolve() / name
     with flag_override(config, ["readonly", "struct"], False):
         config.hydra.sweep.dir = str(folder)
         config.hydra.overrides.hydra.append(setting("hydra.sweep.dir", str(folder)))
-    return folder
 
 
 def join_cluster(config: DictConfig) -> None:
@@ -148,80 +146,53 @@ def _numbered(work: Callable[[W], R], on: Sequence[W], config: Any) -> R | Excep
 
 @dataclass(frozen=True)
 class Ended:
-    """How a job ended: with the key of its `run`, or with a `failure`.
+    """How a job ended: with the key of its `run`, which was `measured` unless the store had it, or
+    with an `error`."""
 
-    A run was `measured` unless the store had it. `number` counts from 0, in the order of the
-    sweep. `outputs` is the folder with its store, `report` that of its page. `begun` is in seconds
-    since the epoch.
-    """
-
-    number: int
-    name: str
-    outputs: str
-    report: str | None
-    begun: float
-    measured: bool = False
     run: str | None = None
-    failure: str | None = None
+    measured: bool = False
+    error: Exception | None = None
 
-    def write(self, folder: Path) -> None:
-        """Write the record to `folder`, atomically."""
-        with explained(folder), whole(folder / f"{self.number}.job.json") as new:
-            new.write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
-
-
-def read(folder: Path) -> list[Ended]:
-    """Read the records of all jobs that have ended, in the order of the sweep."""
-    texts = (path.read_text(encoding="utf-8") for path in folder.glob("*.job.json"))
-    return sorted((Ended(**json.loads(text)) for text in texts), key=lambda job: job.number)
+    @property
+    def failed(self) -> bool:
+        """Whether it failed, and can run here."""
+        return self.error is not None and not isinstance(self.error, Unavailable)
 
 
-def attempt(numbered: Group, total: int, folder: Path) -> list[Exception]:
-    """Obtain the runs of jobs that are measured together; print, and record in `folder`, how each
-    ended.
+def attempt(group: Group, total: int, folder: Path, begun: float) -> dict[str, Ended]:
+    """Obtain the runs of jobs that are measured together; print how each ended, and return it by
+    the key of the job.
 
-    Each job has its number in the sweep; `total` is how many jobs that has; 0: not known. A job
-    that fails is left out, and the others are measured without it. Returns the errors; they are
+    Each job has its number among `total`, which began at the time `begun`; all jobs count in
+    `folder`. A job that fails is left out, and the others are measured without it. Its error is
     printed, and kept for reports.
     """
-    begun, errors = time.time(), []
-
-    def end(number: int, job: Job, **how: Any) -> None:
-        outputs = str(job.config.outputs)
-        Ended(number, job.name, outputs, job.config.report, begun, **how).write(folder)
-
-    left = list(numbered)
+    ended: dict[str, Ended] = {}
+    left = list(group)
     while left:
         try:
             runs, measured = obtain([job for _, job in left])
         except Exception as error:
             alone = error.job if isinstance(error, JobFailed) else None
             cause = error.__cause__ if alone and isinstance(error.__cause__, Exception) else error
-            errors.append(cause)
-            for number, job in left:
-                if alone is None or job is alone:
-                    print(f"steerbench: failed: {job.name}: {cause}", file=sys.stderr)
-                    with _printed():
-                        job.keep_failure(reason(cause))
-                    with _printed():
-                        end(number, job, failure=reason(cause))
-            left = [each for each in left if alone and each[1] is not alone]
+            failed = [each for each in left if alone is None or each[1] is alone]
+            for number, job in failed:
+                print(f"steerbench: failed: {job.name}: {cause}", file=sys.stderr)
+                try:
+                    job.keep_failure(reason(cause))
+                except SteerbenchError as problem:  # does not hide the failure
+                    print(f"steerbench: {problem}", file=sys.stderr)
+                ended[job.key] = Ended(error=cause)
+                _count(folder, number)
+            left = [each for each in left if each not in failed]
         else:
-            for (number, job), run in zip(left, runs, strict=True):
-                end(number, job, run=run, measured=measured)
+            for number, _ in left:
+                _count(folder, number, measured)
             for (_, job), run in zip(left, runs, strict=True):
-                say(job, run, _progress(folder, total))
-            return errors
-    return errors
-
-
-@contextmanager
-def _printed() -> Iterator[None]:
-    """Print an error of the body and go on, so that it does not hide the failure being recorded."""
-    try:
-        yield
-    except Exception as error:
-        print(f"steerbench: {reason(error)}", file=sys.stderr)
+                ended[job.key] = Ended(run, measured)
+                say(job, run, _progress(folder, total, begun))
+            left = []
+    return ended
 
 
 def say(job: Job, run: str, more: str = "") -> None:
@@ -231,71 +202,78 @@ def say(job: Job, run: str, more: str = "") -> None:
     print(f"{job.name}: {psnr} dB, {ms} ms a frame{more}", file=sys.stderr)
 
 
-def _progress(folder: Path, total: int) -> str:
+def _count(folder: Path, number: int, measured: bool = False) -> None:
+    with suppress(OSError):
+        (folder / f"{number}.{'measured' if measured else 'ended'}").touch()
+
+
+def _progress(folder: Path, total: int, begun: float) -> str:
     """How many jobs are done, and an estimate of the remaining time from the measured ones."""
-    ended = read(folder)
-    if len(ended) > total:
-        return ""
-    seconds = time.time() - min(job.begun for job in ended)
-    measured = sum(job.measured for job in ended)
-    left = time_left(seconds, measured, total - len(ended))
-    return f"; {len(ended)} of {total} jobs done{left}"
+    measured, others = (len([*folder.glob(f"*.{how}")]) for how in ("measured", "ended"))
+    done = measured + others
+    left = time_left(time.time() - begun, measured, total - done)
+    return f"; {done} of {total} jobs done{left}"
 
 
 # All jobs of a command
 
 
-def run_jobs(jobs: Sequence[Job], launcher: Launcher) -> int:
-    """Run the jobs, equal ones only once; return how many of those that can run here failed.
+def run_jobs(jobs: Sequence[Job], launcher: Launcher) -> list[Ended]:
+    """Run the jobs, equal ones only once, and say how each of them ended.
 
     Goes scene by scene, and measures what has the first seed, then what has the next. Where there
     is room in this process, the models that the store lacks are trained before, in parallel;
     otherwise each job trains what it needs.
     """
-    distinct = {job.key: job for job in reversed(jobs)}
-    jobs = [job for job in jobs if distinct[job.key] is job]
-    scenes, seeds = [job.scene for job in jobs], [job.config.seed for job in jobs]
-    jobs.sort(key=lambda job: (scenes.index(job.scene), seeds.index(job.config.seed)))
-    ahead, failed = launcher.in_process and room(jobs[0].config) > 1, 0
-    of_scenes = [list(some) for _, some in groupby(jobs, lambda job: job.scene)]
-    for some in of_scenes if ahead else [jobs]:
-        groups, measured = _groups(some, look_up=ahead)
+    first = {job.key: job for job in reversed(jobs)}
+    distinct = [job for job in jobs if first[job.key] is job]
+    scenes, seeds = ([job.settings[name] for job in distinct] for name in ("scene", "seed"))
+
+    def place(job: Job) -> tuple[int, int]:
+        return scenes.index(job.settings["scene"]), seeds.index(job.settings["seed"])
+
+    distinct.sort(key=place)
+    ahead, ended = launcher.in_process and room(jobs[0].config) > 1, dict[str, Ended]()
+    of_scenes = [list(some) for _, some in groupby(distinct, lambda job: place(job)[0])]
+    for some in of_scenes if ahead else [distinct]:
+        groups, found = _groups(some, look_up=ahead)
         if ahead:
-            train_ahead(some, measured)
-        total = sum(map(len, groups))
-        failed += sum(launcher.run(partial(_attempted, total=total), groups))
-    return failed
+            train_ahead(some, found)
+        work = partial(_attempted, total=sum(map(len, groups)), begun=time.time())
+        for of_group in (found, *launcher.run(work, groups)):
+            ended |= of_group
+    return [ended[job.key] for job in jobs]
 
 
-def _groups(jobs: Sequence[Job], look_up: bool) -> tuple[list[Group], set[str]]:
-    """The jobs that are measured in turns, together.
+def _groups(jobs: Sequence[Job], look_up: bool) -> tuple[list[Group], dict[str, Ended]]:
+    """The jobs that are measured together: of those with the same `turns`, what differs only in the
+    method.
 
-    With `look_up`, without those that the store has; and the keys of these.
+    With `look_up`, without those that the store has, which are returned as ended.
     """
-    by_turns: dict[str, list[Job]] = {}
+    together: dict[tuple[str, str], list[Job]] = {}
     for job in jobs:
-        by_turns.setdefault(job.turns or job.key, []).append(job)
+        shared = {name: of for name, of in job.settings.items() if name not in OF_METHOD}
+        with_others = content_key(shared) if job.turns else job.key
+        together.setdefault((job.turns, with_others), []).append(job)
     groups: list[Group] = []
-    measured: set[str] = set()
-    for together in by_turns.values():
+    ended: dict[str, Ended] = {}
+    for of_group in together.values():
         found: dict[str, Job] = {}
         with suppress(SteerbenchError):  # a job that cannot start says so when it is measured
-            found = stored(together) if look_up else {}
+            found = stored(of_group) if look_up else {}
         for run, job in found.items():
             say(job, run)
-        known = {job.key for job in found.values()}
-        if left := [job for job in together if job.key not in known]:
+            ended[job.key] = Ended(run)
+        if left := [job for job in of_group if job.key not in ended]:
             groups.append(list(enumerate(left, sum(map(len, groups)))))
-        measured |= known
-    return groups, measured
+    return groups, ended
 
 
-def _attempted(group: Group, total: int) -> int:
-    """Attempt jobs that are measured together; return how many failed that can run here."""
+def _attempted(group: Group, total: int, begun: float) -> dict[str, Ended]:
     for number, job in group:
         print(f"{number + 1} of {total}, {job.name}", file=sys.stderr)
-    errors = attempt(group, total, Path(HydraConfig.get().runtime.output_dir))
-    return sum(not isinstance(error, Unavailable) for error in errors)
+    return attempt(group, total, Path(HydraConfig.get().runtime.output_dir), begun)
 
 
 # Trainings in parallel, because small ones gain little from a second core
@@ -308,11 +286,10 @@ def train_ahead(jobs: Sequence[Job], measured: Collection[str]) -> None:
     they are measured. A training that fails here fails again then, and is reported then.
     """
     todo: dict[str, Job] = {}
-    for job in jobs:
-        todo.setdefault(_training(job), job)
-    for job in jobs:
-        if job.key in measured:
-            todo.pop(_training(job), None)
+    for job in sorted(jobs, key=lambda job: job.key not in measured):
+        with suppress(SteerbenchError):  # it says so when it is measured
+            todo.setdefault(_training(job), job)
+    todo = {name: job for name, job in todo.items() if job.key not in measured}
     if len(todo) < 2:
         return
     workers, log = room(jobs[0].config), ConsoleLog(jobs[0].outputs)
@@ -329,8 +306,12 @@ def train_ahead(jobs: Sequence[Job], measured: Collection[str]) -> None:
 
 def room(config: DictConfig) -> int:
     """How many trainings can run at a time; 1 on a GPU, or if nothing sets their threads."""
-    cores = len(os.sched_getaffinity(0))
-    return 1 if on_gpu(config.device) else cores // training_threads(config)
+    if on_gpu(config.device):
+        return 1
+    try:
+        return len(os.sched_getaffinity(0)) // training_threads(config)
+    except SteerbenchError:  # as a job that cannot start says when it is measured
+        return 1
 
 
 def _training(job: Job) -> str:

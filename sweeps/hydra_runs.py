@@ -1,23 +1,20 @@
-"""Hydra composes the configuration of every job of a command and runs it."""
+"""Hydra composes the configuration of every job of a command."""
 
 from __future__ import annotations
 
 import os
 import re
 import sys
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextvars import ContextVar
-from dataclasses import dataclass, field
-from math import prod
-from pathlib import Path
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import hydra
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, flag_override
 
 from bench.errors import unexpected
 from sweeps.overrides import CONFIGS, as_typed, explain, further, hint, of_hydra, settled, swept
@@ -27,38 +24,33 @@ if TYPE_CHECKING:  # these load torch, which --help and completion do not need
     from sweeps.measurement import Job
 
 
-@dataclass
-class RunningSweep:
-    """The sweep of a call of `main`: the `folder` where jobs record how they ended, None without a
-    sweep, and the jobs that wait to be measured in turns, with their numbers."""
-
-    folder: Path | None = None
-    waiting: list[tuple[int, Job]] = field(default_factory=list)
-
-
-_sweep: ContextVar[RunningSweep] = ContextVar("sweep")
-"""The sweep of the present call of `main`. Hydra itself makes the object that learns of a sweep."""
+_sweeps: ContextVar[list[DictConfig]] = ContextVar("sweeps")
+"""Hydra's configurations of the sweeps of the present call: Hydra itself makes the object that
+learns of one."""
 
 
 class SweepCallback(Callback):
-    """Notes that a sweep starts; run.yaml lists it among Hydra's callbacks."""
+    """Lets Hydra compose the jobs of a sweep, and no more; run.yaml lists it as a callback."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Note the folder of the sweep, before its launcher is made."""
-        from sweeps.execute import join_cluster, own_folder
+        """Note Hydra's configuration, and have its jobs called here, one after the other."""
+        from sweeps.execute import own_folder
 
-        _sweep.get().folder = own_folder(config)
-        join_cluster(config)
+        own_folder(config)
+        _sweeps.get().append(config.copy())
+        with flag_override(config, ["readonly", "struct"], False):
+            basic = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
+            config.hydra.launcher = {"_target_": basic}
 
 
 def run_hydra(
     argv: Sequence[str], alone: Callable[[DictConfig, list[str]], object]
-) -> tuple[list[Ended], list[Exception]]:
+) -> tuple[list[tuple[Job, Ended]], list[Exception]]:
     """Do what `argv` says: a sweep, one job, which is left to `alone` with its configuration and
     its command, or Hydra's own help.
 
-    A failed job of a sweep is reported at once, and the others still run. Returns how the jobs of
-    the sweep ended, and the errors. SteerbenchError if the sweep has several stores.
+    A failed job of a sweep is reported at once, and the others still run. Returns the jobs of the
+    sweep, how each ended, and all errors. SteerbenchError if the sweep has several stores.
     """
     argv = as_typed(argv)
     if several := swept([word for word in argv if word.startswith("outputs=")]):
@@ -70,97 +62,65 @@ def run_hydra(
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its errors instead of printing them
     _hide_subcommand_from_completion()
     errors: list[Exception] = []
+    found: list[tuple[Job, str]] = []  # each with its choice of a method
 
     def job(config: DictConfig) -> None:
         present = HydraConfig.get()
         sources = present.runtime.config_sources
         folders = [f"--config-dir={x.path}" for x in sources if x.provider == "command-line"]
         command = ["steerbench", "run", *folders, *present.overrides.task]
-        several = present.mode == RunMode.MULTIRUN
         try:
             config = settled(config, further(folders))
-            if several:
-                _one_of_many(config, command)
+            if present.mode == RunMode.MULTIRUN:
+                found.append((_job(config, command), present.runtime.choices["method"]))
             else:
                 alone(config, command)
         except Exception as error:
-            if several and present.runtime.choices["hydra/launcher"] != "basic":
-                raise  # in another process, whose errors are not these
             errors.append(error)  # bypasses Hydra, which would print it in its own way
 
-    token = _sweep.set(sweep := RunningSweep())
+    sweeps: list[DictConfig] = []
+    token = _sweeps.set(sweeps)
     try:
         hydra.main(str(CONFIGS), "run", version_base="1.3")(job)()
     except Exception as error:
         errors.append(explain(error, argv) if of_hydra(error) else error)
     finally:
-        _sweep.reset(token)
-    if sweep.folder is None:
+        _sweeps.reset(token)
+    if not found:
         return [], errors
-    from sweeps.execute import read
+    from sweeps.execute import Launcher, run_jobs
 
-    errors += _in_turns(sweep.waiting, sweep.folder)
-    return read(sweep.folder), errors
+    jobs = _named(found)
+    ended = run_jobs(jobs, Launcher(sweeps[0], argv))
+    errors += [each.error for each in ended if each.error]
+    return list(zip(jobs, ended, strict=True)), errors
 
 
-def _one_of_many(config: DictConfig, command: Sequence[str]) -> None:
-    from sweeps.execute import attempt
+def _job(config: DictConfig, command: Sequence[str]) -> Job:
     from sweeps.measurement import Job, turns_of
-    from sweeps.processes import set_up
 
-    set_up()  # the launcher may have started this process
-    present = HydraConfig.get()
-    sizes = _sizes(Path(present.runtime.output_dir) / "multirun.yaml")
-    name = label(present.runtime.choices["method"], present.overrides.task, sizes or ())
-    total = 0 if sizes is None else prod(sizes.values())
-    number, folder = present.job.num, Path(present.runtime.output_dir)
-    if config.in_turns:
-        launcher = present.runtime.choices["hydra/launcher"]
-        if launcher != "basic":
-            expected = "false with a launcher, because one process renders all frames"
-            raise unexpected("in_turns", expected, f"true with hydra/launcher={launcher}")
-        turns = turns_of(present.runtime.choices.get("experiment", "sweep"), config)
-        _sweep.get().waiting.append((number, Job(config, command, name, turns)))
-    elif errors := attempt([(number, Job(config, command, name))], total, folder):
-        raise errors[0]
+    experiment = HydraConfig.get().runtime.choices.get("experiment", "sweep")
+    job = Job(config, command, turns=turns_of(experiment, config) if config.in_turns else "")
+    assert job.key  # what has none is refused now
+    return job
 
 
-def _in_turns(waiting: Sequence[tuple[int, Job]], folder: Path) -> list[Exception]:
-    """Measure the jobs of a sweep: those that differ only in their method together, in turns."""
-    from bench.results import content_key
-    from sweeps.execute import attempt
-
-    groups: dict[str, list[tuple[int, Job]]] = {}
-    for number, job in waiting:
-        of_method = ("method", "engine", "precision")
-        shared = {name: of for name, of in job.settings.items() if name not in of_method}
-        groups.setdefault(content_key(shared), []).append((number, job))
-    return [error for group in groups.values() for error in attempt(group, len(waiting), folder)]
-
-
-def _sizes(file: Path) -> dict[str, int] | None:
-    """How many values each swept setting has, by the file of Hydra's own sweeper; else None."""
-    if not file.exists():
-        return None
-    sweep = OmegaConf.load(file).hydra
-    params = sweep.sweeper.get("params") or {}
-    words = [*(f"{name}={values}" for name, values in params.items()), *sweep.overrides.task]
-    values = swept(words, GlobalHydra.instance().config_loader())
-    return {name: len(several) for name, several in values.items()}
-
-
-def label(method: str, overrides: Sequence[str], names: Collection[str]) -> str:
-    """The label of a job among others: its method, and its values of the settings `names`.
-
-    A name is shortened to its last part unless that is ambiguous.
-    """
-    settings = dict(word.split("=", 1) for word in overrides if "=" in word)
-    names = [name for name in names if name in settings and name != "method"]
-    ends = [name.rpartition(".")[2] for name in names]
-    shown = [
-        f"{end if ends.count(end) == 1 else name}={settings[name]}"
-        for name, end in zip(names, ends, strict=True)
+def _named(found: Sequence[tuple[Job, str]]) -> list[Job]:
+    """The jobs with labels, made of what differs between them."""
+    settings = [dict(x.split("=", 1) for x in job.command if "=" in x) for job, _ in found]
+    names = [x for x in settings[0] if len({of.get(x) for of in settings}) > 1]
+    return [
+        replace(job, name=label(method, {name: of[name] for name in names if name in of}))
+        for (job, method), of in zip(found, settings, strict=True)
     ]
+
+
+def label(method: str, varied: Mapping[str, str]) -> str:
+    """The label of a job among others: its method, and what it has of the settings that vary."""
+    from reports.lines import shortened
+
+    short = shortened([name for name in varied if name != "method"])
+    shown = [f"{end}={varied[name]}" for name, end in short.items()]
     return f"{method} ({', '.join(shown)})" if shown else method
 
 

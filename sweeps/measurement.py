@@ -21,8 +21,7 @@ from bench.results import Store, content_key
 from bench.sharing import whole
 from bench.trajectories import resized
 from bench.types import Log, Method
-from reports.runs import Run, load_runs, readable
-from reports.trackers import tracker
+from reports.runs import Run, readable
 from sweeps.configured import (
     build,
     checked_settings,
@@ -40,7 +39,7 @@ from sweeps.processes import device_lock
 
 J = TypeVar("J", bound="Job")
 
-PLACES = ("outputs", "report", "tracker", "weights_dir")
+PLACES = ("outputs", "report", "weights_dir")
 """Settings that are only locations and do not change a row."""
 
 
@@ -95,7 +94,6 @@ class Job:
     command: Sequence[str]  # the words that make it alone, for the record
     name: str = ""  # at the terminal
     turns: str = ""
-    scene: str = ""  # its scene in a data set, empty without a data set
 
     @cached_property
     def settings(self) -> dict[str, Any]:
@@ -146,8 +144,8 @@ def obtain(jobs: Sequence[Job]) -> tuple[list[str], bool]:
     """The keys of the runs of `jobs`, whose `turns` are equal, and whether they are measured now.
 
     They are measured unless the store has all of them: figures that are compared come from the same
-    hour. Earlier failures are forgotten. The runs are sent to their tracker. Raises JobFailed if
-    one of several jobs fails, for whatever reason: the others can then be obtained without it.
+    hour. Earlier failures are forgotten. Raises JobFailed if one of several jobs fails,
+    for whatever reason: the others can then be obtained without it.
     """
     log = ConsoleLog(jobs[0].outputs)
     ready = _ready(jobs, log)
@@ -159,8 +157,6 @@ def obtain(jobs: Sequence[Job]) -> tuple[list[str], bool]:
             measured = not _stored(ready)  # by another process meanwhile
             if measured:
                 _measure(ready, log)
-    for each in ready:
-        send(each.job.config, each.run)
     return _told(ready, measured, log), measured
 
 
@@ -301,20 +297,6 @@ def _measure(ready: Sequence[_Ready], log: Log) -> None:
         if each.task.protocol.compared:
             record["compared_with"] = ready[0].run
         each.job.store.save(each.parts, replace(measurement, record=record))
-
-
-def send(config: DictConfig, run: str) -> None:
-    """Send a run to the tracker of `config`, if it names one. Errors are only logged, because the
-    measurement is valid."""
-    if not config.tracker:
-        return
-    outputs = Path(config.outputs)
-    log = ConsoleLog(outputs)
-    try:
-        tracker(config.tracker)(load_runs(Store(outputs), [run])[0], outputs)
-        log.info(f"sent to {config.tracker}: {run}")
-    except Exception as error:  # third-party library: any exception
-        log.info(f"not sent to {config.tracker}: {run}: {reason(error)}")
 
 
 def newest(store: Store) -> dict[str, list[Run]]:

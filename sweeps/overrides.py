@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
-from hydra.core.config_loader import ConfigLoader
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString, Sweep
@@ -93,14 +92,13 @@ def changed(config: DictConfig, words: Sequence[str]) -> DictConfig:
     return copy
 
 
-def swept(words: Sequence[str], loader: ConfigLoader | None = None) -> dict[str, list[str]]:
+def swept(words: Sequence[str]) -> dict[str, list[str]]:
     """The values of every setting with several values (seed=0,1,2); the last word for it counts.
 
-    Hydra's `loader` is needed if a choice may be a pattern (method=*). SteerbenchError if a word
-    cannot be read.
+    SteerbenchError if a word cannot be read.
     """
     try:
-        parsed = OverridesParser.create(loader).parse_overrides(_overrides(words))
+        parsed = OverridesParser.create().parse_overrides(_overrides(words))
     except Exception as error:
         if not of_hydra(error):
             raise
@@ -207,7 +205,8 @@ def hint(word: str) -> str:
 
 def _settings(words: Sequence[str]) -> list[str]:
     """All settings that exist with the choices (scene=blender) in `words`."""
-    groups = {path.name for folder in searched(words) for path in folder.iterdir() if path.is_dir()}
+    folders = [CONFIGS, *further(words)]
+    groups = {path.name for folder in folders for path in folder.iterdir() if path.is_dir()}
     there = {f"{group}={name}" for group in groups for name in choices(group, words)}
     chosen = [word for word in words if word in there]
     config: Any = composed([*folder_words(words), *chosen])
@@ -225,25 +224,24 @@ def leaves(config: Any, prefix: str = "") -> Iterator[str]:
 
 def beside(name: str, words: Sequence[str]) -> list[str]:
     """The words for the method `name` in place of that of `words`, without settings it lacks."""
-    other = composed([*folder_words(words), f"method={name}"])
-    return [*(word for word in words if holds(word, [other])), f"method={name}"]
+    other, missing = composed([*folder_words(words), f"method={name}"]), object()
 
+    def fits(word: str) -> bool:
+        setting = word.partition("=")[0].lstrip("+~")
+        if "@method" in setting or setting == "method":
+            return False
+        of_other = not setting.startswith("method.")
+        return of_other or OmegaConf.select(other, setting, default=missing) is not missing
 
-def holds(word: str, configs: Iterable[DictConfig]) -> bool:
-    """Whether a word chooses no method, and sets nothing of a method that is not in `configs`."""
-    name, missing = word.partition("=")[0].lstrip("+~"), object()
-    if "@method" in name or name == "method":
-        return False
-    return not name.startswith("method.") or all(
-        OmegaConf.select(config, name, default=missing) is not missing for config in configs
-    )
+    return [*filter(fits, words), f"method={name}"]
 
 
 def choices(group: str, words: Sequence[str] = ()) -> dict[str, Path]:
-    """The file of every choice of `group` by name, including folders named in `words`."""
+    """The file of every choice of `group` by name, including folders named in `words`; of equal
+    names, ours wins, then the first."""
     found = {
         path.stem: path
-        for folder in reversed(searched(words))  # for equal names, the first folder wins
+        for folder in (*reversed(further(words)), CONFIGS)
         for path in (folder / group).glob("*.yaml")
     }
     return dict(sorted(found.items()))
@@ -292,11 +290,6 @@ def folder_words(words: Sequence[str]) -> list[str]:
 
 def _overrides(words: Sequence[str]) -> list[str]:
     return [word for word in as_typed(words) if not word.startswith(f"{FLAGS[0]}=")]
-
-
-def searched(words: Sequence[str]) -> list[Path]:
-    """Our configurations, and the `further` folders."""
-    return [CONFIGS, *further(words)]
 
 
 def further(words: Sequence[str]) -> list[Path]:

@@ -26,13 +26,14 @@ OF_CURVES = {"protocol.name": "psnr", "protocol.lpips": "[]"}
 class Planned(Job):
     """A job of a table, for a line of one of its blocks; both are named by their keys.
 
-    `label` is what the line is shown as.
+    `label` is what the line is shown as. `scene` is one of several, or of a data set, or empty.
     """
 
     table: str
     block: str
     line: str
     label: str
+    scene: str
 
 
 def repeats(seeds: int) -> int:

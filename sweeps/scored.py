@@ -18,7 +18,6 @@ from bench.results import REPORTED, Store
 from bench.types import Camera
 from reports.runs import Run, load_runs
 from sweeps.configured import checked_settings, protocol_of, scene_of, use_threads
-from sweeps.measurement import send
 from sweeps.overrides import composed
 
 NOTHING = "-"  # in place of facts of a row that do not apply to given pictures
@@ -99,7 +98,6 @@ def score(
         "budget": {"name": NOTHING},
     }
     key = store.save(parts, replace(measurement, record={**record, **more}))
-    send(config, key)
     (run,) = load_runs(store, [key])
     return run
 

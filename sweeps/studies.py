@@ -89,9 +89,9 @@ class Subject:
         """What tables vary of the method, and what it declares itself."""
         return {**experiments.axes(self.name), **self.study.axes}
 
-    def lines(self, group: str, variants: Sequence[Variant], **more: Any) -> Iterator[StudyLine]:
+    def lines(self, group: str, variants: Sequence[Variant]) -> Iterator[StudyLine]:
         for each in variants:
-            yield StudyLine(self.name, group, each.name, each.settings, **more)
+            yield StudyLine(self.name, group, each.name, each.settings)
 
 
 def accuracy(subject: Subject, only: Sequence[str], trained: bool) -> Iterator[StudyLine]:
@@ -170,7 +170,7 @@ def scaling(subject: Subject, only: Sequence[str]) -> Iterator[StudyLine]:
             words_of = {value: (f"{axis.setting}={value}",) for value in axis.values}
             points = [(axis.size(x), axis.label.format(x), of) for x, of in words_of.items()]
         for value, label, words in points:
-            yield StudyLine(subject.name, name, label, (*short, *words), value, in_turns=False)
+            yield StudyLine(subject.name, name, label, (*short, *words), value)
 
 
 def chosen(names: Sequence[str] | Mapping[str, Any], parts: Sequence[str], kind: str) -> list[str]:
@@ -240,8 +240,8 @@ def jobs_of(study: str, found: Sequence[Subject], options: Mapping[str, Any]) ->
             words = [*subject.words, *line.settings]
             config = subject.varied(line.settings)
             whose = [] if study == "breakdown" else [subject.name]  # all methods in turns
-            turns = ", ".join((study, *whose, line.group))
+            turns = "" if study == "scaling" else ", ".join((study, *whose, line.group))
             name = f"{study}: {subject.name}, {line.group}: {line.label}"
             command = ["steerbench", "run", *words]
-            jobs.append(StudyJob(config, command, name, turns * line.in_turns, line=line))
+            jobs.append(StudyJob(config, command, name, turns, line=line))
     return jobs

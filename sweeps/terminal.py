@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import sys
 from collections.abc import Collection, Mapping, Sequence
 from datetime import timedelta
@@ -109,10 +110,6 @@ def rich_table(table: Table) -> RichTable:
     grid = RichTable(title=escape(table.title), title_justify="left")
     for index, column in enumerate(table.columns):
         grid.add_column(escape(column), justify="right" if table.right(index) else "left")
-    for row, line in enumerate(table.lines):
-        cells = (
-            f"[bold]{escape(text)}[/bold]" if (row, column) in table.bold else escape(text)
-            for column, text in enumerate(line)
-        )
-        grid.add_row(*cells)
+    for line in table.lines:
+        grid.add_row(*(re.sub(r"^\*\*(.*)\*\*$", r"[bold]\1[/]", escape(x)) for x in line))
     return grid

@@ -1,5 +1,6 @@
 """What all tests share: devices, a poisoned `torch.empty`, a quiet log, tiny scene, method, run."""
 
+import importlib.util
 import math
 import os
 import re
@@ -11,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import wraps
 from pathlib import Path
+from types import ModuleType
 
 import hypothesis
 import pytest
@@ -49,6 +51,17 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # Set before anything imports Triton, which reads it once.
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"
+
+
+def script(name: str) -> ModuleType:
+    """The program `docs/NAME.py` as a module."""
+    spec = importlib.util.spec_from_file_location(
+        f"docs_{name}", Path(__file__).parents[1] / "docs" / f"{name}.py"
+    )
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
 
 FIRST = "test_end_to_end.py"
 """The file that takes longest: begun last, it would run alone in the end."""

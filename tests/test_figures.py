@@ -1,7 +1,6 @@
 """The documents show what the commands of docs/figures.toml wrote, all from one commit."""
 
 import csv
-import importlib.util
 import re
 import subprocess
 import sys
@@ -12,14 +11,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.conftest import script
+
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 END = "<!-- end of figures -->"
 
-_spec = importlib.util.spec_from_file_location("figures", ROOT / "docs" / "figures.py")
-figures = importlib.util.module_from_spec(_spec)
-sys.modules["figures"] = figures  # where dataclasses look for it
-_spec.loader.exec_module(figures)
+figures = script("figures")
 
 PROGRAM = f"""#!{sys.executable}
 import sys

@@ -1,9 +1,7 @@
 """`make gpu`, rehearsed to its end on a pretended GPU."""
 
-import importlib.util
 import json
 import subprocess
-import sys
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -11,14 +9,10 @@ from pathlib import Path
 import pytest
 
 from sweeps.cli import dispatch, guard
+from tests.conftest import script
 from tests.pretended_gpu import PretendedGpu
 
-_spec = importlib.util.spec_from_file_location(
-    "gpu_report", Path(__file__).parents[1] / "docs" / "gpu.py"
-)
-report = importlib.util.module_from_spec(_spec)
-sys.modules["gpu_report"] = report
-_spec.loader.exec_module(report)
+report = script("gpu")
 
 TINY = [
     *("scene.width=16", "scene.train=4", "scene.test=2", "protocol.lpips=[]", "protocol.warmup=0"),

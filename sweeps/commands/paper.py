@@ -6,24 +6,21 @@ import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
 from bench.errors import SteerbenchError
 from bench.results import Store, existing_store
 from reports import export
-from reports.outliers import outlier_table, outliers
 from reports.paper_page import write_paper_page
 from reports.paper_tables import Place
 from reports.runs import Repeated, Run, over_common_frames, over_scenes
 from sweeps.data_sets import DataSet, data_sets, find
-from sweeps.execute import Launcher, divided, run_jobs
+from sweeps.execute import Ended, divided, launcher_of, run_jobs
 from sweeps.measurement import newest, of_scene
-from sweeps.overrides import composed, unquoted
+from sweeps.overrides import unquoted
 from sweeps.plan import Planned, plan, scenes_of
 from sweeps.tables import chosen
-from sweeps.terminal import console, show
 
 DATA = "data="  # prefix of the word that names the folder of a data set
 
@@ -31,13 +28,10 @@ DATA = "data="  # prefix of the word that names the folder of a data set
 def main(options: argparse.Namespace) -> int:
     """Measure what the store lacks (unless only a report is wanted) and write the page.
 
-    Returns 1 if a job failed that can run here. With `check`, instead names the runs that look
-    broken, and returns 1 if there are any.
+    Returns 1 if a job failed that can run here.
     """
     settings, of_hydra = divided(options.overrides)
     words, data = data_set(settings)
-    if options.command == "report" and options.check:
-        return _check(existing_store(Path(composed(words).outputs)))
     missing = data.missing if data else {}
     for name, why in missing.items():
         print(f"missing: {name}: {why}", file=sys.stderr)
@@ -46,18 +40,17 @@ def main(options: argparse.Namespace) -> int:
     tables = chosen(one, words, options.beside, shown)
     jobs = [job for table in tables for job in plan(table, words, data)]
     outputs = Path(jobs[0].config.outputs)
-    failed = 0
+    ended: list[Ended] = []
     if options.command != "report":
-        failed = run_jobs(jobs, Launcher([*options.config_dir, *of_hydra], outputs))
+        ended = run_jobs(jobs, launcher_of([*options.config_dir, *of_hydra], outputs))
     runs = newest(existing_store(outputs) if options.command == "report" else Store(outputs))
-    broken = outliers(list(chain(*runs.values())))
     folder = options.report or outputs / (one or "paper")
     measured = gather(jobs, runs)
-    page = write_paper_page(tables, measured, broken, folder, missing)
+    page = write_paper_page(tables, measured, folder, missing)
     if options.format or options.command == "table":
         print(export.exported_tables(tables, measured, options.format or "markdown"), end="")
     print(f"report: {page}", file=sys.stderr)
-    return int(failed > 0)
+    return int(any(each.failed for each in ended))
 
 
 def data_set(words: Sequence[str]) -> tuple[list[str], DataSet | None]:
@@ -72,18 +65,6 @@ def data_set(words: Sequence[str]) -> tuple[list[str], DataSet | None]:
         both = f"{named[-1]} and {scenes[0]}"
         raise SteerbenchError(f"{both}: expected one of them; data names all scenes")
     return settings, find(unquoted(named[-1].removeprefix(DATA))) if named else None
-
-
-def _check(store: Store) -> int:
-    runs = list(chain(*newest(store).values()))
-    if not runs:
-        raise SteerbenchError(f"{store.folder}: no runs, only pictures that were scored")
-    broken = outliers(runs)
-    if broken:
-        show(outlier_table(broken, runs))
-    keys = {outlier.key for outlier in broken}
-    console().print(f"{len(keys)} of {len(runs)} runs look broken")
-    return int(len(keys) > 0)
 
 
 class Outcome(NamedTuple):

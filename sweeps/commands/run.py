@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
@@ -13,6 +12,7 @@ from sweeps.hydra_runs import run_hydra
 if TYPE_CHECKING:
     from reports.runs import Run
     from sweeps.execute import Ended
+    from sweeps.measurement import Job
 
 
 def main(argv: Sequence[str]) -> int:
@@ -52,24 +52,24 @@ def _alone(config: DictConfig, command: Sequence[str], form: str | None) -> None
     write_page(config.report, job.store, [key])
 
 
-def _finish(ended: Sequence[Ended], form: str | None) -> None:
+def _finish(ended: Sequence[tuple[Job, Ended]], form: str | None) -> None:
     """Print one table of all jobs that have ended, and write the pages that they requested."""
-    from bench.results import Store
     from reports.runs import load_runs
+    from sweeps.measurement import reason
     from sweeps.terminal import say_missing, write_page
 
-    def of(jobs: Sequence[Ended]) -> tuple[list[str], dict[str, str]]:
+    def of(jobs: Sequence[tuple[Job, Ended]]) -> tuple[list[str], dict[str, str]]:
         """Keys of the runs, equal ones once, and reasons of failed jobs by name."""
-        failed = {job.name: job.failure for job in jobs if job.failure}
-        return list(dict.fromkeys(job.run for job in jobs if job.run)), failed
+        failed = {job.name: reason(end.error) for job, end in jobs if end.error}
+        return list(dict.fromkeys(end.run for _, end in jobs if end.run)), failed
 
-    store = Store(Path(ended[0].outputs))
+    store = ended[0][0].store
     keys, failed = of(ended)
     runs = load_runs(store, keys)
     _show(runs, failed, form)
     say_missing(runs)
-    for report in dict.fromkeys(job.report for job in ended):
-        write_page(report, store, *of([job for job in ended if job.report == report]))
+    for report in dict.fromkeys(job.config.report for job, _ in ended):
+        write_page(report, store, *of([x for x in ended if x[0].config.report == report]))
 
 
 def _show(runs: Sequence[Run], failed: Mapping[str, str], form: str | None) -> None:

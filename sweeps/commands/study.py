@@ -14,10 +14,10 @@ from bench.errors import unexpected
 from bench.provenance import commit, machine
 from reports.images import Part
 from reports.publish import publish
+from reports.runs import load_runs
 from reports.studies import VIEWS, Measured, by_method
 from reports.tables import Table
-from sweeps.execute import Launcher, divided, run_jobs
-from sweeps.measurement import newest, of_scene
+from sweeps.execute import Ended, divided, launcher_of, run_jobs
 from sweeps.studies import StudyJob, jobs_of, subjects
 from sweeps.terminal import say, show
 
@@ -34,8 +34,8 @@ def main(options: argparse.Namespace) -> int:
     found = subjects(study, words)
     jobs = jobs_of(study, found, given)
     outputs = Path(jobs[0].config.outputs)
-    failed = run_jobs(jobs, Launcher([*options.config_dir, *of_hydra], outputs))
-    lines = list(_measured(jobs))
+    ended = run_jobs(jobs, launcher_of([*options.config_dir, *of_hydra], outputs))
+    lines = list(_measured(jobs, ended))
     if not lines:
         return 1
     parts = VIEWS[study](lines)
@@ -48,16 +48,14 @@ def main(options: argparse.Namespace) -> int:
     folder = options.report or outputs / study
     page = publish(_page(options, parts), folder, [line.run for line in lines])
     print(f"report: {page}", file=sys.stderr)
-    return int(failed > 0)
+    return int(any(each.failed for each in ended))
 
 
-def _measured(jobs: Sequence[StudyJob]) -> Iterator[Measured]:
-    runs = newest(jobs[0].store)
-    for job in jobs:
-        for run in runs.get(job.key, ()):
-            if of_scene(run, job.config):
-                yield Measured.of(job.line, run)
-                break
+def _measured(jobs: Sequence[StudyJob], ended: Sequence[Ended]) -> Iterator[Measured]:
+    there = [(job.line, end.run) for job, end in zip(jobs, ended, strict=True) if end.run]
+    runs = {run.key: run for run in load_runs(jobs[0].store, (key for _, key in there))}
+    for line, key in there:
+        yield Measured.of(line, runs[key])
 
 
 def _page(options: argparse.Namespace, parts: Sequence[Part]) -> list[Part]:

@@ -125,6 +125,14 @@ def rewrite(store: Store, key: str, **others: object) -> None:
     path.write_text(json.dumps(record))
 
 
+def copied(store: Store, source: str, key: str) -> Path:
+    """The folder of a copy of the run `source`, stored as `key`."""
+    folder = shutil.copytree(store.folder / source, store.folder / key)
+    for file in (folder / "rows.csv", folder / "record.json"):
+        file.write_text(file.read_text().replace(source, key))
+    return folder
+
+
 def rename(store: Store, key: str, method: str) -> None:
     path = store.folder / key / "rows.csv"
     pd.read_csv(path).assign(method=method).to_csv(path, index=False)
@@ -141,9 +149,7 @@ def several(store: Store, stored_run: str) -> tuple[Store, dict[str, str]]:
     rename(store, stored_run, "first")
     for number in range(5):
         key = f"{number}{stored_run[1:]}"
-        folder = shutil.copytree(store.folder / stored_run, store.folder / key)
-        for file in (folder / "rows.csv", folder / "record.json"):
-            file.write_text(file.read_text().replace(stored_run, key))
+        copied(store, stored_run, key)
         labels[key] = f"copy {number}"
         rename(store, key, labels[key])
     rewrite(store, key, machine={"cpu": "another"})

@@ -1,4 +1,4 @@
-"""The page about the paper's tables: its pictures, its curves, its outliers."""
+"""The page about the paper's tables: its pictures, its curves."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -8,7 +8,6 @@ import pytest
 
 from reports import figures
 from reports.images import Picture
-from reports.outliers import Outlier
 from reports.paper_page import PAGE, _curves, write_paper_page
 from reports.paper_tables import CURVES, Line, PaperTable, Place, point
 from reports.runs import Repeated, Run
@@ -33,17 +32,13 @@ def test_the_page_has_every_table_and_every_figure(run, tmp_path):
     measured: dict[Place, Repeated] = {}
     for table in TABLES.values():
         measured |= measured_of(table, dict.fromkeys(table.lines, run))
-    found = [Outlier(run.key, "13 dB among 30s"), Outlier("another", "not of this page")]
-    page = write_paper_page([*TABLES.values()], measured, found, tmp_path)
+    page = write_paper_page([*TABLES.values()], measured, tmp_path)
     text = page.read_text()
     shown = re.findall(r"!\[[^]]*\]\((.+?)\)", text)
     assert len(shown) == 6
     assert {page.parent / name for name in shown} == set((tmp_path / "pictures").iterdir())
     assert all(f"## Table {number}" in text for number in range(1, 7))
     assert text.count(f"{run.key}  steerbench run method=offset") == 1
-    assert "## Outliers: runs that look broken" in text
-    assert "13 dB among 30s" in text
-    assert "not of this page" not in text
     html = (tmp_path / "report.html").read_text()
     assert html.count("<svg") == 4
     assert html.count('<div class="frame"') == 2
@@ -62,7 +57,7 @@ def test_a_method_has_one_mark_at_its_first_measured_line_and_an_added_one_too(
         return real(shown, metric)
 
     monkeypatch.setattr(figures, "quality_plot", watched)
-    write_paper_page([table], measured, [], tmp_path)
+    write_paper_page([table], measured, tmp_path)
     methods = ["NeRF", "NSVF", "KiloNeRF", "PlenOctree", "DIVeR", "Instant-NGP", "3D Gaussians"]
     assert drawn == 2 * [[*methods, "SteerNeRF", "x"]]
 
@@ -76,7 +71,7 @@ def test_findings_come_first_all_comparisons_last(run, tmp_path):
         )
         for place, (key, line) in enumerate(reversed(table.lines.items()))
     }
-    text = write_paper_page([table], measured, [], tmp_path).read_text()
+    text = write_paper_page([table], measured, tmp_path).read_text()
     before, after = text.split("## The tables")
     says = "PSNR lost by a hash table of 2^16 against 2^19"
     assert f"| **{says} (dB)** | +0.02 | +0.11 | " in before
@@ -89,16 +84,15 @@ def test_findings_come_first_all_comparisons_last(run, tmp_path):
 def test_a_page_of_nothing_still_says_what_is_missing(tmp_path):
     lines = [Repeated("with joint training", [], ["not measured yet"])]
     measured = {Place("table5", TABLES["table5"].data_sets[0], "joint"): lines[0]}
-    text = write_paper_page([*TABLES.values()], measured, [], tmp_path).read_text()
+    text = write_paper_page([*TABLES.values()], measured, tmp_path).read_text()
     assert "| with joint training: not measured yet | – (+1.07) |" in text
     assert "comparisons" not in text
     assert "![" not in text
-    assert "Outliers" not in text
 
 
 def test_a_page_of_ones_own_table_has_its_title(run, tmp_path):
     table = PaperTable("mine", "My table", ["psnr"], {"a": Line("here", {})})
-    text = write_paper_page([table], measured_of(table, {"a": run}), [], tmp_path).read_text()
+    text = write_paper_page([table], measured_of(table, {"a": run}), tmp_path).read_text()
     assert text.startswith("# My table\n")
     assert "paper" not in text
 
@@ -143,10 +137,10 @@ def test_a_curve_has_a_point_for_every_measured_share(of_method, of_budget, run,
     halves = {key: {0.5: [trained], 1.0: [trained]} for key in table.lines}
     halves["joint"][0.25] = [trained]
     curves = _curves(table, on_curves(table, halves))
-    assert [(curve.label, list(curve.points)) for curve in curves] == [
-        ("with joint training", [20, 40, 80]),
-        ("without joint training", [40, 80]),
-    ]
+    assert {label: list(points) for label, points in curves.items()} == {
+        "with joint training": [20, 40, 80],
+        "without joint training": [40, 80],
+    }
     ceiling = Repeated("field", [changed(run, {"psnr": 99.0})])
     figures.quality_over_training({"Table 5": curves}, ceiling, tmp_path / "curves.png")
     (axes,) = drawn[0].axes
@@ -155,23 +149,22 @@ def test_a_curve_has_a_point_for_every_measured_share(of_method, of_budget, run,
     assert set(release.get_xdata()) == {300_000}
     assert axes.get_xlim()[1] > 300_000
     assert axes.get_title() == "Table 5"
-    for line, curve in zip(lines, curves, strict=True):
-        assert list(line.get_xdata()) == list(curve.points)
+    for line, points in zip(lines, curves.values(), strict=True):
+        assert list(line.get_xdata()) == list(points)
         assert set(line.get_ydata()) == {run.values["psnr"]}
 
 
 def test_all_points_of_a_curve_are_of_the_same_seeds(run):
     table, seeds = TABLES["table5"], {0.25: (0, 1), 0.5: (0, 2), 1.0: (0, 1, 2)}
     runs = {share: [changed(run, {}, seed=x) for x in some] for share, some in seeds.items()}
-    (curve,) = _curves(table, on_curves(table, {"joint": runs}))
-    assert [[r.facts["seed"] for r in x.runs] for x in curve.points.values()] == 3 * [[0]]
+    (points,) = _curves(table, on_curves(table, {"joint": runs})).values()
+    assert [[r.facts["seed"] for r in x.runs] for x in points.values()] == 3 * [[0]]
 
 
 def test_several_seeds_have_bars_on_a_curve_and_one_has_none(run, tmp_path, drawn):
     seeds = [shifted(run, by, seed=seed) for seed, by in enumerate((0.0, 1.0, 2.0))]
     points = {10.0: Repeated("a", seeds), 20.0: Repeated("b", [run])}
-    curves = {"Table 9": [figures.Curve("L = 2", points)]}
-    figures.quality_over_training(curves, None, tmp_path / "curves.png")
+    figures.quality_over_training({"Table 9": {"L = 2": points}}, None, tmp_path / "curves.png")
     (axes,) = drawn[0].axes
     low, high = axes.collections[0].get_segments()[0][:, 1]
     assert high - low == pytest.approx(2 * points[10.0].half("psnr"))

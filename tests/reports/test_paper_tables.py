@@ -51,19 +51,21 @@ def block(table: PaperTable, measured: Measured) -> Shown:
     return only
 
 
+def of_two(*published: tuple[float, float]) -> PaperTable:
+    """A table of two data sets; on both, the PSNR that the paper gives each line."""
+    lines = {
+        key: Line(line.label, {}, {FIRST: {"psnr": first}, SECOND: {"psnr": second}})
+        for (key, line), (first, second) in zip(LINES.items(), published, strict=True)
+    }
+    return replace(TABLE, lines=lines, data_sets=[FIRST, SECOND])
+
+
 def test_both_halves_make_claims_each_with_its_own_figures(run):
-    published = (
-        {FIRST: {"psnr": 30.0}, SECOND: {"psnr": 28.0}},
-        {FIRST: {"psnr": 31.0}, SECOND: {"psnr": 28.5}},
-    )
-    figures = zip(LINES.items(), published, strict=True)
-    lines = {key: replace(line, published=of) for (key, line), of in figures}
-    claims = [Claim("psnr", ["a", "b"], 0.1)]
-    table = replace(TABLE, lines=lines, data_sets=[FIRST, SECOND], claims=claims)
+    table = replace(of_two((30.0, 28.0), (31.0, 28.5)), claims=[Claim("psnr", ["a", "b"], 0.1)])
     measured = {
         Place("table9", data_set, key): Repeated(line.label, [run])
         for data_set in (FIRST, SECOND)
-        for key, line in lines.items()
+        for key, line in LINES.items()
     }
     found = comparisons(table, measured)
     assert [(x.table, x.data_set, x.smaller, x.larger) for x in found] == [
@@ -93,10 +95,7 @@ def test_what_stands_for_a_line_that_was_not_measured_has_its_figures_and_says_w
 
 
 def test_a_section_shows_each_block_and_distances_in_each(run, tmp_path):
-    published = ({x: {"psnr": psnr} for x in (FIRST, SECOND)} for psnr in (31.0, 32.0))
-    pairs = zip(LINES.items(), published, strict=True)
-    lines = {key: Line(line.label, {}, of) for (key, line), of in pairs}
-    table = replace(TABLE, lines=lines, data_sets=[FIRST, SECOND])
+    table = of_two((31.0, 31.0), (32.0, 32.0))
     measured = {Place("table9", x, "a"): Repeated("here", [run]) for x in (FIRST, SECOND)}
     first, second = markdown(section(table, measured), tmp_path).split(f"### {SECOND}")
     for text, where in ((first, "Chair"), (second, "Barn")):

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reports.figures import frontier_plot
-from reports.studies import Measured, StudyLine, best_instead, growth, on_frontier, pooled
+from reports.studies import Measured, StudyLine, growth, on_frontier, pooled
 
 
 def line(group: str, label: str, ms: float, psnr: float = 30.0) -> Measured:
@@ -33,25 +33,19 @@ def test_times_of_groups_are_scaled_to_what_all_have():
     assert [each.lost for each in found.values()] == [0.0, 1.0, 1.0, 2.0]
 
 
-def test_what_takes_longer_and_loses_more_names_what_is_better():
-    lines = on_frontier(
-        [line("a", "slow", 9.0), line("a", "fast", 3.0), line("a", "bad", 4.0, 20.0)]
-    )
-    better = [each.better and each.better.label for each in lines]
-    assert better == ["fast", None, "fast"]
-
-
 # Few values, so that there are ties.
 POINTS = st.lists(st.tuples(st.integers(1, 6), st.integers(-3, 3)), min_size=1, max_size=30)
 
 
 @given(POINTS)
-def test_the_least_error_that_costs_no_more_stands_for_a_setting_and_for_itself(points):
-    best = best_instead(*zip(*points, strict=True))
-    for (cost, _), instead in zip(points, best, strict=True):
-        affordable = [other for other in points if other[0] <= cost]
-        assert points[instead] == min(affordable, key=lambda point: (point[1], point[0]))
-        assert best[instead] == instead == points.index(points[instead])
+def test_what_no_line_beats_is_on_the_frontier_and_others_name_the_best_instead(points):
+    lines = [line("a", str(number), ms, psnr) for number, (ms, psnr) in enumerate(points)]
+    for each in on_frontier(lines):
+        affordable = [other for other in lines if other.ms <= each.ms]
+        best = min(affordable, key=lambda other: (-other.figure("psnr"), other.ms))
+        own = (each.ms, each.figure("psnr")) == (best.ms, best.figure("psnr"))
+        assert each.better is None or each.better == best.line
+        assert each.better is not None or own
 
 
 def test_a_value_of_0_is_left_out_and_a_single_one_has_no_exponent():

@@ -12,7 +12,7 @@ from bench.errors import SteerbenchError
 from bench.results import Store
 from sweeps.baseline import portable
 from sweeps.cli import dispatch
-from tests.reports.conftest import rewrite
+from tests.reports.conftest import copied, rewrite
 from tests.sweeps.conftest import HERE, QUICK
 
 
@@ -101,12 +101,11 @@ def test_a_damaged_baseline_is_refused_by_the_place(baseline, outputs):
 @pytest.fixture
 def copy(outputs: Path, stored_run: str) -> Path:
     """The folder of a second run beside the first, as yet the same."""
-    folder = outputs / "runs" / f"0{stored_run[1:]}"
-    return shutil.copytree(outputs / "runs" / stored_run, folder)
+    return copied(Store(outputs), stored_run, f"0{stored_run[1:]}")
 
 
 def test_all_seeds_of_a_run_are_one_entry_and_none_may_be_missing(outputs, copy, tmp_path, capsys):
-    rows = pd.read_csv(copy / "rows.csv").assign(seed=6, run=copy.name)
+    rows = pd.read_csv(copy / "rows.csv").assign(seed=6)
     rows.loc[rows["metric"] == "psnr", "value"] += 1
     rows.to_csv(copy / "rows.csv", index=False)
     path = tmp_path / "baseline.json"
@@ -143,7 +142,7 @@ def test_what_a_record_leaves_out_is_said(outputs, copy, tmp_path, capsys):
 def test_a_folder_that_is_no_store_is_an_error_of_every_command(steerbench, baseline):
     own = ("results", "compare 0 1", "check baseline.json", "check --record new.json")
     commands = [f"{x} --outputs nowhere" for x in (*own, "export nerfbaselines 0 --to there")]
-    of_settings = ("report --table table3", "report --check", "render --run 0")
+    of_settings = ("report --table table3", "render --run 0")
     commands += [f"{x} outputs=nowhere" for x in of_settings]
     for said in ("there is no store of runs", "no runs to read"):
         for command in commands:

@@ -2,7 +2,6 @@
 
 import os
 from contextlib import suppress
-from dataclasses import replace
 from functools import cache
 from unittest.mock import Mock
 
@@ -12,7 +11,7 @@ import steerbench
 from bench import waiting
 from bench.errors import SteerbenchError
 from sweeps import execute
-from sweeps.execute import Ended, read
+from sweeps.execute import Ended
 from sweeps.hydra_runs import label
 from sweeps.measurement import Job, obtain, stored
 from sweeps.overrides import composed
@@ -22,25 +21,16 @@ from tests.sweeps.conftest import HERE, STAND_INS
 from tests.sweeps.test_plan import TABLES
 
 
-def test_jobs_are_read_as_they_were_written_in_the_order_of_the_sweep(tmp_path):
-    job = Ended(0, "ngp", "outputs", None, begun=1.0)
-    ended = [replace(job, number=number, run=f"run {number}") for number in range(12)]
-    for each in reversed(ended):
-        each.write(tmp_path)
-    assert read(tmp_path) == ended
-
-
 @pytest.mark.parametrize(
-    ("names", "expected"),
+    ("varied", "expected"),
     [
-        (["method"], "ngp"),
-        (["scene.seed", "seed"], "ngp (scene.seed=1, seed=2)"),
-        (["scene.seed", "elsewhere"], "ngp (seed=1)"),
+        ({"method": "ngp"}, "ngp"),
+        ({"scene.seed": "1", "seed": "2"}, "ngp (scene.seed=1, seed=2)"),
+        ({"scene.seed": "1"}, "ngp (seed=1)"),
     ],
 )
-def test_a_label_has_method_and_what_varies_by_whole_names_where_ends_are_alike(names, expected):
-    words = ("+experiment=demo", "scene.seed=1", "seed=2", "method=ngp")
-    assert label("ngp", words, names) == expected
+def test_a_label_has_method_and_what_varies_by_whole_names_where_ends_are_alike(varied, expected):
+    assert label("ngp", varied) == expected
 
 
 def test_a_failure_that_cannot_be_kept_is_printed_all_the_same(tmp_path, monkeypatch, capsys):
@@ -48,7 +38,8 @@ def test_a_failure_that_cannot_be_kept_is_printed_all_the_same(tmp_path, monkeyp
     monkeypatch.setattr(execute, "obtain", Mock(side_effect=cause))
     (tmp_path / "outputs").touch()  # no folder can be made there
     job = Job(composed([f"outputs={tmp_path / 'outputs'}"]), [], "a job")
-    assert execute.attempt([(0, job)], 1, tmp_path / "sweep") == [cause]
+    ended = execute.attempt([(0, job)], 1, tmp_path / "sweep", 0.0)
+    assert ended == {job.key: Ended(error=cause)}
     printed = capsys.readouterr().err
     assert "failed: a job: the cause" in printed
     assert "cannot write to" in printed
@@ -95,13 +86,11 @@ def test_a_job_that_fails_is_left_out_and_the_others_are_measured_in_turns(
     first, last = in_turns(0.5, 0.75)
     jobs = [first, Job(composed([*STAND_INS, broken]), [], "broken", turns="table"), last]
     for _ in range(2):
-        (error,) = execute.attempt(list(enumerate(jobs)), 3, tmp_path)
+        ended = execute.attempt(list(enumerate(jobs)), 3, tmp_path, 0.0)
+        error = ended.pop(jobs[1].key).error
         assert isinstance(error, SteerbenchError)
         assert jobs[1].failure == str(error)
-    ended = read(tmp_path)
-    assert [job.failure for job in ended] == [None, str(error), None]
-    assert [job.measured for job in ended] == [False] * 3  # the second time
-    assert {job.run for job in ended if job.run} == {*stored([first, last])}
+    assert ended == {job.key: Ended(run) for run, job in stored([first, last]).items()}
     if broken.startswith("device"):  # what cannot be used here is not looked for
         assert stored(jobs) == stored([first, last])
     assert capsys.readouterr().err.count("failed: broken") == 2

@@ -16,7 +16,7 @@ from reports.paper_tables import CURVES, SHARES, point
 from sweeps.commands.paper import data_set
 from sweeps.data_sets import DATA_SETS, data_sets, find
 from sweeps.measurement import described
-from sweeps.overrides import composed, setting
+from sweeps.overrides import composed
 from sweeps.plan import Planned, plan, scenes_of
 from sweeps.tables import chosen
 
@@ -288,12 +288,6 @@ def test_a_scene_beside_a_data_set_is_refused(tmp_path, word):
     with pytest.raises(SteerbenchError, match="expected one of them"):
         data_set([word, f"data={tmp_path}"])
     assert data_set([word]) == ([word], None)
-
-
-@pytest.mark.parametrize("text", ["/data/chair", "/a b,c (d)/it's", "/x=1/${y}#2", "~/Jürgen"])
-def test_any_folder_can_be_named_in_a_command(text):
-    config = composed(["scene=blender", setting("scene.path", text)])
-    assert config.scene.path == text
 
 
 @pytest.mark.parametrize("quote", ["", "'", '"'])

@@ -6,6 +6,7 @@ import math
 import shlex
 import signal
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -13,12 +14,15 @@ import torch
 
 import steerbench as python
 from bench.errors import SteerbenchError
-from reports.trackers import TRACKERS
 from tests.sweeps.conftest import CONFIGS, STAND_INS
 
 
 def stored(tmp_path: Path) -> list[Path]:
     return sorted(path.parent for path in tmp_path.glob("outputs/runs/*/record.json"))
+
+
+def records(tmp_path: Path) -> list[dict[str, Any]]:
+    return [json.loads((folder / "record.json").read_text()) for folder in stored(tmp_path)]
 
 
 def test_a_run_prints_its_table_and_is_stored_and_not_measured_again(run, tmp_path):
@@ -61,8 +65,8 @@ def test_another_content_of_a_file_that_the_method_reads_makes_another_run(run, 
 
 def test_the_record_holds_the_command_that_was_typed(run, tmp_path):
     run("seed=3", "scene.path=.")
-    (folder,) = stored(tmp_path)
-    command = json.loads((folder / "record.json").read_text())["command"]
+    (record,) = records(tmp_path)
+    command = record["command"]
     assert command.startswith("steerbench run ")
     assert command.endswith("seed=3 scene.path=.")
     assert f"{CONFIGS} method=grey" in command
@@ -71,27 +75,8 @@ def test_the_record_holds_the_command_that_was_typed(run, tmp_path):
 def test_a_job_that_says_nothing_of_threads_has_the_usual_ones(run, tmp_path):
     usual = torch.get_num_threads()
     run("-m", "threads=2,null")
-    records = [json.loads((folder / "record.json").read_text()) for folder in stored(tmp_path)]
-    asked = [record["made_of"]["config"]["threads"] for record in records]
-    had = [record["machine"]["threads"] for record in records]
-    assert dict(zip(asked, had, strict=True)) == {2: 2, None: usual}
-
-
-def test_a_run_is_sent_each_time_and_stands_where_that_cannot_be_done(run, tmp_path, monkeypatch):
-    sent = []
-
-    def send(run, outputs):
-        sent.append((run.key, run.label, outputs / "runs" / run.key))
-        if len(sent) == 1:
-            raise ConnectionError("no route to host")
-
-    monkeypatch.setattr("reports.trackers.find_spec", lambda name: name)
-    monkeypatch.setitem(TRACKERS, "wandb", send)
-    first = run("tracker=wandb")
-    (folder,) = stored(tmp_path)
-    assert f"not sent to wandb: {folder.name}: no route to host" in first.err
-    assert (first.status, run("tracker=wandb").status, run("tracker=comet").status) == (0, 0, 2)
-    assert sent == [(folder.name, "grey", Path("outputs/runs") / folder.name)] * 2
+    had = {x["made_of"]["config"]["threads"]: x["machine"]["threads"] for x in records(tmp_path)}
+    assert had == {2: 2, None: usual}
 
 
 def test_a_sweep_takes_flags_after_overrides_and_leaves_nothing_but_outputs(run, tmp_path):
@@ -163,17 +148,6 @@ def test_a_store_is_named_in_either_form(run, steerbench, tmp_path, form):
     assert "grey" in steerbench("results", *form).ok().out
 
 
-@pytest.mark.parametrize(
-    ("word", "said"),
-    [
-        ("precision=fp8", "precision: expected fp32"),
-        (f"seed={2**63}", "seed: expected 0 or more, below 2^63"),
-    ],
-)
-def test_a_setting_that_nothing_here_has_is_refused(run, word, said):
-    assert said in run(word).refused()
-
-
 def test_more_threads_than_cores_are_named(run):
     assert "threads=500: more than the" in run("threads=500").ok().err
 
@@ -187,7 +161,7 @@ def test_a_sweep_whose_jobs_all_fail_has_a_table_and_no_page(run, tmp_path):
 
 def test_a_sweep_says_how_far_it_is_and_ends_with_one_table_and_one_page(run, tmp_path):
     outcome = run("-m", "method=grey,dark", "report=page").ok()
-    told = outcome.err.splitlines()
+    told = [line for line in outcome.err.splitlines() if " dB, " in line]
     assert told[0].startswith("grey: 6.05 dB, ")
     assert "; 1 of 2 jobs done, about 0:00:0" in told[0]
     # Grey 0.25 rounds to 64/255: PSNR = -20 log10(191 / 255) = 2.51 dB.
@@ -204,20 +178,13 @@ def test_a_sweep_in_turns_measures_together_what_differs_in_the_method_alone(run
     outcome = run("-m", "method.level=0.5,0.25,7", "seed=0,1", "in_turns=true")
     assert outcome.status == 2
     assert outcome.err.count("failed: grey (level=7") == 2
-    made_of = [json.loads((x / "record.json").read_text())["made_of"] for x in stored(tmp_path)]
+    made_of = [record["made_of"] for record in records(tmp_path)]
     assert len(made_of) == 4
     for seed in (0, 1):
         beside = {tuple(x["beside"]) for x in made_of if x["config"]["seed"] == seed}
         assert [len(keys) for keys in beside] == [2]
     assert run("-m", "method.level=0.5,0.25", "seed=0,1").status == 0
     assert len(stored(tmp_path)) == 4 + 4  # alone they are other runs
-
-
-def test_no_launcher_renders_in_turns(run, tmp_path):
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    refused = run("-m", "seed=0,1", "in_turns=true", "hydra/launcher=joblib").refused()
-    assert "in_turns: expected false with a launcher" in refused
-    assert stored(tmp_path) == []
 
 
 def test_a_folder_named_after_what_is_swept_gets_a_page_of_its_own(run, tmp_path):

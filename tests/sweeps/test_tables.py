@@ -25,11 +25,6 @@ def test_the_experiments_declare_the_six_tables_of_the_paper():
                 assert set(figures) <= {*table.metrics, "frame_ms"}, line.label
 
 
-def test_milliseconds_follow_from_published_frames_per_second():
-    fast = TABLES["table1"].lines["plenoctree"]
-    assert fast.published[FIRST]["frame_ms"] == pytest.approx(1000 / 167.7)
-
-
 @pytest.mark.parametrize("name", TABLES)
 def test_a_second_data_set_has_its_figures_in_a_block_if_the_paper_has_any(name):
     both, has = BOTH[name], name in ("table1", "table2")
