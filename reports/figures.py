@@ -22,6 +22,7 @@ from bench.clock import OTHER
 from bench.results import COLD
 from reports.comparison import written
 from reports.images import Picture
+from reports.lines import Lines
 from reports.runs import Repeated, Run
 from reports.tables import NOT_AVAILABLE
 
@@ -39,9 +40,6 @@ COSTS = {
 
 PLACES = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
 """Where the name of a point may be, across and up: right of it at best."""
-
-RELEASE_STEPS = 300_000  # of stage 2
-STEP_TICKS = (10, 100, 1000, 10_000, RELEASE_STEPS)
 
 MARK = "mark-{}"  # the `gid` of the mark of the line with this number
 
@@ -196,41 +194,40 @@ def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
     _save(figure, path)
 
 
-Curves = Mapping[str, Mapping[float, Repeated]]
-"""Lines by their label: what was measured, by the number of training steps."""
-
-
-def quality_over_training(
-    curves: Mapping[str, Curves], ceiling: Repeated | None, path: Path
-) -> None:
-    """Write a PNG: PSNR over training steps (log scale), a panel for each title in `curves`.
-
-    Bars show the intervals over several seeds. The axis ends with the steps of the release. The
-    PSNR of `ceiling` is a dashed line.
-    """
-    across = min(len(curves), 2)
-    down = -(-len(curves) // across)
-    figure = Figure(figsize=(4 * across, 2.8 * down), layout="constrained")
-    panels = figure.subplots(down, across, squeeze=False, sharey=True).ravel()
-    for axes in panels[len(curves) :]:
-        axes.set_axis_off()
-    for axes, (title, of_panel) in zip(panels, curves.items(), strict=False):
-        _label(axes, "steps of stage 2, log scale")
-        axes.set_title(title, fontsize="medium")
-        for number, (label, points) in enumerate(of_panel.items()):
-            bars = np.nan_to_num([line.half("psnr") for line in points.values()])
-            psnr = [line.mean("psnr") for line in points.values()]
-            style = {**_style(number), "capsize": 3, "label": label, "linestyle": "-"}
-            axes.errorbar(list(points), psnr, yerr=bars if bars.any() else None, **style)
-        if ceiling and (top := ceiling.mean("psnr")) is not None:
-            axes.axhline(top, color="black", linestyle="--", linewidth=1, label="the field")
+def quality_along(lines: Lines, name: str, path: Path) -> None:
+    """Write a PNG: PSNR over the numbers that the setting `name` has, a curve for each choice of
+    the others, with intervals over seeds. Lines that lack the setting are dashed, all across."""
+    others = [of for other, of in lines.settings.items() if other != name and len(set(of)) > 1]
+    curves: dict[str, dict[float, tuple[float, float]]] = {}
+    figure = Figure(figsize=(8, 4.5), layout="constrained")
+    axes = figure.subplots()
+    _label(axes, name)
+    for number, line in enumerate(lines.lines):
+        across, psnr = as_number(lines.settings[name][number]), line.mean("psnr")
+        if psnr is not None and across is not None:
+            label = ", ".join(of[number] for of in others)
+            curves.setdefault(label, {})[across] = psnr, line.half("psnr")
+        elif psnr is not None:
+            axes.axhline(psnr, **{**_style(number), "linestyle": "--"}, label=line.label)
+    for number, (label, curve) in enumerate(curves.items()):
+        means, bars = np.nan_to_num([curve[point] for point in sorted(curve)]).T
+        style = {**_style(number), "capsize": 3, "label": label, "linestyle": "-"}
+        axes.errorbar(sorted(curve), means, yerr=bars if bars.any() else None, **style)
+    low, *_, high = sorted({point for curve in curves.values() for point in curve})
+    if low > 0 and high > 10 * low:
         axes.set_xscale("log")
-        axes.axvline(RELEASE_STEPS, color="grey", linestyle=":", linewidth=1)
-        axes.set_xticks(STEP_TICKS, [f"{steps:,}" for steps in STEP_TICKS])
-        axes.set_xlim(axes.dataLim.x0 / 1.5, 1.5 * RELEASE_STEPS)
-        axes.xaxis.set_minor_locator(NullLocator())
-        axes.legend(frameon=False, fontsize="small", loc="center right")
+        axes.xaxis.set_major_formatter("{x:g}")
+    if len(axes.get_legend_handles_labels()[1]) > 1:
+        axes.legend(frameon=False)
     _save(figure, path)
+
+
+def as_number(value: str) -> float | None:
+    """What a setting says, if that is a number."""
+    try:
+        return float(value)
+    except ValueError:
+        return None
 
 
 def _style(number: int) -> dict[str, Any]:

@@ -36,6 +36,7 @@ def write_page(
     ]
     parts = [
         *_heading(lines, failures),
+        *_ablations(lines),
         *_tradeoffs(lines),
         "## Where the time goes",
         Picture("stages", "Mean ms of a frame by stages", partial(figures.stage_bars, lines.lines)),
@@ -100,6 +101,16 @@ def _tradeoffs(lines: Lines) -> Iterator[Part]:
                 f"One mark a line, bars are intervals; further up is better, further left is"
                 f" {better}. The axis across is logarithmic."
             )
+
+
+def _ablations(lines: Lines) -> Iterator[Part]:
+    """Plots of quality over the settings with several numbers."""
+    for name, values in lines.settings.items():
+        if len({figures.as_number(value) for value in values} - {None}) > 2:
+            shows = f"PSNR in dB over {name}"
+            yield f"## Quality over {name}"
+            yield Picture(f"psnr-{name}", shows, partial(figures.quality_along, lines, name))
+            yield "Bars are intervals over seeds; dashed: what has no such setting."
 
 
 def _pictures(runs: Sequence[Run]) -> Iterator[Part]:

@@ -15,14 +15,10 @@ from reports import figures
 from reports.claims import NOT_MEASURED, Comparison, claim_table, finding_table
 from reports.images import Part, Picture, frame_section, kept_frames
 from reports.paper_tables import (
-    CURVES,
-    SHARES,
     Measured,
     PaperTable,
-    Place,
     comparisons,
     measured_where,
-    point,
     section,
 )
 from reports.publish import publish
@@ -90,46 +86,12 @@ def _plot(
         added = {line.label: (table.name, key) for table, key, line in every if line.added}
         some = [*some, *_chosen(added, tables, measured)]
         drawn = figures.quality_plot(some, plot["metric"])
-    elif "lines" in plot:
+    else:
         some = _first_runs(some, one_scene=plot.get("one_scene", False))
         draw = partial(getattr(figures, plot["draw"]), some)
         drawn = Picture(plot["file"], plot["title"], draw)
-    else:
-        curves = {x.called: found for x in tables if x.curve and (found := _curves(x, measured))}
-        some = [
-            line for of in curves.values() for points in of.values() for line in points.values()
-        ]
-        views = {line.runs[0].views for line in some}
-        fields = _chosen({"": plot["ceiling"]}, tables, measured)
-        ceiling = next((line for line in fields if line.runs[0].views in views), None)
-        draw = partial(figures.quality_over_training, curves, ceiling)
-        drawn = Picture(plot["file"], plot["title"], draw)
     if some:
         yield from (f"## {plot['title']}", drawn, plot["caption"].strip())
-
-
-def _curves(table: PaperTable, measured: Measured) -> figures.Curves:
-    """The measured lines of `table` over the course of their training."""
-    curves = {}
-    for key, line in table.lines.items():
-        of_shares = {x: measured.get(Place(table.name, CURVES, point(key, x))) for x in SHARES}
-        of_shares[1.0] = table.measured(key, measured)
-        marks = {share: mark for share, mark in of_shares.items() if mark and mark.runs}
-        seeds = [{run.facts["seed"] for run in mark.runs} for mark in marks.values()]
-        common = set.intersection(*seeds) if len(seeds) > 1 else set()  # of the same trainings
-        points = {}
-        for share, mark in marks.items() if common else ():
-            runs = [run for run in mark.runs if run.facts["seed"] in common]
-            points[_steps(runs[0]) * share] = replace(mark, runs=runs)
-        if points:
-            curves[line.label] = points
-    return curves
-
-
-def _steps(run: Run) -> Any:
-    """Steps of stage 2 in the training of `run`."""
-    method = run.record["made_of"].get("config", {}).get("method", {})
-    return method.get("steps") or run.record["budget"]["renderer_steps"]
 
 
 def _images(

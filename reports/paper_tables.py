@@ -15,13 +15,9 @@ from reports.tables import ABSENT, BOLD, Table
 
 METHOD = "method"  # the setting of a line that is another method
 
-CURVES = "curves"  # the block of the points of curves over the training
-SHARES = (0.25, 0.5)
-"""The shares of the training that curves show besides the end."""
-
 
 class Place(NamedTuple):
-    """Where a line is: the name of its table, the data set of its block or CURVES, its key."""
+    """Where a line is: the name of its table, the data set of its block, its key."""
 
     table: str
     block: str
@@ -30,11 +26,6 @@ class Place(NamedTuple):
 
 Measured = Mapping[Place, Repeated]
 """What was measured of each line that was planned."""
-
-
-def point(line: str, share: float) -> str:
-    """The key, among CURVES, of a line after this share of its training."""
-    return f"{line} after {share}"
 
 
 @dataclass(frozen=True)
@@ -65,8 +56,7 @@ class PaperTable:
     set. `notes` are what a reader should know before comparing, `claims` what the paper concludes;
     in what a claim says, {KEY} is what this line is called. Distances are those to the line
     `reference`, by default the first. For a line that was not measured stands the one that
-    `instead` has for it. The metrics `scenes` are also shown for every scene of a data set. With
-    `curve`, the lines are also shown as curves over the training.
+    `instead` has for it. The metrics `scenes` are also shown for every scene of a data set.
     """
 
     name: str
@@ -80,7 +70,6 @@ class PaperTable:
     notes: Sequence[str] = ()
     claims: Sequence[Claim] = ()
     scenes: Sequence[str] = ()
-    curve: bool = False
     reference: str = ""
     instead: Mapping[str, str] = field(default_factory=dict)
 

@@ -1,7 +1,7 @@
 """The jobs of tables."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -9,17 +9,13 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from bench.errors import Unavailable, unexpected
-from reports.paper_tables import CURVES, METHOD, SHARES, Line, PaperTable, point
+from reports.paper_tables import METHOD, PaperTable
 from sweeps import experiments
 from sweeps.configured import build
 from sweeps.data_sets import DataSet, data_set_of
 from sweeps.measurement import Job, turns_of
 from sweeps.overrides import changed, choices, composed, setting, swept, target_of, unquoted
 from sweeps.processes import on_gpu
-
-AFTER = "method.after"  # the setting for the share of its training that a method is rendered after
-OF_CURVES = {"protocol.name": "psnr", "protocol.lpips": "[]"}
-"""Curves need only PSNR; LPIPS would take most of a frame's time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +72,8 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
         return composed([*fixed, *groups])
 
     jobs = []
-    for block, key, line, data_set in _wanted(table):
+    lines = ((data_set, *line) for data_set, of in table.blocks.items() for line in of.items())
+    for data_set, key, line in lines:
         if "precision" in line.job and line.job["precision"] not in precisions:
             continue
         own_settings = {name: of for name, of in line.job.items() if name not in asked}
@@ -99,9 +96,8 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
             command = ["steerbench", "run", *fixed, *own, "hydra.mode=RUN"]
             parts = (f"{table.name}: {line.label}", scene, f"seed {config.seed}")
             told = ", ".join(filter(None, parts))
-            timed = experiment.in_turns and block != CURVES
-            turns = turns_of(table.name, config) if timed else ""
-            where = {"table": table.name, "block": block, "line": key, "scene": scene}
+            turns = turns_of(table.name, config) if experiment.in_turns else ""
+            where = {"table": table.name, "block": data_set, "line": key, "scene": scene}
             jobs.append(Planned(config, command, told, turns, label=line.label, **where))
     return jobs
 
@@ -118,18 +114,6 @@ def _engine_here(experiment: DictConfig) -> list[str]:
     except Unavailable:
         return ["precision=fp32"]
     return []
-
-
-def _wanted(table: PaperTable) -> Iterator[tuple[str, str, Line, str]]:
-    """The lines of a table's blocks, then the points of its curves, which are not timed: block,
-    key, line, and the data set of its figures."""
-    for data_set, lines in table.blocks.items():
-        for key, line in lines.items():
-            yield data_set, key, line, data_set
-    for (key, line), share in product(table.lines.items(), SHARES if table.curve else ()):
-        job = {**line.job, AFTER: str(share), **OF_CURVES}
-        mark = replace(line, label=f"{line.label}, after {share}", job=job)
-        yield CURVES, point(key, share), mark, table.data_sets[0]
 
 
 def scenes_of(words: Sequence[str], data: DataSet | None = None) -> list[str]:

@@ -1,15 +1,16 @@
-"""The page about the paper's tables: its pictures, its curves."""
+"""The page about the paper's tables, and the plots of all pages."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
 
 from reports import figures
 from reports.images import Picture
-from reports.paper_page import PAGE, _curves, write_paper_page
-from reports.paper_tables import CURVES, Line, PaperTable, Place, point
+from reports.lines import Lines
+from reports.paper_page import PAGE, write_paper_page
+from reports.paper_tables import Line, PaperTable, Place
 from reports.runs import Repeated, Run
 from sweeps.tables import chosen
 from tests.reports.conftest import TABLES, changed, measured_of, shifted
@@ -22,9 +23,8 @@ def of(run: Run, label: str) -> Repeated:
 def test_every_line_that_is_shown_in_a_figure_is_one_of_the_tables():
     lines = {(table.name, key) for table in TABLES.values() for key in table.lines}
     shown = [entry["lines"] for entry in (*PAGE["plots"], *PAGE["images"]) if "lines" in entry]
-    shown += [{"": plot["ceiling"]} for plot in PAGE["plots"] if "ceiling" in plot]
     named = [(table, str(key)) for x in shown for table, key in x.values()]
-    assert len(named) > len(shown) > 4
+    assert len(named) > len(shown) > 3
     assert {*named} <= lines
 
 
@@ -107,67 +107,32 @@ def test_a_curve_has_a_point_for_every_scored_frame_and_hollow_ones_for_cold(run
     assert list(cold.get_xdata()) == [0]
 
 
+def test_a_setting_with_numbers_has_a_curve_for_each_choice_of_the_others(run, tmp_path, drawn):
+    """Sorted by the number, with intervals; a line without it is dashed."""
+    seeds = [shifted(run, by, seed=seed) for seed, by in enumerate((0.0, 1.0, 2.0))]
+    lines = [*(of(run, "") for _ in range(4)), Repeated("", seeds), of(run, "field")]
+    settings = {
+        "method": [*5 * ["steernerf"], "ngp"],
+        "steps": ["400", "20", "100", "20", "400", ""],
+        "channels": ["6", "6", "6", "8", "8", ""],
+    }
+    figures.quality_along(Lines(lines, settings), "steps", tmp_path / "along.png")
+    (axes,) = drawn[0].axes
+    field, six, eight = axes.lines[0], *(bars.lines[0] for bars in axes.containers)
+    assert [list(curve.get_xdata()) for curve in (six, eight)] == [[20, 100, 400], [20, 400]]
+    assert field.get_linestyle() == "--"
+    assert axes.get_xscale() == "log"
+    (low, high) = axes.collections[-1].get_segments()[1][:, 1]
+    assert high - low == pytest.approx(2 * lines[4].half("psnr"))
+    legend = {text.get_text() for text in axes.get_legend().get_texts()}
+    assert legend == {"field", "steernerf, 6", "steernerf, 8"}
+
+
 def test_a_mark_stands_where_its_line_is_in_quality_and_cost(run, tmp_path, drawn):
     lines = [of(run, "measured"), Repeated("missing", [])]
     figures.quality_against(lines, "size_bytes.total", tmp_path / "marks.png")
     (mark,) = drawn[0].axes[0].lines
     assert mark.get_xydata().tolist() == [[104e-6, run.values["psnr"]]]
-
-
-def on_curves(
-    table: PaperTable, runs: Mapping[str, Mapping[float, Sequence[Run]]]
-) -> dict[Place, Repeated]:
-    """These runs of each line after each share of its training, in the order of the shares."""
-    data_set = table.data_sets[0]
-    return {
-        Place(table.name, data_set, key)
-        if share == 1
-        else Place(table.name, CURVES, point(key, share)): Repeated("", of_share)
-        for key, shares in runs.items()
-        for share, of_share in shares.items()
-    }
-
-
-@pytest.mark.parametrize(("of_method", "of_budget"), [(None, 80), (80, 7)])
-def test_a_curve_has_a_point_for_every_measured_share(of_method, of_budget, run, tmp_path, drawn):
-    table = TABLES["table5"]
-    made_of = {"config": {"method": {"steps": of_method}}}
-    budget = {"renderer_steps": of_budget}
-    trained = replace(run, record={**run.record, "budget": budget, "made_of": made_of})
-    halves = {key: {0.5: [trained], 1.0: [trained]} for key in table.lines}
-    halves["joint"][0.25] = [trained]
-    curves = _curves(table, on_curves(table, halves))
-    assert {label: list(points) for label, points in curves.items()} == {
-        "with joint training": [20, 40, 80],
-        "without joint training": [40, 80],
-    }
-    ceiling = Repeated("field", [changed(run, {"psnr": 99.0})])
-    figures.quality_over_training({"Table 5": curves}, ceiling, tmp_path / "curves.png")
-    (axes,) = drawn[0].axes
-    *lines, field, release = axes.lines
-    assert set(field.get_ydata()) == {99.0}
-    assert set(release.get_xdata()) == {300_000}
-    assert axes.get_xlim()[1] > 300_000
-    assert axes.get_title() == "Table 5"
-    for line, points in zip(lines, curves.values(), strict=True):
-        assert list(line.get_xdata()) == list(points)
-        assert set(line.get_ydata()) == {run.values["psnr"]}
-
-
-def test_all_points_of_a_curve_are_of_the_same_seeds(run):
-    table, seeds = TABLES["table5"], {0.25: (0, 1), 0.5: (0, 2), 1.0: (0, 1, 2)}
-    runs = {share: [changed(run, {}, seed=x) for x in some] for share, some in seeds.items()}
-    (points,) = _curves(table, on_curves(table, {"joint": runs})).values()
-    assert [[r.facts["seed"] for r in x.runs] for x in points.values()] == 3 * [[0]]
-
-
-def test_several_seeds_have_bars_on_a_curve_and_one_has_none(run, tmp_path, drawn):
-    seeds = [shifted(run, by, seed=seed) for seed, by in enumerate((0.0, 1.0, 2.0))]
-    points = {10.0: Repeated("a", seeds), 20.0: Repeated("b", [run])}
-    figures.quality_over_training({"Table 9": {"L = 2": points}}, None, tmp_path / "curves.png")
-    (axes,) = drawn[0].axes
-    low, high = axes.collections[0].get_segments()[0][:, 1]
-    assert high - low == pytest.approx(2 * points[10.0].half("psnr"))
 
 
 def test_every_mark_has_its_name_beside_it_and_none_covers_another(run, tmp_path, drawn):

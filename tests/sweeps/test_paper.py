@@ -74,7 +74,7 @@ def labels(page: Path) -> list[str]:
 def test_a_job_that_fails_stands_in_its_line_and_the_others_run(steerbench, measured, outputs):
     outcome = steerbench("table", "table3", "seed=0", outputs)
     assert outcome.status == 1
-    assert len(measured) == 4 * (1 + 2)  # lines; twice each for their curves
+    assert len(measured) == 4
     assert "failed: table3: L = 3, seed 0: no room" in outcome.err
     assert "about 0:00:0" in outcome.err
     page = Path(re.search(r"report: (.*)", outcome.err)[1])

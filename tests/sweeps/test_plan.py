@@ -1,7 +1,6 @@
 """The jobs of the paper's tables, and the scenes of a data set that they are means over."""
 
 import json
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -12,7 +11,6 @@ from PIL import Image
 
 from bench.errors import SteerbenchError
 from methods.engines import openvino_engine
-from reports.paper_tables import CURVES, SHARES, point
 from sweeps.commands.paper import data_set
 from sweeps.data_sets import DATA_SETS, data_sets, find
 from sweeps.measurement import described
@@ -20,8 +18,7 @@ from sweeps.overrides import composed
 from sweeps.plan import Planned, plan, scenes_of
 from sweeps.tables import chosen
 
-CURVED = {table.name: table for table in chosen()}
-TABLES = {name: replace(table, curve=False) for name, table in CURVED.items()}
+TABLES = {table.name: table for table in chosen()}
 """Their lines alone."""
 
 POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]
@@ -39,23 +36,6 @@ def test_every_line_that_can_be_measured_has_its_job(name):
     lines = TABLES[name].lines
     assert [(job.line, job.label) for job in jobs] == [(key, x.label) for key, x in lines.items()]
     assert len({job.key for job in jobs}) == len(lines)
-
-
-def test_a_curve_has_the_lines_of_the_papers_method_at_several_shares_of_one_training():
-    table = CURVED["table5"]
-    lines, jobs = (plan(one, ["budget=demo"]) for one in (TABLES["table5"], table))
-    marks = [job for job in jobs if job.block == CURVES]
-    assert [job.key for job in jobs if job not in marks] == [job.key for job in lines]
-    assert len(marks) == 2 * 2 * 3  # lines, shares, seeds
-    points = {point(key, share): (key, share) for key in table.lines for share in SHARES}
-    for job in marks:
-        key, share = points[job.line]
-        (whole,) = (x for x in lines if (x.line, x.config.seed) == (key, job.config.seed))
-        one, other = described(job.config), described(whole.config)
-        assert (one["method"].pop("after"), other["method"].pop("after")) == (share, 1)
-        scored = one.pop("protocol"), other.pop("protocol")
-        assert [protocol["lpips"] for protocol in scored] == [[], ["alex", "vgg"]]
-        assert one == other
 
 
 @pytest.mark.parametrize(
@@ -88,12 +68,6 @@ def test_the_lines_of_a_table_of_times_are_measured_in_turns(name):
     timed = {"fps", "frame_ms"} & {*TABLES[name].metrics}
     assert {job.turns == "" for job in jobs} == {not timed}
     assert len({job.turns for job in jobs}) == 1
-
-
-def test_the_points_of_curves_are_not_measured_in_turns():
-    jobs = plan(CURVED["table3"], ["seed=0"])
-    assert {job.turns == "" for job in jobs if job.block == CURVES} == {True}
-    assert {job.turns == "" for job in jobs if job.block != CURVES} == {False}
 
 
 def test_turns_are_of_one_seed_and_one_scene():
@@ -197,7 +171,7 @@ def test_a_scene_is_compared_with_the_figures_of_its_data_set(monkeypatch):
     assert {scene for scene, _ in second} == {"wires"}
     assert {line for _, line in second} == set(tables["table1"].beside)
     assert len(second) == 4
-    assert {job.scene for job in plan(replace(tables["table5"], curve=False), words)} == {"totem"}
+    assert {job.scene for job in plan(tables["table5"], words)} == {"totem"}
 
 
 @pytest.mark.parametrize(
