@@ -19,7 +19,7 @@ from bench.errors import not_there, some, unexpected
 from bench.metrics import Lpips, check_size
 from bench.protocol import EvaluationProtocol
 from bench.results import STEADY, Measurement
-from bench.rows import phase_rows, row_table, score_rows, single
+from bench.rows import phase_rows, row_table, score_rows
 from bench.scenes.images import contents, decode_bytes
 from bench.scenes.lookup import natural
 from bench.scoring import PICTURES, Scoring
@@ -203,7 +203,6 @@ def score(
         table["frame_ms"] = times
     of_frames = phase_rows(table) if times else score_rows(table, scoring.names)
     summary = [{**row, "phase": STEADY} for row in of_frames]
-    summary += [single(name, value) for name, value in scoring.whole().items()]
     rows = row_table(summary, resolution=resolution(sizes), protocol=protocol.name, **facts)
     record = {
         "protocol": asdict(protocol),

@@ -39,10 +39,10 @@ COLUMNS = [
 """`value` is a mean over `n` frames with its 95 % interval [lo, hi], or a single figure (n = 1,
 no interval). NaN with n = 0 means not available. `phase` says which frames: "steady", "cold" (with
 fewer preceding frames than the method looks back on), or "all" for a figure of the whole run.
-`device` is "reported" where others measured the times, "imported" where all figures are theirs."""
+`device` is "reported" where others measured the times."""
 
 STEADY, COLD, WHOLE = "steady", "cold", "all"  # the values of the column `phase`
-REPORTED, IMPORTED = "reported", "imported"  # values of the column `device`: not measured here
+REPORTED = "reported"  # as `device`: others measured the times
 
 FRAME = ("frame", "name", "phase")  # the first columns of frames.csv
 FIGURES = {"value": "float64", "lo": "float64", "hi": "float64", "n": "int64", "seed": "int64"}
