@@ -3,14 +3,11 @@
 import math
 from dataclasses import replace
 from itertools import chain, pairwise
-from pathlib import Path
 
-import hydra
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from omegaconf import OmegaConf
 
 from bench.cameras import scale_camera
 from bench.paths import write_path
@@ -31,8 +28,6 @@ from bench.trajectories import (
 from bench.types import Camera, Scene, Split, SteerbenchError
 from tests.bench.test_motion import turn_deg
 from tests.conftest import camera_on_orbit
-
-CONFIGS = Path(__file__).parents[2] / "sweeps" / "configs" / "trajectory"
 
 
 @given(st.integers(1, 500), st.integers(0, 500))
@@ -191,17 +186,6 @@ def test_a_loop_goes_there_and_back_until_its_frames_are_used_up():
     scene = orbit_of([0, 1, 2])
     assert [step.truth for step in loop(scene, frames=5, limit=2).steps] == [0, 1, 0, 1, 0]
     assert [step.truth for step in loop(scene, frames=3, limit=1).steps] == [0, 0, 0]
-
-
-@pytest.mark.parametrize(
-    ("choice", "made"), [("test", from_split), ("orbit", orbit), ("jump", jump), ("loop", loop)]
-)
-def test_the_configurations_are_the_defaults(choice, made):
-    scene = orbit_of(list(range(15)))
-    config = OmegaConf.create(
-        {"trajectory": OmegaConf.load(CONFIGS / f"{choice}.yaml"), "budget": {"frames": 12}}
-    )
-    assert hydra.utils.instantiate(config.trajectory, scene) == made(scene, limit=12)
 
 
 def test_each_camera_is_approached_once_after_a_cut_from_a_motion_of_its_own(tiny_scene):

@@ -79,20 +79,6 @@ def test_what_was_hidden_or_is_empty_or_out_of_the_picture_does_not_count():
     assert math.isnan(warping_error(now, view, *wall(24)))
 
 
-def test_the_surface_of_an_embedded_scene_is_exact(tmp_path, quiet_log):
-    """`void` is a ball of radius 0.06 at (0.35, -0.2, 0.15) in its model's units."""
-    sizes = {"width": 60, "train": 2, "test": 9, "bounds": [[-1.2] * 3, [1.2] * 3]}
-    ball = embedded.load("void", **sizes, root=tmp_path, log=quiet_log)
-    camera = ball.splits["test"].cameras[0]
-    depth = ball.surface(camera).flatten()
-    rays, seen = cast(camera), torch.isfinite(depth)
-    assert seen.sum() > 4
-    points = (rays.origins + depth[:, None] * rays.directions)[seen]
-    centre = (torch.tensor([0.35, -0.2, 0.15]) - ball.origin) / ball.unit_length
-    radii = (points - centre).norm(dim=1) * ball.unit_length
-    torch.testing.assert_close(radii, torch.full_like(radii, 0.06), atol=2e-5, rtol=0)
-
-
 def test_exact_flow_follows_the_true_pictures_of_a_path(tmp_path, quiet_log):
     scene = embedded.load("totem", width=160, train=2, test=8, root=tmp_path, log=quiet_log)
     test = scene.splits["test"]
