@@ -46,6 +46,8 @@ def test_each_training_picture_is_either_learned_from_or_held_out(tiny_scene, co
         assert pairs[name][0] is camera
         assert pairs[name][1] is image
     assert found.splits["test"] is scene.splits["test"]
+    with pytest.raises(SteerbenchError, match=r"split=validation: expected at least 8 .* got 7 of"):
+        hold_out(with_training(tiny_scene, 7), "validation", 8)
 
 
 def test_the_digest_says_that_and_what_is_held_out(tiny_scene):
@@ -55,11 +57,6 @@ def test_the_digest_says_that_and_what_is_held_out(tiny_scene):
     assert len({scene.digest, *digests}) == 3
     other = replace(scene, digest="of other pictures")
     assert hold_out(other, "validation", 8).digest != digests[0]
-
-
-def test_too_few_training_pictures_are_refused(tiny_scene):
-    with pytest.raises(SteerbenchError, match=r"split=validation: expected at least 8 .* got 7 of"):
-        hold_out(with_training(tiny_scene, 7), "validation", 8)
 
 
 SIZE, RED = 32, plain((1.0, 0.0, 0.0))
