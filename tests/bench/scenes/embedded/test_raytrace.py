@@ -14,7 +14,6 @@ from bench.scenes.embedded.raytrace import (
     Media,
     Part,
     Solids,
-    Tiles,
     render,
     sample_offsets,
 )
@@ -141,12 +140,6 @@ def test_culling_of_shadow_casters_changes_nothing(model):
     # Rounding can turn a ray that grazes an edge.
     assert (solids.shadowed(owners, points) != dark).sum() <= 1
     assert 100 < dark.sum() < 5900
-
-
-def test_points_in_one_place_share_a_tile():
-    tiles = Tiles(torch.full((7, 3), 0.25))
-    assert tiles.runs(torch.zeros(3), torch.ones(3)) == [slice(0, 7)]
-    assert tiles.runs(torch.zeros(3), torch.tensor((1.0, 1.0, 0.2))) == []
 
 
 def test_highlights_move_with_the_viewer():
