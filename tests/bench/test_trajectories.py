@@ -6,8 +6,6 @@ from itertools import chain, pairwise
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from bench.cameras import scale_camera
 from bench.paths import write_path
@@ -22,24 +20,11 @@ from bench.trajectories import (
     orbit,
     smooth,
     spline,
-    spread,
     static,
 )
 from bench.types import Camera, Scene, Split, SteerbenchError
 from tests.bench.test_motion import turn_deg
 from tests.conftest import camera_on_orbit
-
-
-@given(st.integers(1, 500), st.integers(0, 500))
-def test_spread_is_even_increasing_and_holds_both_ends(total, count):
-    kept = spread(total, count)
-    assert len(kept) == min(total, count)
-    assert kept[:1] == [0] * bool(count)
-    if len(kept) > 1:
-        assert kept[-1] == total - 1
-        gaps = [after - before for before, after in pairwise(kept)]
-        assert min(gaps) >= 1
-        assert max(gaps) - min(gaps) <= 1
 
 
 def test_a_whole_split_is_rendered_in_its_order_with_its_ground_truth(tiny_scene):

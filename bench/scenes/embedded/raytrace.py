@@ -89,11 +89,9 @@ def render(model: SceneModel, camera: Camera, samples: int) -> Frame:
         ]
         if not spans:
             continue
-        first, last = min(span[1] for span in spans), max(span[2] for span in spans)
-        band = Band(camera.c2w[:, 3], camera.c2w[:, :3], x[None, first:last], y[top:bottom, None])
-        traced = model.trace(band, [(part, a - first, b - first) for part, a, b in spans])
-        for picture, seen in zip((rgb, alpha, depth), traced, strict=True):
-            picture[top:bottom, first:last] = seen.mean(2)
+        band = Band(camera.c2w[:, 3], camera.c2w[:, :3], x[None], y[top:bottom, None])
+        for picture, seen in zip((rgb, alpha, depth), model.trace(band, spans), strict=True):
+            picture[top:bottom] = seen.mean(2)
     empty = alpha < EMPTY_ALPHA
     depth = (depth / alpha.clamp(min=EMPTY_ALPHA)).masked_fill(empty, math.inf)
     return Frame(rgb, depth, alpha)
@@ -244,10 +242,8 @@ def rotation(x: float, y: float, z: float) -> Tensor:
     turns = torch.eye(3, dtype=torch.float64)
     for axis, degrees in enumerate((x, y, z)):
         c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-        turn = torch.eye(3, dtype=torch.float64)
-        a, b = (axis + 1) % 3, (axis + 2) % 3
-        turn[a, a], turn[a, b], turn[b, a], turn[b, b] = c, -s, s, c
-        turns = turn @ turns
+        about_x = torch.tensor([[1, 0, 0], [0, c, -s], [0, s, c]], dtype=torch.float64)
+        turns = about_x.roll((axis, axis), (0, 1)) @ turns
     return turns.float()
 
 
