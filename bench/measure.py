@@ -201,7 +201,7 @@ def _measurement(
     whole |= {f"size_bytes.{part}": size for part, size in sizes.items()}
     whole |= {"size_bytes.total": sum(sizes.values())} if sizes else {}
     whole |= {"peak_bytes": peak_bytes, "train_s": method.train_s}
-    whole |= {"train_peak_bytes": getattr(method, "train_peak_bytes", math.nan), **scoring.whole()}
+    whole |= {"train_peak_bytes": getattr(method, "train_peak_bytes", math.nan)}
     summary = [
         *(row | {"phase": phase} for phase, of in of_phases if len(of) for row in phase_rows(of)),
         *(single(name, value) for name, value in whole.items()),

@@ -17,7 +17,7 @@ from torch import Tensor
 from bench.types import Log, SteerbenchError, Unavailable, check_shape
 from bench.weights import load_features
 
-SMALLEST_SIDE = {"psnr": 1, "ssim": 11, "lpips_alex": 31, "lpips_vgg": 16, "flip": 1}
+SMALLEST_SIDE = {"psnr": 1, "ssim": 11, "lpips_alex": 31, "lpips_vgg": 16}
 SMALLEST_SIDE |= {f"cc_{metric}": side for metric, side in SMALLEST_SIDE.items()}
 """Smallest side in pixels: SSIM needs room for its window, LPIPS for one feature at its deepest."""
 

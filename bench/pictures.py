@@ -18,8 +18,8 @@ from torch import Tensor
 from bench.errors import not_there, some, unexpected
 from bench.metrics import Lpips, check_size
 from bench.protocol import EvaluationProtocol
-from bench.results import STEADY, Measurement
-from bench.rows import phase_rows, row_table, score_rows, single
+from bench.results import STEADY, Measurement, read_table
+from bench.rows import phase_rows, row_table, score_rows
 from bench.scenes.images import contents, decode_bytes
 from bench.scenes.lookup import natural
 from bench.scoring import PICTURES, Scoring
@@ -131,13 +131,7 @@ def reported_times(file: Path, pairs: Sequence[Pair]) -> list[float]:
     ending, and others are ignored; without, there is one for each picture, in their order. Raises
     SteerbenchError if the file cannot be read, or a time is missing or not above 0.
     """
-    if not file.is_file():
-        raise not_there(file)
-    try:
-        table = pd.read_csv(file, dtype={"name": "str"})
-    except (OSError, ValueError) as error:
-        got = " ".join(str(error).split())
-        raise unexpected(file, "a readable CSV file", got) from error
+    table = read_table(file)
     if "frame_ms" not in table:
         raise unexpected(file, "a column frame_ms", ", ".join(map(str, table)) or "none")
     if "name" in table:
@@ -203,7 +197,6 @@ def score(
         table["frame_ms"] = times
     of_frames = phase_rows(table) if times else score_rows(table, scoring.names)
     summary = [{**row, "phase": STEADY} for row in of_frames]
-    summary += [single(name, value) for name, value in scoring.whole().items()]
     rows = row_table(summary, resolution=resolution(sizes), protocol=protocol.name, **facts)
     record = {
         "protocol": asdict(protocol),

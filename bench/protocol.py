@@ -21,7 +21,7 @@ CHOICES = {"background": tuple(BACKGROUNDS), "flicker": ("split", "exact")}
 CHOICES |= {"mask": ("scene", "none"), "colour_correction": ("none", "affine", "quadratic")}
 """The values of the protocol's options."""
 
-COLUMNS = ("flip", *video_metrics.NEEDS)  # further metrics that a protocol can name
+COLUMNS = tuple(video_metrics.NEEDS)  # further metrics that a protocol can name
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,6 @@ class EvaluationProtocol:
     compared: bool  # with the first in turns: `psnr_to_first`, `worst_to_first`
     waits: bool  # whether to note where the host waits for a GPU
     columns: tuple[str, ...]  # further metrics, of `COLUMNS`
-    fps: float  # frames a second at which the path is seen, for the JOD
-    display: str  # on which it is seen, a name of `cvvdp`
 
     def __post_init__(self) -> None:
         for option in ("lpips", "columns"):  # a list, when read from YAML
@@ -62,15 +60,13 @@ class EvaluationProtocol:
                 raise unexpected(f"protocol.{option}", f"{least} or more", got)
         if not set(self.columns) <= set(COLUMNS):
             raise unexpected("protocol.columns", f"some of {', '.join(COLUMNS)}", [*self.columns])
-        if not 0 < self.fps < math.inf:
-            raise unexpected("protocol.fps", "more than 0", self.fps)
 
     @property
     def metric_names(self) -> tuple[str, ...]:
         """Names of the metrics that `score` returns, in the order of the table."""
         plain = ("psnr", "ssim", *(f"lpips_{net}" for net in self.lpips))
         corrected = [f"cc_{name}" for name in plain if self.colour_correction != "none"]
-        return (*plain, *corrected, *(["flip"] if "flip" in self.columns else []))
+        return (*plain, *corrected)
 
     def check(self, scene: Scene, trajectory: Trajectory) -> None:
         """Raise SteerbenchError before any training if the frames could not be scored afterwards:
@@ -107,14 +103,7 @@ class EvaluationProtocol:
     def load_lpips(
         self, weights_dir: Path | None, log: Log
     ) -> tuple[dict[str, metrics.Lpips], dict[str, str]]:
-        """LPIPS by backbone; by metric, why it is missing, which is also logged.
-
-        Raises Unavailable if a further column needs a package that is not installed.
-        """
-        if "flip" in self.columns:
-            video_metrics.flip_package()
-        if "jod" in self.columns:
-            video_metrics.color_video_vdp(self.display)
+        """LPIPS by backbone; by metric, why it is missing, which is also logged."""
         loaded, missing = {}, {}
         for net in self.lpips:
             try:
@@ -152,6 +141,4 @@ class EvaluationProtocol:
             for net in self.lpips:
                 score = lpips[net](image, truth) if net in lpips else math.nan
                 scores[f"{kind}lpips_{net}"] = score
-        if "flip" in self.columns:
-            scores["flip"] = video_metrics.flip(self.rounded(rgb), truth)
         return scores

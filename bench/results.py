@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from functools import reduce
 from glob import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -39,10 +40,10 @@ COLUMNS = [
 """`value` is a mean over `n` frames with its 95 % interval [lo, hi], or a single figure (n = 1,
 no interval). NaN with n = 0 means not available. `phase` says which frames: "steady", "cold" (with
 fewer preceding frames than the method looks back on), or "all" for a figure of the whole run.
-`device` is "reported" where others measured the times, "imported" where all figures are theirs."""
+`device` is "reported" where others measured the times."""
 
 STEADY, COLD, WHOLE = "steady", "cold", "all"  # the values of the column `phase`
-REPORTED, IMPORTED = "reported", "imported"  # values of the column `device`: not measured here
+REPORTED = "reported"  # as `device`: others measured the times
 
 FRAME = ("frame", "name", "phase")  # the first columns of frames.csv
 FIGURES = {"value": "float64", "lo": "float64", "hi": "float64", "n": "int64", "seed": "int64"}
@@ -184,12 +185,7 @@ class Store:
     def frames(self, run: str, metrics: Iterable[str] = ()) -> pd.DataFrame:
         """The frames of a run, which must have the columns `FRAME`, and `metrics`."""
         path = self._existing(run) / "frames.csv"
-        if not path.is_file():
-            raise not_there(path)
-        try:
-            table = pd.read_csv(path, dtype={"name": "str"}, keep_default_na=False, na_values=[""])
-        except (OSError, ValueError) as error:
-            raise unexpected(path, "a table of frames", " ".join(str(error).split())) from error
+        table = read_table(path, keep_default_na=False, na_values=[""])
         for name in (*FRAME, *metrics):
             if name not in table:
                 raise unexpected(path, f"a column {name}", nearest(name, map(str, table)))
@@ -219,6 +215,17 @@ class Store:
         if folder := self.find(run):
             return folder
         raise SteerbenchError(f"no run {run!r} in {self.folder}: see `steerbench results`")
+
+
+def read_table(path: Path, **how: Any) -> pd.DataFrame:
+    """The table in a CSV file, whose column `name` is text; SteerbenchError if it cannot be read.
+    `how` is for `pandas.read_csv`."""
+    if not path.is_file():
+        raise not_there(path)
+    try:
+        return pd.read_csv(path, dtype={"name": "str"}, **how)
+    except (OSError, ValueError) as error:
+        raise unexpected(path, "a table", " ".join(str(error).split())) from error
 
 
 def existing_store(root: Path) -> Store:

@@ -1,6 +1,5 @@
 """Scores of rendered frames by a protocol, one after the other, with pictures of some of them."""
 
-import math
 from collections import deque
 from collections.abc import Callable, Collection, Mapping
 from typing import NamedTuple
@@ -44,7 +43,7 @@ class Scoring:
     the true pictures have warping errors, `warp_1_true` and `warp_7_true`. Without, flow comes from
     the depth of the frames, and warping errors are called `warp_1_own` and `warp_7_own`. `images`
     holds 8-bit pictures by file name: ground truth, rendering and error map of the `shown` frames,
-    once they are scored. For the JOD all frames are kept.
+    once they are scored.
     """
 
     def __init__(
@@ -69,7 +68,6 @@ class Scoring:
         # Of the figures of a frame, in their order.
         self.names = (*protocol.metric_names, "flicker", *self._of_path)
         self._last: deque[Shot] = deque(maxlen=1 + max([1, *self._warps.values()]))
-        self._films: list[list[tuple[np.ndarray, np.ndarray]]] = []  # consecutive, with a truth
 
     def score(
         self,
@@ -116,15 +114,9 @@ class Scoring:
             self._last.clear()
         before = self._last[-1] if self._last else None
         self._last.append(shot)
-        if shot.truth is not None:
-            if before is None or before.truth is None:
-                self._films.append([])
-            else:
-                pictures = shot.image, shot.truth, before.image, before.truth
-                figures |= self._step(*(picture.to(device) for picture in pictures))
-            if "jod" in self._protocol.columns:
-                shown = metrics.as_bytes(shot.image.clamp(0, 1))
-                self._films[-1].append((shown, metrics.as_bytes(shot.truth)))
+        if shot.truth is not None and before is not None and before.truth is not None:
+            pictures = shot.image, shot.truth, before.image, before.truth
+            figures |= self._step(*(picture.to(device) for picture in pictures))
         for name, offset in self._warps.items():
             then = self._last[-1 - offset] if len(self._last) > offset else None
             if then is not None and then.view is not None and shot.view is not None:
@@ -150,8 +142,7 @@ class Scoring:
 
     def missing(self, found: Collection[str]) -> dict[str, str]:
         """Why wanted metrics are not among those `found`, but for networks that are not there."""
-        names = [*self._of_path, *(["jod"] if "jod" in self._protocol.columns else [])]
-        needs = {name: video_metrics.NEEDS[name.split("_")[0]] for name in names}
+        needs = {name: video_metrics.NEEDS[name.split("_")[0]] for name in self._of_path}
         why = {name: f"needs {what}" for name, what in needs.items() if name not in found}
         every = self._protocol.lpips_every
         if self._scored in range(1, every):
@@ -159,15 +150,6 @@ class Scoring:
             few = f"protocol.lpips_every is {every}, and {have}"
             why |= {f"lpips_{net}": few for net in self._lpips}
         return why
-
-    def whole(self) -> dict[str, float]:
-        """The JOD of all frames: the mean over its films, weighted by their frames."""
-        if "jod" not in self._protocol.columns:
-            return {}
-        films, how = [film for film in self._films if len(film) > 1], self._protocol
-        found = [video_metrics.jod(film, how.fps, how.display) for film in films]
-        weights = [len(film) for film in films]
-        return {"jod": float(np.average(found, weights=weights)) if films else math.nan}
 
 
 def _pictures(index: int, rgb: Tensor, truth: Tensor) -> dict[str, np.ndarray]:

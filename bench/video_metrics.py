@@ -1,54 +1,28 @@
-"""Further metrics: FLIP of a picture; of a path, what its frames look like one after the other.
+"""Further metrics of a path: what its frames look like one after the other.
 
-Pictures are float [H, W, 3] in [0, 1], as they are scored. Those of a path need more: true pictures
-of consecutive frames, or where each pixel was some frames earlier. No method imports this module,
-so that a package installed for a metric leaves the keys of trainings alone.
+Pictures are float [H, W, 3] in [0, 1], as they are scored.
 """
 
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from bench.cameras import pixel_grid, project, unproject
-from bench.errors import optional, unexpected
-from bench.metrics import check_pair, declare_torchvision
 from bench.types import Camera, check_shape
 
 NEEDS = {
     "tpsnr": "the true pictures of two consecutive frames",
     "tlpips": "the true pictures of two consecutive frames, and LPIPS",
     "warp": "a frame as many frames earlier, without a cut between, and the depth of both",
-    "jod": "the true pictures of consecutive frames",
 }
 """The further metrics of a path, and what a figure of each needs."""
-
-LEFT_OUT = ", or take it out of protocol.columns"
 
 OFFSETS = (1, 7)  # frames between the two of a warping error: what blinks, and what drifts
 SAME_SURFACE = 0.01
 """Two z-depths are of one surface if they differ by no more than this share. Neighbouring pixels of
 a surface seen at 70 degrees do not, at 200 pixels across a field of view of 40 degrees."""
-
-
-def flip(image: Tensor, reference: Tensor) -> float:
-    """FLIP (Andersson et al. 2020), mean over the pixels: 0 for equal pictures, at most 1.
-
-    Seen as the package `flip-evaluator` assumes, at 67 pixels per degree: a 4K display 0.7 m wide,
-    0.7 m away. Raises Unavailable without that package.
-    """
-    check_pair(image, reference)
-    pair = (picture.float().cpu().numpy() for picture in (reference, image))
-    _, mean, _ = flip_package().evaluate(*pair, "LDR", applyMagma=False)
-    return float(mean)
-
-
-def flip_package() -> Any:
-    """`flip_evaluator`; raises Unavailable without it."""
-    return optional("flip_evaluator", "flip", "flip", LEFT_OUT)
 
 
 class DepthView(NamedTuple):
@@ -87,29 +61,3 @@ def warping_error(
     warped = torch.nn.functional.grid_sample(source, grid, align_corners=False)[0, :, 0].T
     kept = image.reshape(-1, 3)[seen][inside][same]
     return (kept.double() - warped.double()).square().mean().item()
-
-
-def jod(film: Sequence[tuple[np.ndarray, np.ndarray]], fps: float, display: str) -> float:
-    """JOD of ColorVideoVDP (Mantiuk et al. 2024): 10 if nobody sees a difference.
-
-    `film` has each of consecutive frames and its truth, uint8 [H, W, 3]. Raises as
-    `color_video_vdp` does.
-    """
-    metric, videos = color_video_vdp(display), map(np.stack, zip(*film, strict=True))
-    with torch.inference_mode():
-        found, _ = metric.predict(*videos, dim_order="FHWC", frames_per_second=fps)
-    return float(found)
-
-
-def color_video_vdp(display: str) -> Any:
-    """The metric of the package `cvvdp` for a `display` that it knows, "standard_4k" for example.
-
-    Raises Unavailable without that package, SteerbenchError for an unknown display.
-    """
-    declare_torchvision()
-    pycvvdp = optional("pycvvdp", "cvvdp", "jod", LEFT_OUT)
-    try:
-        return pycvvdp.cvvdp(display_name=display, quiet=True)
-    except pycvvdp.vq_exception as error:
-        known = "a display that `cvvdp --display ?` lists"
-        raise unexpected("protocol.display", known, repr(display)) from error

@@ -12,7 +12,7 @@ from functools import partial
 
 import pandas as pd
 
-from bench.results import COLD, STEADY, WHOLE
+from bench.results import COLD, STEADY
 
 NOT_AVAILABLE = "n/a"
 ABSENT = "–"  # of a figure that the paper does not give or that cannot be measured here
@@ -95,14 +95,12 @@ QUALITY = {
         "cc_psnr": ("PSNR of corrected colours, dB", "↑", 2),
         "cc_ssim": ("SSIM of corrected colours", "↑", 4),
         **{f"cc_lpips_{net}": (f"LPIPS {net} of corrected colours", "↓", 4) for net in NETS},
-        "flip": ("FLIP", "↓", 4),
         "flicker": ("flicker", "↓", 4),
         "tpsnr": ("tPSNR, dB", "↑", 2),
         **{f"tlpips_{net}": (f"tLPIPS {net}", "↓", 4) for net in NETS},
         **{f"warp_{k}": (f"warping error, {k} apart", "↓", 5) for k in (1, 7)},
         **{f"warp_{k}_true": (f"warping error of the truth, {k} apart", "", 5) for k in (1, 7)},
         **{f"warp_{k}_own": (f"warping error, {k} apart, own depth", "↓", 5) for k in (1, 7)},
-        "jod": ("JOD", "↑", 3),
     }.items()
 }
 """The quality metrics."""
@@ -130,15 +128,10 @@ def phases(rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
 def run_tables(rows: pd.DataFrame) -> list[Table]:
     """The tables of one run: quality, time by stage and work for each phase; memory.
 
-    For pictures that were only scored, there is only quality. The JOD, of a whole path, is shown
-    with the first phase.
+    For pictures that were only scored, there is only quality.
     """
-    whole = rows[rows["phase"] == WHOLE]
-    tables = [
-        table(of_phase if number else pd.concat([of_phase, whole]), suffix)
-        for number, (suffix, of_phase) in enumerate(phases(rows))
-        for table in (_quality, _time, _work)
-    ]
+    by_phase = phases(rows)
+    tables = [t(of, suffix) for suffix, of in by_phase for t in (_quality, _time, _work)]
     return [table for table in (*tables, _memory(rows)) if table.lines]
 
 

@@ -5,8 +5,6 @@ import math
 import os
 import re
 import signal
-import subprocess
-import sys
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
@@ -29,7 +27,6 @@ from bench import neighbours
 from bench.console import ConsoleLog
 from bench.measure import Task, measure, train
 from bench.metrics import declare_torchvision
-from bench.nerfbaselines import VERSION
 from bench.results import Store
 from bench.trajectories import from_split
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene, Split, composite
@@ -249,22 +246,6 @@ def lpips_weights(
             names = {name: re.sub(r"^slice\d+", "features", name) for name in state}
             torch.save({names[name]: state[name] for name in state}, folder / file)
     return folder
-
-
-@pytest.fixture(scope="session")
-def nerfbaselines(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A Python that has NerfBaselines: $NERFBASELINES_PYTHON, or that of a new environment, because
-    it needs an older numpy than ours; skips where pip cannot install it."""
-    if given := os.environ.get("NERFBASELINES_PYTHON"):
-        return given
-    folder = tmp_path_factory.mktemp("nerfbaselines")
-    subprocess.run([sys.executable, "-m", "venv", folder], check=True)
-    python = str(folder / "bin/python")
-    install = [python, "-m", "pip", "install", "--quiet", f"nerfbaselines=={VERSION}"]
-    done = subprocess.run(install, capture_output=True, text=True, check=False)
-    if done.returncode:
-        pytest.skip(f"pip cannot install NerfBaselines here: {done.stderr.strip()[-200:]}")
-    return python
 
 
 @pytest.fixture

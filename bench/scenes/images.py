@@ -21,7 +21,6 @@ from kornia.geometry.camera import distort_points_kannala_brandt
 from kornia.geometry.transform import remap
 from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
-from torch.nn.functional import pad
 
 from bench.cameras import crop_camera, pixel_grid, scale_camera
 from bench.errors import not_there, unexpected
@@ -329,24 +328,14 @@ def seen_rectangle(source: Tensor) -> tuple[int, int, int, int]:
     """(left, top, right, bottom) of a rectangle that was seen: drops the worst side in turn."""
     height, width = source.shape[:2]
     limit = source.new_tensor((width, height)) - 0.5  # last pixel centre: bilinear needs no border
-    unseen = ~((source >= 0.5) & (source <= limit)).all(-1)  # True for NaN, too
-    # A summed-area table: every side of every rectangle costs the same.
-    table = pad(unseen.int(), (1, 0, 1, 0)).cumsum(0).cumsum(1).numpy()
-
-    def share(left: int, top: int, right: int, bottom: int) -> float:
-        count = table[bottom, right] - table[top, right] - table[bottom, left] + table[top, left]
-        return count / ((right - left) * (bottom - top))
-
+    unseen = ~((source >= 0.5) & (source <= limit)).all(-1).numpy()  # True for NaN, too
     left, top, right, bottom = 0, 0, width, height
     while left < right and top < bottom:
-        if not share(left, top, right, bottom):
+        inside = unseen[top:bottom, left:right]
+        if not inside.any():
             return left, top, right, bottom
-        shares = (
-            share(left, top, left + 1, bottom),
-            share(left, top, right, top + 1),
-            share(right - 1, top, right, bottom),
-            share(left, bottom - 1, right, bottom),
-        )
+        sides = inside[:, 0], inside[0], inside[:, -1], inside[-1]
+        shares = [side.mean() for side in sides]
         worst = shares.index(max(shares))
         left, top = left + (worst == 0), top + (worst == 1)
         right, bottom = right - (worst == 2), bottom - (worst == 3)

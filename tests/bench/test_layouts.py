@@ -53,6 +53,8 @@ def test_the_layout_of_nerfbaselines_comes_back_with_its_path(scene, path, tmp_p
     images = [*found.splits["train"].images, *found.splits["test"].images]
     assert all(torch.equal(a, b) for a, b in zip(images, wanted, strict=True))
     assert (found.unit_length, found.origin.tolist()) == (scene.unit_length, scene.origin.tolist())
+    cameras = (given.splits["train"].cameras for given in (found, scene))
+    assert all(torch.equal(a.c2w, b.c2w) for a, b in zip(*cameras, strict=True))
     about = json.loads((tmp_path / "out/nb-info.json").read_text())
     assert (about["id"], about["scene"]) == ("steerbench", scene.name)
     steps = follow(scene, str(tmp_path / "out/path.json")).steps

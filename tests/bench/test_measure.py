@@ -3,7 +3,6 @@
 import math
 import weakref
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,14 +11,13 @@ import torch
 
 import bench.measure
 from bench.clock import FrameRecord
-from bench.console import ConsoleLog
 from bench.measure import MethodFailed, Task, _Take, measure, train
 from bench.metrics import psnr, quantise
 from bench.protocol import EvaluationProtocol
 from bench.results import COLUMNS
 from bench.rows import path_interval
-from bench.trajectories import from_split
-from bench.types import Budget, Frame, SteerbenchError, composite
+from bench.trajectories import Trajectory, from_split
+from bench.types import Budget, Scene, SteerbenchError, composite
 from tests.conftest import QUICK, STEERBENCH_1, OffsetMethod
 
 PROTOCOL = replace(QUICK, warmup=2)
@@ -200,14 +198,19 @@ def test_a_backbone_that_cannot_be_had_leaves_nan_and_its_reason(run, offset_met
     assert list(measured.frames)[3:7] == ["psnr", "ssim", "lpips_alex", "lpips_vgg"]
 
 
+def without_truth(scene: Scene, count: int) -> Trajectory:
+    """The test split as a path whose first frames have no ground truth."""
+    whole = from_split(scene)
+    steps = (replace(s, truth=None) if i < count else s for i, s in enumerate(whole.steps))
+    return replace(whole, steps=tuple(steps))
+
+
 def test_frames_without_ground_truth_are_timed_but_not_scored(run, offset_method, tiny_scene):
-    whole = from_split(tiny_scene)
-    steps = tuple(replace(s, truth=None) if i < 4 else s for i, s in enumerate(whole.steps))
-    measured = run(offset_method, trajectory=replace(whole, steps=steps))
+    measured = run(offset_method, trajectory=without_truth(tiny_scene, 4))
     assert row(measured.rows, "psnr")["n"] == 2
     assert row(measured.rows, "frame_ms")["n"] == 6
-    unscored = replace(whole, steps=tuple(replace(s, truth=None) for s in whole.steps))
-    assert math.isnan(value(run(offset_method, trajectory=unscored).rows, "psnr"))
+    unscored = run(offset_method, trajectory=without_truth(tiny_scene, 6))
+    assert math.isnan(value(unscored.rows, "psnr"))
 
 
 def test_the_exact_picture_serves_flicker_when_the_protocol_asks(run, offset_method, tiny_scene):
@@ -218,9 +221,7 @@ def test_the_exact_picture_serves_flicker_when_the_protocol_asks(run, offset_met
         return torch.full((camera.height, camera.width, 4), 255, dtype=torch.uint8)
 
     scene, protocol = replace(tiny_scene, exact=exact), replace(PROTOCOL, flicker="exact")
-    whole = from_split(tiny_scene)
-    unscored = replace(whole, steps=tuple(replace(s, truth=None) for s in whole.steps))
-    given = {"scene": scene, "trajectory": unscored}
+    given = {"scene": scene, "trajectory": without_truth(tiny_scene, 6)}
     frames = run(offset_method, protocol=protocol, **given).frames
     assert frames["flicker"].notna().tolist() == [False, *[True] * 5]
     assert len(asked) == 6
@@ -255,9 +256,14 @@ def test_a_rendering_with_nan_in_it_stops_the_run(run, offset_method):
         run(offset_method)
 
 
-def test_another_background_stops_the_run_before_training(run, offset_method, tiny_scene):
+def test_what_cannot_be_scored_or_compared_stops_the_run_before_training(
+    run, offset_method, tiny_scene
+):
     with pytest.raises(SteerbenchError, match="background"):
         run(offset_method, scene=replace(tiny_scene, background=torch.zeros(3)))
+    offset_method.memory = 99
+    with pytest.raises(SteerbenchError, match="99 frames before it"):
+        run(offset_method, protocol=IN_ROUNDS)
     assert offset_method.calls == []
 
 
@@ -279,7 +285,7 @@ def test_frames_are_let_go_once_they_are_scored(run, offset_method):
 
 
 def test_methods_in_turns_draw_frames_as_if_alone(run, offset_method):
-    other = type(offset_method)(offset_method.settings()["device"], 16 / 255)
+    other = OffsetMethod(offset_method.settings()["device"], 16 / 255)
     drawn = []
     for name, method in (("one", offset_method), ("other", other)):
 
@@ -297,7 +303,7 @@ def test_methods_in_turns_draw_frames_as_if_alone(run, offset_method):
 
 @pytest.mark.parametrize("where", ["fit", "reset", "render", "sizes"])
 def test_of_several_methods_the_one_that_failed_is_named(where, run, offset_method, monkeypatch):
-    other, error = type(offset_method)("cpu", 16 / 255), RuntimeError("no")
+    other, error = OffsetMethod("cpu", 16 / 255), RuntimeError("no")
 
     def failing(*_: object) -> None:
         raise error
@@ -317,54 +323,31 @@ def test_of_several_methods_the_one_that_failed_is_named(where, run, offset_meth
 IN_ROUNDS = replace(PROTOCOL, warmup=0, rounds=3, compared=True)
 
 
-class Brighter(OffsetMethod):
-    """Renders half the ground truth, brighter by some 8-bit levels; notes its turn in `turns`."""
-
-    def __init__(self, scene, levels: float, turns: list, memory: int = 0) -> None:
-        super().__init__("cpu", 0.0)
-        self.levels, self.turns, self.memory = levels, turns, memory
-        self.split, self.background = scene.splits["test"], scene.background
-
-    def fit(self, scene, budget, log) -> None:
-        self.turns.append((self.levels, "fit"))
-
-    def reset(self) -> None:
-        self.turns.append((self.levels, "reset"))
-
-    def render(self, camera, probe) -> Frame:
-        number = next(n for n, known in enumerate(self.split.cameras) if known is camera)
-        self.turns.append((self.levels, number))
-        dark = composite(self.split.images[number], self.background) / 2
-        picture = dark + self.levels / 255
-        return Frame(picture, torch.ones_like(picture[..., 0]), torch.ones_like(picture[..., 0]))
-
-
 @pytest.fixture
 def in_turns(run, tiny_scene):
-    """What was measured of methods of these brightnesses, in rounds, and who had which turn."""
+    """What was measured in rounds of a method that renders the truth, half as bright, and of one
+    that is 8 levels brighter; and who had which turn."""
+    test = tiny_scene.splits["test"]
+    dark = replace(test, images=[image[..., :3] // 2 for image in test.images])
+    scene = replace(tiny_scene, splits={**tiny_scene.splits, "test": dark})
 
-    def rendered(*levels: float, memory: int = 0, **changes):
-        turns: list = []
-        methods = [Brighter(tiny_scene, n, turns, memory) for n in levels]
-        found = run(*methods, **{"protocol": IN_ROUNDS, **changes})
-        return (found if len(levels) > 1 else [found]), turns
+    def rendered(**changes):
+        methods = OffsetMethod("cpu", 0.0), OffsetMethod("cpu", 8 / 255)
+        methods[1].calls = methods[0].calls
+        found = run(*methods, **{"scene": scene, "protocol": IN_ROUNDS, **changes})
+        return found, methods[0].calls
 
     return rendered
 
 
-def test_methods_take_turns_in_every_round_and_are_held_against_the_first(in_turns, tiny_scene):
-    (first, second), turns = in_turns(0, 8)
-    count = len(tiny_scene.splits["test"])
-    round_ = [(levels, turn) for turn in ("reset", *range(count)) for levels in (0, 8)]
-    warm = [(levels, turn) for turn in ("fit", "reset") for levels in (0, 8)]
-    assert turns == [*warm, *3 * round_]
+def test_methods_take_turns_in_every_round_and_are_held_against_the_first(in_turns):
+    (first, second), calls = in_turns()
+    round_ = ["reset", *(f"r_{number}" for number in range(6))]
+    assert calls == [call for call in ("fit", "reset", *3 * round_) for _ in (first, second)]
     assert value(first.rows, "psnr_to_first") == math.inf
     assert value(first.rows, "worst_to_first") == 0
-    # Halves of odd levels round to even ones: by up to one level more or less than 8.
     apart, worst = (value(second.rows, f"{x}_to_first") for x in ("psnr", "worst"))
-    assert -20 * math.log10(9 / 255) <= apart <= -20 * math.log10(7 / 255)
-    assert 7 / 255 - 1e-6 <= worst <= 9 / 255 + 1e-6
-    assert value(second.rows, "psnr") > value(first.rows, "psnr")  # half the truth is too dark
+    assert (apart, worst) == pytest.approx((20 * math.log10(255 / 8), 8 / 255))
     for each in (first, second):
         ms, *ends = (value(each.rows, f"frame_ms{x}") for x in ("", ".fastest", ".slowest"))
         # Two ways to add up the same times.
@@ -372,9 +355,8 @@ def test_methods_take_turns_in_every_round_and_are_held_against_the_first(in_tur
         assert ms <= ends[1] * (1 + 1e-12)
 
 
-def test_a_single_round_names_no_other_and_no_first(in_turns):
-    (alone,), _ = in_turns(0, protocol=PROTOCOL)
-    named = set(alone.rows["metric"])
+def test_a_single_round_names_no_other_and_no_first(run, offset_method):
+    named = set(run(offset_method).rows["metric"])
     assert not {"frame_ms.fastest", "psnr_to_first", "worst_to_first"} & named
 
 
@@ -401,14 +383,6 @@ def test_only_steady_frames_with_a_ground_truth_are_held_against_the_first(in_tu
     whole = from_split(tiny_scene)
     blind = replace(whole, steps=(whole.steps[0], replace(whole.steps[1], truth=None)))
     alone = replace(whole, steps=whole.steps[:1])
-    found = [in_turns(0, 8, trajectory=path)[0][1].rows for path in (blind, alone)]
+    # Bright pictures are clipped, each in other places.
+    found = [in_turns(scene=tiny_scene, trajectory=path)[0][1].rows for path in (blind, alone)]
     assert value(found[0], "psnr_to_first") == value(found[1], "psnr_to_first")
-
-
-def test_what_cannot_be_compared_is_refused_before_anything_is_trained(in_turns, tiny_scene):
-    turns: list = []
-    method = Brighter(tiny_scene, 0, turns, memory=99)
-    task = Task(tiny_scene, from_split(tiny_scene), IN_ROUNDS, BUDGET, seed=0)
-    with pytest.raises(SteerbenchError, match="99 frames before it"):
-        train([method], task, ConsoleLog(Path(), quiet=True))
-    assert turns == []

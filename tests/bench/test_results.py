@@ -1,7 +1,6 @@
 """The store shows whole runs only, and gives back exactly what was put in."""
 
 import errno
-import json
 import math
 import os
 import time
@@ -17,14 +16,6 @@ from PIL import Image
 from bench import results
 from bench.results import COLUMNS, SCHEMA_VERSION, STEADY, Measurement, Store, content_key
 from bench.types import SteerbenchError
-
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False)
-    | st.text(),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
-    max_leaves=8,
-)  # fmt: skip
-PARTS = st.dictionaries(st.text(), JSON, max_size=4)
 
 
 def measurement(values: list[float], text: str = "plain") -> Measurement:
@@ -43,15 +34,6 @@ def measurement(values: list[float], text: str = "plain") -> Measurement:
 @pytest.fixture
 def store(tmp_path: Path) -> Store:
     return Store(tmp_path / "outputs")
-
-
-@given(PARTS, PARTS, st.randoms())
-def test_a_key_tells_parts_apart_and_not_their_order(one, other, random):
-    same = json.dumps(one, sort_keys=True) == json.dumps(other, sort_keys=True)
-    assert (content_key(one) == content_key(other)) == same
-    shuffled = list(one.items())
-    random.shuffle(shuffled)
-    assert content_key(one) == content_key(dict(shuffled))
 
 
 def test_parts_that_do_not_repeat_are_refused():

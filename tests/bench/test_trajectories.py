@@ -3,14 +3,9 @@
 import math
 from dataclasses import replace
 from itertools import chain, pairwise
-from pathlib import Path
 
-import hydra
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
-from omegaconf import OmegaConf
 
 from bench.cameras import scale_camera
 from bench.paths import write_path
@@ -25,26 +20,11 @@ from bench.trajectories import (
     orbit,
     smooth,
     spline,
-    spread,
     static,
 )
 from bench.types import Camera, Scene, Split, SteerbenchError
 from tests.bench.test_motion import turn_deg
 from tests.conftest import camera_on_orbit
-
-CONFIGS = Path(__file__).parents[2] / "sweeps" / "configs" / "trajectory"
-
-
-@given(st.integers(1, 500), st.integers(0, 500))
-def test_spread_is_even_increasing_and_holds_both_ends(total, count):
-    kept = spread(total, count)
-    assert len(kept) == min(total, count)
-    assert kept[:1] == [0] * bool(count)
-    if len(kept) > 1:
-        assert kept[-1] == total - 1
-        gaps = [after - before for before, after in pairwise(kept)]
-        assert min(gaps) >= 1
-        assert max(gaps) - min(gaps) <= 1
 
 
 def test_a_whole_split_is_rendered_in_its_order_with_its_ground_truth(tiny_scene):
@@ -191,17 +171,6 @@ def test_a_loop_goes_there_and_back_until_its_frames_are_used_up():
     scene = orbit_of([0, 1, 2])
     assert [step.truth for step in loop(scene, frames=5, limit=2).steps] == [0, 1, 0, 1, 0]
     assert [step.truth for step in loop(scene, frames=3, limit=1).steps] == [0, 0, 0]
-
-
-@pytest.mark.parametrize(
-    ("choice", "made"), [("test", from_split), ("orbit", orbit), ("jump", jump), ("loop", loop)]
-)
-def test_the_configurations_are_the_defaults(choice, made):
-    scene = orbit_of(list(range(15)))
-    config = OmegaConf.create(
-        {"trajectory": OmegaConf.load(CONFIGS / f"{choice}.yaml"), "budget": {"frames": 12}}
-    )
-    assert hydra.utils.instantiate(config.trajectory, scene) == made(scene, limit=12)
 
 
 def test_each_camera_is_approached_once_after_a_cut_from_a_motion_of_its_own(tiny_scene):

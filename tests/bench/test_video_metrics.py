@@ -1,16 +1,11 @@
-"""Metrics of a path against closed forms, and against what their own programs print."""
+"""Metrics of a path against closed forms."""
 
 import math
-import subprocess
-import sys
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 from torch import Tensor
 
 from bench.cameras import cast, pixel_grid
@@ -19,26 +14,13 @@ from bench.metrics import as_bytes, psnr
 from bench.scenes import embedded
 from bench.scoring import Scoring
 from bench.trajectories import from_split
-from bench.types import Budget, Camera, SteerbenchError, Unavailable, composite
-from bench.video_metrics import DepthView, flip, jod, warping_error
-from tests.bench.test_metrics import noise, waves
+from bench.types import Budget, Camera, composite
+from bench.video_metrics import DepthView, warping_error
+from tests.bench.test_metrics import noise
 from tests.conftest import QUICK
 
 ROOT = Path(__file__).parents[2]
 WHITE = torch.ones(3)
-
-
-def has(package: str, extra: str) -> pytest.MarkDecorator:
-    reason = f"needs {package}: pip install -e '.[{extra}]'"
-    return pytest.mark.skipif(find_spec(package) is None, reason=reason)
-
-
-def program(start: str, *words: object) -> str:
-    """What the program that `start` starts prints when called with `words`."""
-    before = "from bench.metrics import declare_torchvision; declare_torchvision(); "
-    command = [sys.executable, "-c", before + start, *map(str, words)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    return done.stdout
 
 
 def test_tpsnr_and_tlpips_are_those_of_the_change_from_frame_to_frame():
@@ -63,53 +45,6 @@ def test_tpsnr_and_tlpips_are_those_of_the_change_from_frame_to_frame():
     assert second["tpsnr"] == pytest.approx(expected, rel=1e-6)
     again = scoring.score(2, now, pictures[1], cut=False)
     assert (again["flicker"], again["tpsnr"]) == (0, math.inf)
-
-
-@has("flip_evaluator", "flip")
-def test_flip_is_what_its_own_program_prints(tmp_path):
-    pictures = waves()
-    for name, picture in zip(("test", "true"), pictures, strict=True):
-        Image.fromarray(as_bytes(picture)).save(tmp_path / f"{name}.png")
-    files = "-r", tmp_path / "true.png", "-t", tmp_path / "test.png", "-nerm", "-nexm"
-    printed = program("from flip_evaluator.flip_python_api import main; main()", *files)
-    assert f"Mean: {flip(*pictures):.6f}\n" in printed
-    assert flip(pictures[0], pictures[0]) == 0
-
-
-@has("pycvvdp", "cvvdp")
-def test_the_jod_is_what_its_own_program_prints(tmp_path):
-    wrong, true = map(as_bytes, waves())
-    shown = [wrong if number % 3 == 0 else true for number in range(10)]
-    film = [(np.roll(frame, k, 1), np.roll(true, k, 1)) for k, frame in enumerate(shown)]
-    for number, pair in enumerate(film):
-        for name, frame in zip(("test", "true"), pair, strict=True):
-            Image.fromarray(frame).save(tmp_path / f"{name}{number:02}.bmp")
-    files = "-r", tmp_path / "true%02d.bmp", "-t", tmp_path / "test%02d.bmp"
-    how = "--fps", 24, "-d", "standard_fhd", "-q", "--device", "cpu"
-    printed = program("from pycvvdp.run_cvvdp import main; main()", *files, *how)
-    found = jod(film, 24.0, "standard_fhd")
-    assert printed.strip() == f"{found:.4f}"
-    assert 5 < found < 9.9
-
-
-@has("pycvvdp", "cvvdp")
-def test_a_display_that_nobody_sells_is_refused():
-    protocol = replace(QUICK, name="mine", columns=("jod",), display="oled_9000")
-    with pytest.raises(SteerbenchError, match=r"protocol\.display: expected .* got 'oled_9000'"):
-        protocol.load_lpips(None, None)
-
-
-@pytest.mark.parametrize(
-    ("column", "package", "extra"),
-    [("flip", "flip_evaluator", "flip"), ("jod", "pycvvdp", "cvvdp")],
-)
-def test_a_package_that_is_missing_is_named_before_anything_is_measured(
-    monkeypatch, column, package, extra
-):
-    monkeypatch.setitem(sys.modules, package, None)
-    protocol = replace(QUICK, name="mine", columns=(column,))
-    with pytest.raises(Unavailable, match=rf"{column} needs {package}: pip install .*\[{extra}\]"):
-        protocol.load_lpips(None, None)
 
 
 def wall(shift: int, offset: float = 0.0) -> tuple[Tensor, DepthView]:
@@ -142,20 +77,6 @@ def test_what_was_hidden_or_is_empty_or_out_of_the_picture_does_not_count():
     spoilt[:, :6] = 9.0
     assert warping_error(spoilt, DepthView(view.camera, empty), then, earlier) < 1e-12
     assert math.isnan(warping_error(now, view, *wall(24)))
-
-
-def test_the_surface_of_an_embedded_scene_is_exact(tmp_path, quiet_log):
-    """`void` is a ball of radius 0.06 at (0.35, -0.2, 0.15) in its model's units."""
-    sizes = {"width": 60, "train": 2, "test": 9, "bounds": [[-1.2] * 3, [1.2] * 3]}
-    ball = embedded.load("void", **sizes, root=tmp_path, log=quiet_log)
-    camera = ball.splits["test"].cameras[0]
-    depth = ball.surface(camera).flatten()
-    rays, seen = cast(camera), torch.isfinite(depth)
-    assert seen.sum() > 4
-    points = (rays.origins + depth[:, None] * rays.directions)[seen]
-    centre = (torch.tensor([0.35, -0.2, 0.15]) - ball.origin) / ball.unit_length
-    radii = (points - centre).norm(dim=1) * ball.unit_length
-    torch.testing.assert_close(radii, torch.full_like(radii, 0.06), atol=2e-5, rtol=0)
 
 
 def test_exact_flow_follows_the_true_pictures_of_a_path(tmp_path, quiet_log):
@@ -200,21 +121,14 @@ def test_the_flow_is_the_scenes_and_otherwise_named_as_the_methods_own():
     assert not any(name.startswith("warp") for name in film(PATH, depth=False)[8])
 
 
-def test_the_flow_works_without_a_truth_and_a_gap_in_it_ends_a_film(monkeypatch):
-    seen = []
-    monkeypatch.setattr(
-        "bench.video_metrics.jod", lambda film, *_: seen.append(len(film)) or 10.0 - len(film)
-    )
-    protocol = replace(PATH, columns=("warp", "jod"), display="mine")
-    scoring = Scoring(protocol, {}, WHITE, ())
+def test_the_flow_works_without_a_truth():
+    scoring = Scoring(PATH, {}, WHITE, ())
     picture, view = wall(0)
     truth = torch.zeros(16, 24, 3, dtype=torch.uint8)
     for k in range(10):
         known = None if k in (0, 4, 6) else truth
         figures = scoring.score(k, picture, known, cut=False, camera=view.camera, depth=view.depth)
         assert ("warp_1_own" in figures) == (k > 0)
-    assert scoring.whole() == {"jod": pytest.approx((3 * 7 + 3 * 7) / 6)}  # frames 1-3 and 7-9
-    assert seen == [3, 3]
 
 
 def test_what_is_missing_says_what_it_needs(tiny_scene, offset_method, quiet_log):

@@ -135,10 +135,10 @@ def test_an_assertion_says_by_how_much_and_against_which_limit():
 
 
 def test_limits_are_typed_in_the_unit_of_the_metric_or_as_a_share():
-    found = limited(["psnr=0.2", "frame_ms=10%", "flip=0.01"], {"psnr": LIMITS["psnr"]})
+    found = limited(["psnr=0.2", "frame_ms=10%", "flicker=0.01"], {"psnr": LIMITS["psnr"]})
     times = Limit(-1, relative=0.1, here=True, unit="ms")
-    psnr, flip = Limit(1, absolute=0.2, unit="dB"), Limit(-1, absolute=0.01)
-    assert found == {"psnr": psnr, "frame_ms": times, "flip": flip}
+    psnr, flicker = Limit(1, absolute=0.2, unit="dB"), Limit(-1, absolute=0.01)
+    assert found == {"psnr": psnr, "frame_ms": times, "flicker": flicker}
     for word, said in (("pnsr=1", "Did you mean psnr"), ("psnr=-1", "got -1"), ("psnr", "nothing")):
         with pytest.raises(SteerbenchError, match=said):
             limited([word])

@@ -141,7 +141,7 @@ def test_what_a_record_leaves_out_is_said(outputs, copy, tmp_path, capsys):
 
 def test_a_folder_that_is_no_store_is_an_error_of_every_command(steerbench, baseline):
     own = ("results", "compare 0 1", "check baseline.json", "check --record new.json")
-    commands = [f"{x} --outputs nowhere" for x in (*own, "export nerfbaselines 0 --to there")]
+    commands = [f"{x} --outputs nowhere" for x in own]
     of_settings = ("report --table table3", "render --run 0")
     commands += [f"{x} outputs=nowhere" for x in of_settings]
     for said in ("there is no store of runs", "no runs to read"):

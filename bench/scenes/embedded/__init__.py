@@ -173,11 +173,8 @@ def train_poses(count: int, seed: int, views: Viewpoints = MOST) -> list[Tensor]
 def orbit_poses(count: int, views: Viewpoints = MOST) -> list[Tensor]:
     """Poses 1 degree of azimuth apart, centred on the front, that rise and fall twice a turn."""
     azimuths = [math.radians(-90 + k - (count - 1) / 2) for k in range(count)]
-    heights = [math.radians(views.middle + views.swing * math.sin(2 * a)) for a in azimuths]
-    return [
-        pose_on_sphere(a, height, views.distance)
-        for a, height in zip(azimuths, heights, strict=True)
-    ]
+    heights = (math.radians(views.middle + views.swing * math.sin(2 * a)) for a in azimuths)
+    return [pose_on_sphere(*place, views.distance) for place in zip(azimuths, heights, strict=True)]
 
 
 def pose_on_sphere(azimuth: float, elevation: float, distance: float = DISTANCE) -> Tensor:

@@ -31,12 +31,8 @@ BAND_RAYS = 1 << 18  # enough to hide the cost of calls, few enough to stay in t
 Span = tuple[int, int, int]
 """A part's number, the first column that it can cover in a band, and one past the last."""
 
-Rays = tuple[Tensor, Tensor, Tensor]
-"""Row, column and sample of each ray in a band, [N]."""
-
 LIGHT = (0.48, -0.6, 0.64)  # unit direction to the light
 LIFT = 1e-4  # distance of a shadow ray's start above the surface, in the model's units
-TILES = 32  # into which the light's view of the points is divided, each way
 
 SKY, GROUND, SUN = 0.52, 0.24, 0.62
 """Light from above, from below, and from the light's direction, as shares of a surface's colour."""
@@ -83,17 +79,19 @@ def render(model: SceneModel, camera: Camera, samples: int) -> Frame:
     y = (torch.arange(height)[:, None] + offsets[:, 1] - camera.cy) / camera.fy
     rgb, (alpha, depth) = torch.zeros(height, width, 3), torch.zeros(2, height, width)
     rows = max(BAND_RAYS // (width * samples), 1)
-    boxes = ProjectedBoxes(camera, model.boxes())
+    seen_in = windows(camera, model.boxes())
     for top in range(0, height, rows):
         bottom = min(top + rows, height)
-        spans = boxes.spans(top, bottom)
+        spans = [
+            (part, left, right)
+            for part, (left, first, right, last) in enumerate(seen_in)
+            if left < right and first < bottom and last > top
+        ]
         if not spans:
             continue
-        first, last = min(span[1] for span in spans), max(span[2] for span in spans)
-        band = Band(camera.c2w[:, 3], camera.c2w[:, :3], x[None, first:last], y[top:bottom, None])
-        traced = model.trace(band, [(part, a - first, b - first) for part, a, b in spans])
-        for picture, seen in zip((rgb, alpha, depth), traced, strict=True):
-            picture[top:bottom, first:last] = seen.mean(2)
+        band = Band(camera.c2w[:, 3], camera.c2w[:, :3], x[None], y[top:bottom, None])
+        for picture, seen in zip((rgb, alpha, depth), model.trace(band, spans), strict=True):
+            picture[top:bottom] = seen.mean(2)
     empty = alpha < EMPTY_ALPHA
     depth = (depth / alpha.clamp(min=EMPTY_ALPHA)).masked_fill(empty, math.inf)
     return Frame(rgb, depth, alpha)
@@ -108,36 +106,16 @@ def sample_offsets(samples: int) -> Tensor:
     return (torch.stack((index, mirrored), dim=1) + 0.5) / samples
 
 
-class ProjectedBoxes:
-    """The bounding boxes of a model's parts as a camera sees them."""
-
-    def __init__(self, camera: Camera, boxes: Tensor) -> None:
-        pixels, depth = project(camera, boxes.reshape(-1, 3))
-        self.width = camera.width
-        self.in_front = (depth.reshape(-1, 8) > 0).all(1)
-        self.behind = (depth.reshape(-1, 8) <= 0).all(1)
-        pairs = torch.combinations(torch.arange(8))
-        # The outline of a convex box lies in the hull of the segments between pairs of corners.
-        corners = pixels.reshape(-1, 8, 2)
-        self.start, self.end = corners[:, pairs[:, 0]], corners[:, pairs[:, 1]]  # [P, 28, 2]
-
-    def spans(self, top: int, bottom: int) -> list[Span]:
-        """The parts that may be seen in rows top <= row < bottom, each with its columns."""
-        (u0, v0), (u1, v1) = self.start.unbind(-1), self.end.unbind(-1)
-        flat = v0 == v1
-        rise = (v1 - v0).masked_fill(flat, 1)
-        # The range of each segment between the rows, with one pixel of margin for rounding.
-        low = ((top - 1 - v0) / rise).clamp(0, 1).masked_fill(flat, 0)
-        high = ((bottom + 1 - v0) / rise).clamp(0, 1).masked_fill(flat, 1)
-        meets = (torch.minimum(v0, v1) <= bottom + 1) & (torch.maximum(v0, v1) >= top - 1)
-        ends = torch.stack((u0 + low * (u1 - u0), u0 + high * (u1 - u0)))
-        first = ends.masked_fill(~meets, math.inf).amin((0, 2)).floor() - 1
-        last = ends.masked_fill(~meets, -math.inf).amax((0, 2)).ceil() + 1
-        # A part that reaches behind the camera may be visible anywhere.
-        first = first.masked_fill(~self.in_front, 0).clamp(min=0)
-        last = last.masked_fill(~self.in_front, self.width).clamp(max=self.width)
-        columns = torch.stack((first, last.masked_fill(self.behind, 0)), dim=1).tolist()
-        return [(part, int(a), int(b)) for part, (a, b) in enumerate(columns) if a < b]
+def windows(camera: Camera, boxes: Tensor) -> list[list[int]]:
+    """The first and last column and row, exclusive, in which a camera may see each of `boxes`."""
+    pixels, depth = (x.reshape(len(boxes), 8, -1) for x in project(camera, boxes.reshape(-1, 3)))
+    ahead, size = depth[..., 0] > 0, pixels.new_tensor((camera.width, camera.height))
+    low, high = pixels.amin(1).floor() - 1, pixels.amax(1).ceil() + 1
+    # A part that reaches behind the camera may be visible anywhere.
+    whole = ahead.all(1, keepdim=True)
+    low, high = low.where(whole, 0).clamp(min=0), high.where(whole, size).minimum(size)
+    high = high.where(ahead.any(1, keepdim=True), 0)
+    return torch.cat((low, high), dim=1).int().tolist()
 
 
 @dataclass(frozen=True)
@@ -154,18 +132,6 @@ class Part:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "frame", rotation(*self.turn))
-
-
-@dataclass(frozen=True)
-class Surface:
-    """What some rays see of one part; vectors are [N, 3]."""
-
-    number: int  # of the part
-    rays: Rays
-    directions: Tensor  # of the rays
-    points: Tensor
-    local: Tensor  # the points in the part's frame
-    normals: Tensor  # to the viewer's side
 
 
 class Solids:
@@ -201,57 +167,44 @@ class Solids:
             owner[:, columns].masked_fill_(t < nearest, number)
             torch.minimum(nearest, t, out=nearest)
         seen = owner >= 0
+        rays = seen.nonzero(as_tuple=True)
+        order = owner[rays].argsort(stable=True)
+        row, column, sample = rays = tuple(index[order] for index in rays)
+        x, y = band.x[0, column, sample], band.y[row, 0, sample]
+        plane = torch.stack((x, y, torch.ones_like(x)), dim=1)
         rgb = depth.new_zeros(*shape, 3)
-        surfaces = []
-        for number, first, last in spans:
-            row, column, sample = (owner[:, first:last] == number).nonzero(as_tuple=True)
-            if len(row):
-                rays = row, column + first, sample
-                surfaces.append(self.surface(number, rays, depth[rays], band))
-        for surface, lit in zip(surfaces, self.lit(surfaces), strict=True):
-            rgb[surface.rays] = self.shade(surface, lit)
+        rgb[rays] = self.shade(owner[rays], depth[rays], plane, band)
         return rgb, seen.to(depth.dtype), depth.masked_fill_(~seen, 0)
 
-    def surface(self, number: int, rays: Rays, depth: Tensor, band: Band) -> Surface:
-        """What the `rays` of a band meet of a part at `depth` [N]."""
-        part, (row, column, sample) = self.parts[number], rays
-        x, y = band.x[0, column, sample], band.y[row, 0, sample]
-        directions = torch.stack((x, y, torch.ones_like(x)), 1) @ band.rotation.T
-        points = band.origin + depth[:, None] * directions
-        local = (points - torch.tensor(part.centre)) @ part.frame
-        normals = part.shape.normal(local) @ part.frame.T
+    def shade(self, owners: Tensor, depth: Tensor, plane: Tensor, band: Band) -> Tensor:
+        """Lambert and Blinn-Phong colours [N, 3] of what rays of a `band` through points (x, y, 1)
+        of the image `plane` meet at `depth` [N], of the parts `owners` [N], which are sorted."""
+        numbers, counts = owners.unique_consecutive(return_counts=True)
+        ends = [0, *counts.cumsum(0).tolist()]
+        parts = [self.parts[number] for number in numbers.tolist()]
+        pieces = list(zip(parts, map(slice, ends, ends[1:]), strict=True))
+        directions, points, local, normals, colours = torch.empty(5, *plane.shape)
+        for part, piece in pieces:
+            directions[piece] = plane[piece] @ band.rotation.T
+            points[piece] = band.origin + depth[piece, None] * directions[piece]
+            local[piece] = (points[piece] - torch.tensor(part.centre)) @ part.frame
+            normals[piece] = part.shape.normal(local[piece]) @ part.frame.T
         # The normal points to the viewer's side of the surface.
         away = (normals * directions).sum(1, keepdim=True) > 0
         normals = torch.where(away, -normals, normals)
-        return Surface(number, rays, directions, points, local, normals)
-
-    def lit(self, surfaces: Sequence[Surface]) -> list[Tensor]:
-        """Which points [N] of each surface the light reaches."""
-        if not surfaces:
-            return []
-        # All surfaces together: a caster is intersected once, not once for each of them.
-        points, normals = (
-            torch.cat([getattr(surface, name) for surface in surfaces])
-            for name in ("points", "normals")
-        )
-        counts = [len(surface.points) for surface in surfaces]
-        numbers = torch.tensor([surface.number for surface in surfaces], dtype=torch.int16)
-        owners = numbers.repeat_interleave(torch.tensor(counts))
         lit = normals @ self.light > 0
         lit[lit.clone()] = ~self.shadowed(owners[lit], (points + LIFT * normals)[lit])
-        return list(lit.split(counts))
-
-    def shade(self, surface: Surface, lit: Tensor) -> Tensor:
-        """Lambert and Blinn-Phong colours [N, 3] of the points of a surface."""
-        part, normals = self.parts[surface.number], surface.normals
         height = 0.5 + 0.5 * normals[:, 2:]
         sun = (normals * self.light).sum(1, keepdim=True) * lit[:, None]
-        colour = part.texture(surface.local) * (GROUND + (SKY - GROUND) * height + SUN * sun)
-        if part.gloss:
-            half = unit(self.light - unit(surface.directions))
-            highlight = (normals * half).sum(1, keepdim=True).clamp(min=0) ** part.sharpness
-            colour = colour + part.gloss * highlight * lit[:, None]
-        return colour.clamp(max=1)
+        light = GROUND + (SKY - GROUND) * height + SUN * sun
+        half = unit(self.light - unit(directions))
+        highlight = (normals * half).sum(1, keepdim=True).clamp(min=0)
+        for part, piece in pieces:
+            colours[piece] = part.texture(local[piece]) * light[piece]
+            if part.gloss:
+                shine = highlight[piece] ** part.sharpness
+                colours[piece] += part.gloss * shine * lit[piece, None]
+        return colours.clamp(max=1)
 
     def shadowed(self, owners: Tensor, points: Tensor) -> Tensor:
         """[N] bool: whether another part is between a point of part `owners` [N] and the light.
@@ -259,68 +212,29 @@ class Solids:
         A convex part is skipped for itself: it casts no shadow on its own lit side.
         """
         dark = torch.zeros(len(points), dtype=torch.bool)
-        if not len(points):
-            return dark
-        tiles = Tiles(points @ self.light_axes)
-        columns, owners = points[tiles.order].T.contiguous(), owners[tiles.order]
-        for number in tiles.casters(self.low, self.high):
-            caster = self.parts[number]
-            runs = tiles.runs(self.low[number], self.high[number])
-            if not runs:
+        seen = points @ self.light_axes
+        # Sorted by their first coordinate: under a caster's box are only points of one piece.
+        order = seen[:, 0].argsort()
+        across, along, ahead = seen[order].T.contiguous()
+        columns, owners = points[order].T.contiguous(), owners[order]
+        first = torch.searchsorted(across, self.low[:, 0].contiguous()).tolist()
+        last = torch.searchsorted(across, self.high[:, 0].contiguous(), right=True).tolist()
+        boxes = zip(first, last, self.low.tolist(), self.high.tolist(), strict=True)
+        for number, (start, end, (_, low, _), (_, high, nearest)) in enumerate(boxes):
+            piece, caster = slice(start, end), self.parts[number]
+            under = (along[piece] >= low) & (along[piece] <= high) & (ahead[piece] <= nearest)
+            under &= ~dark[piece]
+            under = start + under.nonzero()[:, 0]
+            if not len(under):
                 continue
-            centre = torch.tensor(caster.centre)[:, None]
-            below = torch.cat([columns[:, run] for run in runs], dim=1) - centre
+            below = columns[:, under] - torch.tensor(caster.centre)[:, None]
             x, y, z = (caster.frame.T @ below if any(caster.turn) else below).unbind(0)
             u, v, w = (self.light @ caster.frame).unbind(0)
             found = caster.shape.hit((x, y, z), (u, v, w)) < math.inf
             if not isinstance(caster.shape, Carved | Pierced):
-                found &= torch.cat([owners[run] for run in runs]) != number
-            counts = [run.stop - run.start for run in runs]
-            for run, part in zip(runs, found.split(counts), strict=True):
-                dark[run].logical_or_(part)
-        return torch.empty_like(dark).index_put_((tiles.order,), dark)
-
-
-class Tiles:
-    """Points [N, 3] seen from the light, sorted by tiles: a caster needs only those under it."""
-
-    def __init__(self, seen: Tensor) -> None:
-        """`seen` are two coordinates across the light, and one that grows towards it."""
-        self.low, self.high = seen.amin(0), seen.amax(0)
-        self.size = ((self.high - self.low)[:2] / TILES).clamp(min=1e-6)
-        tile = ((seen - self.low)[:, :2] / self.size).long().clamp(0, TILES - 1)
-        number = tile[:, 0] * TILES + tile[:, 1]
-        self.order = number.argsort()
-        counts = number.bincount(minlength=TILES * TILES)
-        self.starts = [0, *counts.cumsum(0).tolist()]
-        farthest = seen.new_full((TILES * TILES,), math.inf)
-        self.farthest = farthest.scatter_reduce(0, number, seen[:, 2], "amin").tolist()
-
-    def casters(self, low: Tensor, high: Tensor) -> list[int]:
-        """Which of the boxes from `low` to `high` [P, 3] may lie between a point and the light."""
-        candidates = (low <= self.high)[:, :2].all(1) & (high >= self.low).all(1)
-        return candidates.nonzero()[:, 0].tolist()
-
-    def runs(self, low: Tensor, high: Tensor) -> list[slice]:
-        """The sorted points in the tiles that a box [3] covers, unless all are nearer than it."""
-        first, last = (self._tile(corner) for corner in (low, high))
-        nearest = high[2].item()
-        runs: list[slice] = []
-        for row in range(first[0], last[0] + 1):
-            for tile in range(row * TILES + first[1], row * TILES + last[1] + 1):
-                if self.farthest[tile] > nearest:  # so is the tile of no points
-                    continue
-                start, end = self.starts[tile], self.starts[tile + 1]
-                if runs and runs[-1].stop == start:
-                    runs[-1] = slice(runs[-1].start, end)
-                else:
-                    runs.append(slice(start, end))
-        return runs
-
-    def _tile(self, corner: Tensor) -> Sequence[int]:
-        """The column and the row of the tile nearest to a point."""
-        place = ((corner - self.low)[:2] / self.size).floor()
-        return place.clamp(0, TILES - 1).int().tolist()
+                found &= owners[under] != number
+            dark[under[found]] = True
+        return torch.empty_like(dark).index_put_((order,), dark)
 
 
 def rotation(x: float, y: float, z: float) -> Tensor:
@@ -328,10 +242,8 @@ def rotation(x: float, y: float, z: float) -> Tensor:
     turns = torch.eye(3, dtype=torch.float64)
     for axis, degrees in enumerate((x, y, z)):
         c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-        turn = torch.eye(3, dtype=torch.float64)
-        a, b = (axis + 1) % 3, (axis + 2) % 3
-        turn[a, a], turn[a, b], turn[b, a], turn[b, b] = c, -s, s, c
-        turns = turn @ turns
+        about_x = torch.tensor([[1, 0, 0], [0, c, -s], [0, s, c]], dtype=torch.float64)
+        turns = about_x.roll((axis, axis), (0, 1)) @ turns
     return turns.float()
 
 

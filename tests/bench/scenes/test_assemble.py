@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from bench.cameras import look_at
-from bench.scenes import assemble
 from bench.scenes.assemble import CELLS, Box, box_of_cameras, cube, hold_out, hull_box, tight
 from bench.scenes.embedded import picture, pose_on_sphere, train_poses
 from bench.scenes.embedded.raytrace import Part, Solids
@@ -46,6 +45,8 @@ def test_each_training_picture_is_either_learned_from_or_held_out(tiny_scene, co
         assert pairs[name][0] is camera
         assert pairs[name][1] is image
     assert found.splits["test"] is scene.splits["test"]
+    with pytest.raises(SteerbenchError, match=r"split=validation: expected at least 8 .* got 7 of"):
+        hold_out(with_training(tiny_scene, 7), "validation", 8)
 
 
 def test_the_digest_says_that_and_what_is_held_out(tiny_scene):
@@ -55,11 +56,6 @@ def test_the_digest_says_that_and_what_is_held_out(tiny_scene):
     assert len({scene.digest, *digests}) == 3
     other = replace(scene, digest="of other pictures")
     assert hold_out(other, "validation", 8).digest != digests[0]
-
-
-def test_too_few_training_pictures_are_refused(tiny_scene):
-    with pytest.raises(SteerbenchError, match=r"split=validation: expected at least 8 .* got 7 of"):
-        hold_out(with_training(tiny_scene, 7), "validation", 8)
 
 
 SIZE, RED = 32, plain((1.0, 0.0, 0.0))
@@ -96,15 +92,6 @@ def test_the_hull_of_many_views_is_tight():
     # A pixel is 4 / 45 wide there; the hull has up to 2 of them and a cell of 3 / 64 more.
     slack = 2 * 4 / 45 + 2 * 3 / 64
     assert (box.upper - box.lower).max() <= (0.6 + 2 * slack) * 1.05
-
-
-def test_blocks_drop_no_cell_that_would_be_kept(monkeypatch):
-    part = Part(Ellipsoid((0.2, 0.5, 0.1)), RED, (0.3, -0.2, 0.1))
-    box = hull_of(part, train_poses(20, 3))
-    monkeypatch.setattr(assemble, "GLANCES", 0)
-    cell_by_cell = hull_of(part, train_poses(20, 3))
-    assert torch.equal(box.lower, cell_by_cell.lower)
-    assert torch.equal(box.upper, cell_by_cell.upper)
 
 
 def test_cells_that_leave_the_picture_are_kept():

@@ -10,21 +10,6 @@ from bench.scenes import blender, transforms
 from bench.scenes.export import write_blender
 
 
-def test_a_scene_that_was_written_is_read_bit_by_bit(moved_scene, quiet_log, tmp_path):
-    write_blender(moved_scene, tmp_path, {"train": "train", "test": "test"}, quiet_log)
-    found = blender.load(tmp_path, bounds="full", log=quiet_log)
-    assert found.splits.keys() == {"train", "test"}
-    for name, split in found.splits.items():
-        given = moved_scene.splits[name]
-        for camera, image, wanted, picture in zip(
-            split.cameras, split.images, given.cameras, given.images, strict=True
-        ):
-            assert torch.equal(image, picture)
-            assert torch.equal(camera.c2w, wanted.c2w)
-            assert camera.fx == pytest.approx(wanted.fx, rel=1e-15)
-            assert (camera.cx, camera.cy, camera.width) == (20.0, 16.0, 40)
-
-
 def test_pictures_without_alpha_are_opaque_and_a_split_not_named_has_none(
     moved_scene, log, tmp_path
 ):

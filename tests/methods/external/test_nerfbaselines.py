@@ -1,11 +1,15 @@
 """A method of NerfBaselines, in an environment that pip makes for it, as a method of ours."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 import torch
 
-from bench.nerfbaselines import VERSION
 from bench.types import Budget, NullProbe, composite
 
+VERSION = "1.2.12"
 METHOD = '''
 """The mean colour of the training pictures, a share of it at each step."""
 
@@ -51,6 +55,22 @@ from nerfbaselines import register
 
 register({"id": "mean", "method_class": "mean_method:Mean"})
 """
+
+
+@pytest.fixture(scope="module")
+def nerfbaselines(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A Python that has NerfBaselines: $NERFBASELINES_PYTHON, or that of a new environment, because
+    it needs an older numpy than ours; skips where pip cannot install it."""
+    if given := os.environ.get("NERFBASELINES_PYTHON"):
+        return given
+    folder = tmp_path_factory.mktemp("nerfbaselines")
+    subprocess.run([sys.executable, "-m", "venv", folder], check=True)
+    python = str(folder / "bin/python")
+    install = [python, "-m", "pip", "install", "--quiet", f"nerfbaselines=={VERSION}"]
+    done = subprocess.run(install, capture_output=True, text=True, check=False)
+    if done.returncode:
+        pytest.skip(f"pip cannot install NerfBaselines here: {done.stderr.strip()[-200:]}")
+    return python
 
 
 @pytest.mark.slow
