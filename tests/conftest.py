@@ -5,6 +5,7 @@ import math
 import os
 import re
 import signal
+import sys
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
