@@ -2,7 +2,7 @@
 #
 #   PYTHON=python3.12      the interpreter to build the environment from (3.11 or newer)
 #   VENV=.venv             where the environment lives
-#   PIP_ARGS="..."         further arguments for pip, e.g. an index of CPU-only wheels of torch
+#   PIP_ARGS="..."         further arguments for pip; without any, torch is the build for CPUs if there is no driver
 #   DEMO_ARGS="..."        overrides for the demo, e.g. DEMO_ARGS="seed=1 scene=wires"
 #   PAPER_ARGS="..."       overrides for the paper's tables, e.g. PAPER_ARGS="budget=full data=DIR"
 #   GPU_ARGS="..."         of docs/gpu.py, e.g. GPU_ARGS="--data DIR/mic"
@@ -23,6 +23,8 @@ PAPER_ARGS ?= budget=paper protocol=paper-1 scene=totem,mill
 
 # A complete interpreter is one that is new enough and can make environments with pip in them.
 SUITS := import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))
+
+DRIVER := ls /proc/driver/nvidia/version /usr/lib/wsl/lib/nvidia-smi 2>/dev/null | grep -q .
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' Makefile
@@ -81,6 +83,10 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	  fi; \
 	  echo "making $(VENV) with $$($$found --version)"; \
 	  $$found -m venv --clear $(VENV); }
+	@$(BIN)/python -c 'import torch' 2>/dev/null || [ -n "$(PIP_ARGS)" ] || $(DRIVER) || { \
+	  echo "no NVIDIA driver: torch for CPUs is tried first"; \
+	  $(BIN)/python -m pip install --disable-pip-version-check -q --retries 0 --timeout 10 -c constraints.txt \
+	    --extra-index-url https://download.pytorch.org/whl/cpu torch torchvision || true; }
 	$(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c constraints.txt -e ".[dev,openvino,video,viewer,colmap]"
 	-$(BIN)/steerbench compile
 	@touch $@
