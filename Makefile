@@ -29,7 +29,7 @@ DRIVER := ls /proc/driver/nvidia/version /usr/lib/wsl/lib/nvidia-smi 2>/dev/null
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' Makefile
 
-install: $(VENV)/.installed ## make $(VENV), install steerbench into it, compile its kernels
+install: $(VENV)/.installed ## make $(VENV), install steerbench into it, compile the kernels of the demo
 
 demo: install ## build a scene, train on it, render it, write outputs/demo/report.html
 	@$(BIN)/steerbench run +experiment=demo $(DEMO_ARGS)
@@ -38,7 +38,8 @@ paper: install ## measure every table of the SteerNeRF paper, write outputs/pape
 	@$(BIN)/steerbench paper $(PAPER_ARGS)
 
 # A process for each core, a file of tests in one of them, in the order of tests/conftest.py.
-PYTEST = $(BIN)/python -m pytest -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+# All kernels are compiled before, or several processes would compile the same.
+PYTEST = $(BIN)/steerbench compile && $(BIN)/python -m pytest -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
 test: lint ## lint, then all tests that take no more than a few seconds
 	$(PYTEST) -m "not slow"
@@ -88,5 +89,5 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	  $(BIN)/python -m pip install --disable-pip-version-check -q --retries 0 --timeout 10 -c constraints.txt \
 	    --extra-index-url https://download.pytorch.org/whl/cpu torch torchvision || true; }
 	$(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c constraints.txt -e ".[dev,openvino,video,viewer,colmap]"
-	-$(BIN)/steerbench compile
+	-$(BIN)/steerbench compile ngp steernerf gaussians
 	@touch $@

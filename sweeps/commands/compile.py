@@ -1,4 +1,4 @@
-"""`steerbench compile`: compile all kernels for this CPU now, not when they are first called.
+"""`steerbench compile`: compile kernels for this CPU now, not when they are first called.
 
 A kernel is compiled by computing its cases, which covers all types of inputs.
 """
@@ -7,18 +7,20 @@ import argparse
 import importlib
 import os
 import sys
+from collections.abc import Sequence
 from concurrent.futures import as_completed
 from pathlib import Path
 
 from bench.case import failed
 from bench.console import ConsoleLog
 from methods import checks
+from sweeps.overrides import composed, target_of
 from sweeps.processes import processes
 
 
 def main(options: argparse.Namespace) -> int:
-    """Compile the kernels for this CPU, on all cores; return 1 if one of them is wrong."""
-    names = checks.modules("cases")
+    """Compile kernels for this CPU, on all cores; return 1 if one of them is wrong."""
+    names = needed(options.methods) if options.methods else checks.modules("cases")
     with (
         processes(len(os.sched_getaffinity(0))) as pool,
         ConsoleLog(Path()).progress("compiling kernels", len(names)) as bar,
@@ -30,6 +32,13 @@ def main(options: argparse.Namespace) -> int:
     for case in sorted(wrong):
         print(f"wrong on this machine: {case}; see `steerbench kernels`", file=sys.stderr)
     return int(bool(wrong))
+
+
+def needed(methods: Sequence[str]) -> list[str]:
+    """The modules of cases beside what the classes of `methods` import."""
+    for method in methods:
+        target_of(composed([f"method={method}"]).method)
+    return [name for name in checks.modules("cases") if name.rpartition(".")[0] in sys.modules]
 
 
 def wrong_of(module: str) -> list[str]:

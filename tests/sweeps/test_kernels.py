@@ -1,6 +1,7 @@
 """`steerbench kernels`, `compile` and `stress`: a table, then JSON; what is wrong fails them."""
 
 import fcntl
+import subprocess
 import sys
 from functools import partial
 from types import SimpleNamespace
@@ -110,6 +111,15 @@ def test_compile_computes_the_cases_of_all_modules_in_processes(steerbench, monk
     monkeypatch.setattr("methods.checks.modules", lambda name: ["methods.kernels.shade"])
     with pytest.raises(AttributeError, match="has no attribute 'cases'"):
         steerbench("compile")
+
+
+def test_compile_takes_what_the_named_methods_import():
+    """In a process of its own: here, other tests have imported more."""
+    code = "from sweeps.commands.compile import needed; print(*needed(['ngp', 'gaussians']))"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    modules = set(ran.stdout.split())
+    assert {"methods.kernels.encode.cases", "methods.gaussians.kernels.ssim.cases"} < modules
+    assert not any("diver" in module or "kilonerf" in module for module in modules)
 
 
 # stress
