@@ -223,9 +223,9 @@ def quality_along(lines: Lines, name: str, path: Path) -> None:
 
 
 def as_number(value: str) -> float | None:
-    """What a setting says, if that is a number."""
+    """What a setting says, if that is a number; of a power of 2, the exponent."""
     try:
-        return float(value)
+        return float(value.removeprefix("2^"))
     except ValueError:
         return None
 
