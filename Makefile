@@ -19,7 +19,7 @@ PIP_ARGS ?=
 DEMO_ARGS ?=
 FIGURES_ARGS ?=
 GPU_ARGS ?=
-PAPER_ARGS ?= budget=paper protocol=paper-1 scene=totem,mill
+PAPER_ARGS ?= budget=paper protocol=paper-1 scene=totem,totem_hd
 
 # A complete interpreter is one that is new enough and can make environments with pip in them.
 SUITS := import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))

@@ -80,7 +80,7 @@ def _plot(
     plot: Mapping[str, Any], tables: Sequence[PaperTable], measured: Measured
 ) -> Iterator[Part]:
     """A plot with heading and caption, if any of its lines was measured."""
-    some: Sequence[Any] = _chosen(plot.get("lines", {}), tables, measured)
+    some: Sequence[Any] = _chosen(plot["lines"], tables, measured)
     if "metric" in plot:
         every = ((table, key, line) for table in tables for key, line in table.lines.items())
         added = {line.label: (table.name, key) for table, key, line in every if line.added}

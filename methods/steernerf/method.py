@@ -54,7 +54,7 @@ class SteerNerf(OnField):
             "skips": [
                 Variant(f"{name} not skipped", (f"{word}=false",)) for name, word in SKIPS.items()
             ],
-            "step length": turned("step", f"{HOW}.step", (1.5, 2, 3)),
+            "step length": turned("step", f"{HOW}.step", (1.5, 3, 4)),
             "stop": turned("stop", f"{HOW}.stop", ("1e-1", "3e-2", "1e-3", "1e-4")),
             "range reduction": RANGES,
         },

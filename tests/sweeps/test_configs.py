@@ -19,7 +19,7 @@ CHOICES = [f"{group}={name}" for group in GROUPS for name in choices(group)]
 SIZES = sorted((CONFIGS / "size").glob("*/*.yaml"))
 USERS = {
     **{"field": "method=ngp", "unet": "method=steernerf", "tables": "method=ngp"},
-    **{"totem": "scene=totem", "mill": "scene=mill", "student": "method=nerf"},
+    **{"totem": "scene=totem", "totem_hd": "scene=totem_hd", "student": "method=nerf"},
 }
 """Of sizes that are not of one method: a word that chooses what takes them in."""
 
@@ -54,7 +54,7 @@ def default(field: Field) -> Any:
 
 
 def test_every_scene_has_a_choice():
-    embedded = {"totem", "wires", "cloud", "void", "mill"}
+    embedded = {"totem", "wires", "cloud", "void", "totem_hd"}
     assert choices("scene").keys() == {"blender", "colmap", "nsvf", "transforms", *embedded}
 
 
@@ -70,7 +70,7 @@ def test_a_scene_has_every_option_of_its_loader_and_no_other_default(name):
     parameters = inspect.signature(get_object(config.pop("_target_"))).parameters
     assert config.pop("_convert_") == "all"  # loaders take plain lists
     assert set(config) == set(parameters) - {"log"}
-    size = {"width", "height"} if name == "mill" else set()  # larger than the other pictures
+    size = {"width", "height"} if name == "totem_hd" else set()  # larger than the other pictures
     for option in config.keys() - {"root", "bounds"} - size:
         assert parameters[option].default in (config[option], inspect.Parameter.empty)
 

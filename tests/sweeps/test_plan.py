@@ -151,16 +151,15 @@ def test_tables_of_times_are_in_half_precision_where_the_cpu_has_it(
 # Scenes and data sets
 
 
-def test_a_scene_is_compared_with_the_figures_of_its_data_set(monkeypatch):
+def test_a_scene_is_compared_with_the_figures_of_its_data_set():
     """Embedded scenes are compared with the first data set, unless they stand in for another."""
-    monkeypatch.setitem(DATA_SETS["Tanks & Temples"], "stand_ins", ["wires"])
-    words = ["scene=wires,totem", "scene.downscale=2", "budget=tiny", "seed=0"]
+    words = ["scene=totem_hd,totem", "scene.downscale=2", "budget=paper", "seed=0"]
     scenes = scenes_of(words)
     assert data_sets(scenes) == ["NeRF-Synthetic", "Tanks & Temples"]
     tables = {table.name: table for table in chosen(data_sets=data_sets(scenes))}
     of_block: dict[str, set[tuple[str, str]]] = {}
     for job in plan(tables["table1"], words):
-        assert job.config.scene.name == job.scene
+        assert job.config.scene.height == {"totem": None, "totem_hd": 1080}[job.scene]
         assert job.config.scene.downscale == 2
         of_block.setdefault(job.block, set()).add((job.scene, job.line))
         again = composed([text for text in job.command[2:] if text != "hydra.mode=RUN"])
@@ -168,7 +167,7 @@ def test_a_scene_is_compared_with_the_figures_of_its_data_set(monkeypatch):
     assert list(of_block) == list(DATA_SETS)
     first, second = of_block.values()
     assert {scene for scene, _ in first} == {"totem"}
-    assert {scene for scene, _ in second} == {"wires"}
+    assert {scene for scene, _ in second} == {"totem_hd"}
     assert {line for _, line in second} == set(tables["table1"].beside)
     assert len(second) == 4
     assert {job.scene for job in plan(tables["table5"], words)} == {"totem"}

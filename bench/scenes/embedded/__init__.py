@@ -7,7 +7,7 @@ import hashlib
 import json
 import math
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -23,25 +23,9 @@ from bench.scenes.files import opengl_to_opencv, whole_number
 from bench.threads import in_parallel
 from bench.types import Camera, Log, Scene, SteerbenchError, Unavailable
 
-ANGLE_X = 0.69  # horizontal field of view in radians
-DISTANCE = 4.3  # of most cameras from the centre of the scene, in the model's units
+ANGLE = 0.69  # field of view across the shorter side of a picture, in radians
+DISTANCE = 4.3  # of all cameras from the centre of the scene, in the model's units
 WIDTH, TRAIN, TEST = 400, 60, 24  # of what a scene has that is called like its model alone
-
-
-@dataclass(frozen=True)
-class Viewpoints:
-    """Where the cameras of a scene are; heights are in degrees above the horizon."""
-
-    lowest: float = -10.0  # of the training poses
-    highest: float = 80.0
-    middle: float = 25.0  # of the test poses
-    swing: float = 8.0  # up and down from there
-    distance: float = DISTANCE
-
-
-MOST = Viewpoints()
-VIEWS = {"mill": Viewpoints(3.0, 26.0, middle=14.0, swing=6.0, distance=4.7)}
-"""Of scenes that need others than most: nobody sees a building from below its ground."""
 
 
 def load(
@@ -61,10 +45,10 @@ def load(
     """Read an embedded scene; write it first if it does not exist yet.
 
     `train` pictures come from all around, 10 degrees below to 80 degrees above the horizon; `test`
-    pictures from a smooth orbit, 1 degree of azimuth apart (360 close it). `VIEWS` has the heights
-    of scenes that need others. For `downscale`, `background` and `bounds` see `blender.load`. Sizes
-    other than the defaults, and a seed, stand in the scene's name, for it is another scene. Raises
-    SteerbenchError when an option is out of range or `root` cannot be written.
+    pictures from a smooth orbit, 1 degree of azimuth apart (360 close it). For `downscale`,
+    `background` and `bounds` see `blender.load`. Sizes other than the defaults, and a seed, stand
+    in the scene's name, for it is another scene. Raises SteerbenchError when an option is out of
+    range or `root` cannot be written.
     """
     sizes = {"width": width, "height": width if height is None else height, "train": train}
     numbers = {**sizes, "test": test, "seed": seed}
@@ -137,10 +121,10 @@ def write(folder: Path, settings: dict, log: Log) -> None:
 
 def _write_pictures(folder: Path, settings: dict, log: Log) -> None:
     model, width, height = find(settings["name"]), settings["width"], settings["height"]
-    focal, views = width / 2 / math.tan(ANGLE_X / 2), VIEWS.get(settings["name"], MOST)
-    train = train_poses(settings["train"], settings["seed"], views)
+    focal = min(width, height) / 2 / math.tan(ANGLE / 2)
+    train = train_poses(settings["train"], settings["seed"])
     jobs = []
-    for split, poses in (("train", train), ("test", orbit_poses(settings["test"], views))):
+    for split, poses in (("train", train), ("test", orbit_poses(settings["test"]))):
         (folder / split).mkdir(parents=True)
         frames = []
         for number, pose in enumerate(poses):
@@ -148,7 +132,8 @@ def _write_pictures(folder: Path, settings: dict, log: Log) -> None:
             jobs.append((camera, folder / split / f"r_{number}.png"))
             matrix = [*opengl_to_opencv(pose).tolist(), [0.0, 0.0, 0.0, 1.0]]
             frames.append({"file_path": f"./{split}/r_{number}", "transform_matrix": matrix})
-        record = {"camera_angle_x": ANGLE_X, "scene": settings, "frames": frames}
+        angle = 2 * math.atan(width / 2 / focal)
+        record = {"camera_angle_x": angle, "scene": settings, "frames": frames}
         (folder / blender.camera_file(split)).write_text(json.dumps(record, indent=1))
 
     def draw(job: tuple[Camera, Path]) -> None:
@@ -158,28 +143,24 @@ def _write_pictures(folder: Path, settings: dict, log: Log) -> None:
     in_parallel(draw, jobs, f"render {settings['name']}", log)
 
 
-def train_poses(count: int, seed: int, views: Viewpoints = MOST) -> list[Tensor]:
+def train_poses(count: int, seed: int) -> list[Tensor]:
     """Poses spread evenly over a zone of the sphere by the golden angle; `seed` sets the start."""
     phase, shift = torch.rand(2, generator=torch.Generator().manual_seed(seed)).tolist()
-    low, high = (math.sin(math.radians(x)) for x in (views.lowest, views.highest))
+    low, high = (math.sin(math.radians(x)) for x in (-10.0, 80.0))
     golden = math.pi * (3 - math.sqrt(5))
     heights = (math.asin(low + (high - low) * (k + shift) / count) for k in range(count))
-    return [
-        pose_on_sphere(2 * math.pi * phase + golden * k, h, views.distance)
-        for k, h in enumerate(heights)
-    ]
+    return [pose_on_sphere(2 * math.pi * phase + golden * k, h) for k, h in enumerate(heights)]
 
 
-def orbit_poses(count: int, views: Viewpoints = MOST) -> list[Tensor]:
+def orbit_poses(count: int) -> list[Tensor]:
     """Poses 1 degree of azimuth apart, centred on the front, that rise and fall twice a turn."""
     azimuths = [math.radians(-90 + k - (count - 1) / 2) for k in range(count)]
-    heights = (math.radians(views.middle + views.swing * math.sin(2 * a)) for a in azimuths)
-    return [pose_on_sphere(*place, views.distance) for place in zip(azimuths, heights, strict=True)]
+    return [pose_on_sphere(a, math.radians(25.0 + 8.0 * math.sin(2 * a))) for a in azimuths]
 
 
-def pose_on_sphere(azimuth: float, elevation: float, distance: float = DISTANCE) -> Tensor:
-    """Camera-to-world [3, 4] float64 that looks at the centre from `distance`, z up; radians."""
+def pose_on_sphere(azimuth: float, elevation: float) -> Tensor:
+    """Camera-to-world [3, 4] float64 that looks at the centre from `DISTANCE`, z up; radians."""
     level = math.cos(elevation)
     direction = (level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation))
-    eye = distance * torch.tensor(direction, dtype=torch.float64)
+    eye = DISTANCE * torch.tensor(direction, dtype=torch.float64)
     return look_at(eye, torch.zeros_like(eye), eye.new_tensor((0, 0, 1)))

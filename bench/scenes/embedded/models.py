@@ -4,8 +4,7 @@ import math
 from collections.abc import Callable
 from itertools import pairwise
 
-from bench.scenes.embedded.mill import mill
-from bench.scenes.embedded.raytrace import Ball, Media, Part, SceneModel, Solids, along
+from bench.scenes.embedded.raytrace import Ball, Media, Part, SceneModel, Solids
 from bench.scenes.embedded.solids import (
     Capsule,
     Carved,
@@ -116,8 +115,11 @@ def wires() -> Solids:
 
 
 def wire(start: Triple, end: Triple, radius: float, colour: Colour) -> Part:
-    length, middle, turn = along(start, end)
-    return Part(Capsule(radius, length / 2), plain(colour), middle, turn, gloss=0.3)
+    x, y, z = (b - a for a, b in zip(start, end, strict=True))
+    cx, cy, cz = ((a + b) / 2 for a, b in zip(start, end, strict=True))
+    length = math.sqrt(x * x + y * y + z * z)
+    turn = (0.0, math.degrees(math.acos(z / length)), math.degrees(math.atan2(y, x)))
+    return Part(Capsule(radius, length / 2), plain(colour), (cx, cy, cz), turn, gloss=0.3)
 
 
 def cage() -> list[Part]:
@@ -183,5 +185,5 @@ def void() -> Solids:
 
 
 MODELS: dict[str, Callable[[], SceneModel]] = {
-    make.__name__: make for make in (totem, wires, cloud, void, mill)
+    make.__name__: make for make in (totem, wires, cloud, void)
 }

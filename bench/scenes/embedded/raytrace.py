@@ -14,15 +14,7 @@ import torch
 from torch import Tensor
 
 from bench.cameras import project
-from bench.scenes.embedded.solids import (
-    Carved,
-    Pierced,
-    Shape,
-    Triple,
-    ball_interval,
-    box_corners,
-    unit,
-)
+from bench.scenes.embedded.solids import Carved, Shape, Triple, ball_interval, box_corners, unit
 from bench.scenes.embedded.textures import Colour, Texture
 from bench.types import EMPTY_ALPHA, Camera, Frame
 
@@ -36,6 +28,8 @@ LIFT = 1e-4  # distance of a shadow ray's start above the surface, in the model'
 
 SKY, GROUND, SUN = 0.52, 0.24, 0.62
 """Light from above, from below, and from the light's direction, as shares of a surface's colour."""
+
+SHARPNESS = 60.0  # exponent of highlights
 
 
 @dataclass(frozen=True)
@@ -127,7 +121,6 @@ class Part:
     centre: Triple = (0.0, 0.0, 0.0)  # origin of the frame, in the model's units
     turn: Triple = (0.0, 0.0, 0.0)  # in degrees about x, then y, then z
     gloss: float = 0.0  # strength of the highlight, 0 for a matt surface
-    sharpness: float = 60.0  # exponent of the highlight
     frame: Tensor = field(init=False)
 
     def __post_init__(self) -> None:
@@ -202,8 +195,7 @@ class Solids:
         for part, piece in pieces:
             colours[piece] = part.texture(local[piece]) * light[piece]
             if part.gloss:
-                shine = highlight[piece] ** part.sharpness
-                colours[piece] += part.gloss * shine * lit[piece, None]
+                colours[piece] += part.gloss * highlight[piece] ** SHARPNESS * lit[piece, None]
         return colours.clamp(max=1)
 
     def shadowed(self, owners: Tensor, points: Tensor) -> Tensor:
@@ -231,7 +223,7 @@ class Solids:
             x, y, z = (caster.frame.T @ below if any(caster.turn) else below).unbind(0)
             u, v, w = (self.light @ caster.frame).unbind(0)
             found = caster.shape.hit((x, y, z), (u, v, w)) < math.inf
-            if not isinstance(caster.shape, Carved | Pierced):
+            if not isinstance(caster.shape, Carved):
                 found &= owners[under] != number
             dark[under[found]] = True
         return torch.empty_like(dark).index_put_((order,), dark)
@@ -245,15 +237,6 @@ def rotation(x: float, y: float, z: float) -> Tensor:
         about_x = torch.tensor([[1, 0, 0], [0, c, -s], [0, s, c]], dtype=torch.float64)
         turns = about_x.roll((axis, axis), (0, 1)) @ turns
     return turns.float()
-
-
-def along(start: Triple, end: Triple) -> tuple[float, Triple, Triple]:
-    """Length and middle of a line, and the turn of a part whose z axis lies on it."""
-    x, y, z = (b - a for a, b in zip(start, end, strict=True))
-    cx, cy, cz = ((a + b) / 2 for a, b in zip(start, end, strict=True))
-    length = math.sqrt(x * x + y * y + z * z)
-    turn = (0.0, math.degrees(math.acos(z / length)), math.degrees(math.atan2(y, x)))
-    return length, (cx, cy, cz), turn
 
 
 @dataclass(frozen=True)

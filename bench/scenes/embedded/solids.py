@@ -93,46 +93,6 @@ class Cuboid(Convex):
 
 
 @dataclass(frozen=True)
-class Gable(Convex):
-    """A prism along x, in y and z a triangle with its point up."""
-
-    half: Triple  # sizes along x, y (at the foot) and z
-
-    def extent(self) -> Triple:
-        return self.half
-
-    def interval(self, origin: Origin, directions: Directions) -> Interval:
-        (x, y, z), (u, v, w) = origin, directions
-        length, width, height = self.half
-        kept = overlap(slab(x, u, length), slab(z, w, height))
-        for side in (-2 * height, 2 * height):
-            # The slopes are side * y + width * z = width * height.
-            slope = below(side * y + width * z, side * v + width * w, width * height)
-            kept = overlap(kept, slope)
-        return kept
-
-    def distance(self, points: Tensor) -> Tensor:
-        return self._beyond(points).amax(1)
-
-    def normal(self, points: Tensor) -> Tensor:
-        """The normal of the nearest plane."""
-        _, width, height = self.half
-        signs, zero = points.sign(), torch.zeros(len(points)).to(points)
-        slope = torch.stack((zero, 2 * height * signs[:, 1], zero + width), dim=1)
-        end, foot = signs * points.new_tensor((1, 0, 0)), points.new_tensor((0, 0, -1))
-        planes = torch.stack((end, foot.expand_as(end), unit(slope)), dim=1)
-        nearest = self._beyond(points).argmax(1)
-        return planes[torch.arange(len(points)), nearest]
-
-    def _beyond(self, points: Tensor) -> Tensor:
-        """How far points are beyond an end, the foot and a slope, [N, 3]."""
-        length, width, height = self.half
-        x, y, z = points.unbind(1)
-        slope = (2 * height * y.abs() + width * (z - height)) / math.hypot(2 * height, width)
-        return torch.stack((x.abs() - length, -z - height, slope), dim=1)
-
-
-@dataclass(frozen=True)
 class Cylinder(Convex):
     """A capped cylinder along z."""
 
@@ -282,73 +242,6 @@ class Carved(Shape):
         return normal
 
 
-@dataclass(frozen=True)
-class Pierced(Shape):
-    """A box with a lattice of rectangular holes through it along y: a wall, a fence, a ladder.
-
-    A ray that starts inside the solid is taken to leave it where it leaves the box.
-    """
-
-    half: Triple
-    count: tuple[int, int]  # holes along x and along z, evenly spread
-    hole: tuple[float, float]  # half sizes of a hole along x and z
-
-    def extent(self) -> Triple:
-        return self.half
-
-    def hit(self, origin: Origin, directions: Directions) -> Tensor:
-        """Where a ray enters the solid, or the side of the hole that it is in."""
-        enter, leave = Cuboid(self.half).interval(origin, directions)
-        start = enter.clamp(min=0)
-        side = torch.full_like(leave, math.inf)
-        inside = torch.ones_like(leave, dtype=torch.bool)
-        for axis, count, hole in zip((0, 2), self.count, self.hole, strict=True):
-            direction = directions[axis]
-            x = start * direction + origin[axis]
-            x -= centre_of_cell(x, self.half[axis], count)
-            inside &= x.abs() < hole
-            # Until the side ahead; a ray along the sides never gets there.
-            room = hole - x * direction.sign()
-            side = torch.minimum(side, room / direction.abs().clamp(min=1e-12))
-        side += start
-        side = torch.where(side < leave, side, math.inf)
-        solid = torch.where(enter > 0, enter, leave)
-        missed = (enter > leave) | (leave <= 0)
-        return torch.where(inside, side, solid).masked_fill_(missed, math.inf)
-
-    def distance(self, points: Tensor) -> Tensor:
-        return torch.maximum(Cuboid(self.half).distance(points), -self._from_hole(points).amax(1))
-
-    def normal(self, points: Tensor) -> Tensor:
-        """The normal of the box or of the side of a hole, whichever is nearer."""
-        beyond = self._from_hole(points)
-        x, _, z = (points - self._middles(points)).unbind(1)
-        zero = torch.zeros_like(x)
-        across = (beyond[:, 0] > beyond[:, 1])[:, None]
-        upright, level = torch.stack((-x, zero, zero), 1), torch.stack((zero, zero, -z), 1)
-        sides = torch.where(across, upright, level).sign()
-        box = Cuboid(self.half)
-        on_box = box.distance(points).abs() < beyond.amax(1).abs()
-        return torch.where(on_box[:, None], box.normal(points), sides)
-
-    def _from_hole(self, points: Tensor) -> Tensor:
-        """How far points are beyond the sides of the nearest hole, along x and z: [N, 2]."""
-        return (points - self._middles(points)).abs()[:, ::2] - points.new_tensor(self.hole)
-
-    def _middles(self, points: Tensor) -> Tensor:
-        x, y, z = points.unbind(1)
-        along_x = centre_of_cell(x, self.half[0], self.count[0])
-        along_z = centre_of_cell(z, self.half[2], self.count[1])
-        return torch.stack((along_x, torch.zeros_like(y), along_z), dim=1)
-
-
-def centre_of_cell(x: Tensor, half: float, count: int) -> Tensor:
-    """The middle of the cell that holds x, of `count` cells from -half to half."""
-    size = 2 * half / count
-    cell = ((x + half) / size).floor().clamp(0, count - 1)
-    return (cell + 0.5) * size - half
-
-
 def ball_interval(origin: Sequence, directions: Sequence[Tensor], radius: float) -> Interval:
     """Where rays are within `radius` of 0, in as many dimensions as there are components.
 
@@ -375,14 +268,6 @@ def slab(origin: float | Tensor, direction: Tensor, half: float) -> Interval:
     inverse = direction.masked_fill(direction.abs() < 1e-12, 1e-12).reciprocal_()
     low, high = (-half - origin) * inverse, (half - origin) * inverse
     return torch.minimum(low, high), torch.maximum(low, high)
-
-
-def below(origin: float | Tensor, direction: Tensor, limit: float) -> Interval:
-    """Where a coordinate is at most `limit`, which starts at `origin` and grows by `direction`."""
-    slope = direction.masked_fill(direction.abs() < 1e-12, 1e-12)
-    crossing = (limit - origin) / slope
-    enter = torch.where(slope < 0, crossing, -math.inf)
-    return enter, torch.where(slope > 0, crossing, math.inf)
 
 
 def sum_of_products(first: Sequence, second: Sequence) -> Tensor:

@@ -7,16 +7,8 @@ import torch
 
 from bench.cameras import cast
 from bench.scenes.embedded import raytrace
-from bench.scenes.embedded.models import cloud, mill, totem, wires
-from bench.scenes.embedded.raytrace import (
-    LIGHT,
-    Ball,
-    Media,
-    Part,
-    Solids,
-    render,
-    sample_offsets,
-)
+from bench.scenes.embedded.models import cloud, totem, wires
+from bench.scenes.embedded.raytrace import LIGHT, Ball, Media, Part, Solids, render, sample_offsets
 from bench.scenes.embedded.solids import Capsule, Ellipsoid
 from bench.scenes.embedded.textures import plain
 from bench.types import EMPTY_ALPHA, Camera
@@ -89,7 +81,7 @@ def test_depth_is_finite_exactly_where_there_is_opacity():
     assert ((frame.rgb >= 0) & (frame.rgb <= 1 + 1e-6)).all()
 
 
-@pytest.mark.parametrize("model", [totem, wires, mill])
+@pytest.mark.parametrize("model", [totem, wires])
 @pytest.mark.parametrize("eye", [(1.0, -3.5, 1.5), (0.3, 0.2, 0.3), (0.0, 0.1, 4.0)])
 def test_the_nearest_of_all_parts_is_seen(monkeypatch, model, eye):
     solids, camera = model(), camera_at(eye, size=40)
@@ -127,7 +119,7 @@ def test_shadow_of_a_sphere_is_the_closed_form():
     assert 50 < (gap < 0).sum() < 3950
 
 
-@pytest.mark.parametrize("model", [totem, wires, mill])
+@pytest.mark.parametrize("model", [totem, wires])
 def test_culling_of_shadow_casters_changes_nothing(model):
     solids = model()
     points = 2.4 * torch.rand(6000, 3, generator=torch.Generator().manual_seed(3)) - 1.2

@@ -12,8 +12,6 @@ from bench.scenes.embedded.solids import (
     Cuboid,
     Cylinder,
     Ellipsoid,
-    Gable,
-    Pierced,
     Shape,
     Shifted,
 )
@@ -21,13 +19,9 @@ from bench.scenes.embedded.solids import (
 SHAPES: dict[str, Shape] = {
     "ellipsoid": Ellipsoid((0.9, 0.4, 0.6)),
     "box": Cuboid((0.5, 0.8, 0.3)),
-    "gable": Gable((0.5, 0.7, 0.6)),
     "cylinder": Cylinder(0.5, 0.7),
     "capsule": Capsule(0.3, 0.5),
-    "common": Common(Cuboid((0.6, 0.6, 0.6)), Ellipsoid((0.8, 0.8, 0.8))),
-    "common of a shifted": Common(
-        Cylinder(0.6, 0.6), Shifted(Ellipsoid((0.7,) * 3), (0.3, 0, 0.2))
-    ),
+    "common": Common(Cylinder(0.6, 0.6), Shifted(Ellipsoid((0.7,) * 3), (0.3, 0, 0.2))),
     "carved": Carved(
         Cuboid((0.6, 0.6, 0.4)),
         [
@@ -105,39 +99,6 @@ def test_normals_are_the_gradient_of_the_distance(shape):
 def test_the_extent_holds_every_hit(shape):
     points, _ = met(shape, 2000)
     assert (points.abs() <= torch.tensor(shape.extent(), dtype=torch.float64) + 1e-9).all()
-
-
-def test_a_pierced_box_is_a_box_minus_its_holes():
-    pierced = Pierced((0.9, 0.25, 0.6), (3, 2), (0.22, 0.2))
-    middles = [(x, 0.0, z) for x in (-0.6, 0.0, 0.6) for z in (-0.3, 0.3)]
-    body = Carved(Cuboid((0.9, 0.25, 0.6)), [Shifted(Cuboid((0.22, 9, 0.2)), x) for x in middles])
-    assert pierced.extent() == body.extent()
-    origins, directions = rays(4000)
-    inside = body.distance(origins) < 0
-    torch.testing.assert_close(pierced.distance(origins), body.distance(origins))
-    found, expected = (hits(shape, origins, directions)[~inside] for shape in (pierced, body))
-    torch.testing.assert_close(found, expected)
-    hit = found.isfinite()
-    assert 0.1 < hit.double().mean() < 0.5
-    # Some rays hit the sides of holes, from in front, from behind and from inside.
-    points = (origins[~inside] + found[:, None] * directions[~inside])[hit]
-    assert (points[:, 1].abs() < 0.249).double().mean() > 0.2
-    assert torch.equal(pierced.normal(points), body.normal(points))
-
-
-def test_from_inside_the_solid_a_pierced_box_ends_where_the_box_does():
-    pierced = Pierced((0.9, 0.25, 0.6), (3, 2), (0.22, 0.2))
-    along = tuple(torch.tensor([x]) for x in (0.0, 1.0, 0.0))
-    assert pierced.hit((0.3, 0.0, 0.3), along).item() == pytest.approx(0.25)
-
-
-def test_the_end_of_a_gable_has_the_area_of_a_triangle():
-    x, y = torch.meshgrid(*(torch.linspace(-1, 1, 801),) * 2, indexing="ij")
-    directions = (torch.full_like(x, 1e-9), torch.zeros_like(x), torch.ones_like(x))
-    # From below the foot is a rectangle, and a ray goes up to the slope: h (1 - |y| / w).
-    enter, leave = Gable((0.4, 0.5, 0.3)).interval((x, y, -torch.ones_like(x)), directions)
-    deep = (leave - enter).clamp(min=0).masked_fill(enter > leave, 0)
-    assert deep.mean().item() * 4 == pytest.approx(0.8 * 0.5 * 0.6, rel=0.01)
 
 
 def test_a_thin_wire_far_away_keeps_its_thickness_in_float32():

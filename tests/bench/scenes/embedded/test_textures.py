@@ -1,94 +1,10 @@
-"""Noise, and patterns where they can be told beforehand: joints, tones, what goes on in parts."""
+"""Noise, and patterns where they can be told beforehand."""
 
-import math
-
-import pytest
 import torch
 
-from bench.scenes.embedded.mill import block
-from bench.scenes.embedded.textures import (
-    Texture,
-    bricks,
-    cells,
-    checker,
-    lattice,
-    noise,
-    panes,
-    pips,
-    planks,
-    polar_checker,
-    rough,
-    setts,
-    spiral,
-    tiles,
-    tone,
-)
+from bench.scenes.embedded.textures import checker, lattice, noise, pips, polar_checker, spiral
 
-DARK, LIGHT, THIRD = (0.1, 0.1, 0.2), (0.7, 0.6, 0.5), (0.3, 0.5, 0.2)
-TEXTURES: dict[str, Texture] = {
-    "bricks": bricks(DARK, LIGHT, THIRD, (0.034, 0.012, 0.003)),
-    "planks": planks(DARK, LIGHT, (0.03, 0.004), False),
-    "floor": planks(DARK, LIGHT, (0.03, 0.004), True),
-    "tiles": tiles(DARK, LIGHT, THIRD, (0.03, 0.026)),
-    "setts": setts(DARK, LIGHT, THIRD, 0.03),
-    "rough": rough(DARK, LIGHT),
-    "panes": panes(DARK, LIGHT, (0.04, 0.04, 0.045)),
-}
-
-
-def scattered(count: int) -> torch.Tensor:
-    return 2 * torch.rand(count, 3, generator=torch.Generator().manual_seed(5)) - 1
-
-
-@pytest.mark.parametrize("name", TEXTURES)
-def test_a_texture_is_coloured_and_varies_from_place_to_place(name):
-    points = scattered(4000)
-    colours = TEXTURES[name](points)
-    assert colours.shape == (4000, 3)
-    assert colours.min() >= 0
-    assert colours.max() <= 1
-    assert (colours.std(0) > 0.03).all()
-    # Within a hair's breadth there is no pattern, but for the borders of pieces.
-    near = TEXTURES[name](points + 1e-5)
-    assert ((near - colours).abs().amax(1) < 0.02).float().mean() > 0.98
-
-
-def test_joints_have_their_share_of_a_wall():
-    x, y, z = scattered(200_000).unbind(1)
-    _, _, inside = cells(x + y, z, 0.034, 0.012)
-    share = (inside < 0.0015).float().mean().item()
-    assert share == pytest.approx(1 - (1 - 0.003 / 0.034) * (1 - 0.003 / 0.012), abs=0.005)
-
-
-def test_pieces_are_laid_half_a_piece_on_in_every_other_row():
-    u = torch.linspace(0.01, 3.99, 400)
-    row, column, _ = cells(u, torch.full_like(u, 0.5), 1.0, 1.0)
-    above, shifted, _ = cells(u - 0.5, torch.full_like(u, 1.5), 1.0, 1.0)
-    assert torch.equal(column, shifted)
-    assert {*row.tolist()} == {0.0}
-    assert {*above.tolist()} == {1.0}
-
-
-def test_tones_are_evenly_spread_and_come_again_only_after_1024_pieces():
-    row, column = torch.cartesian_prod(*(torch.arange(-64.0, 64),) * 2).unbind(1)
-    tones = tone(row, column)
-    assert tones.mean().item() == pytest.approx(0.5, abs=0.02)
-    assert tones.std().item() == pytest.approx(1 / math.sqrt(12), abs=0.02)
-    assert torch.equal(tones, tone(row, column + 1024))
-    for away in (1, 32, 64):
-        assert (tones == tone(row, column + away)).float().mean() < 0.1
-        assert (tones == tone(row + away, column)).float().mean() < 0.1
-
-
-def test_a_pattern_goes_on_from_part_to_part():
-    wall = block((0.0, 0.0, 0.0), (1.0, 0.2, 0.5), TEXTURES["bricks"])
-    more = block((0.6, 0.0, 0.3), (2.0, 0.2, 0.9), TEXTURES["bricks"])
-    shared = torch.rand(500, 3) * torch.tensor((0.4, 0.0, 0.2)) + torch.tensor((0.6, 0.0, 0.3))
-    seen = [
-        part.texture((shared - torch.tensor(part.centre)) @ part.frame) for part in (wall, more)
-    ]
-    # Only rounding may differ, and it can turn a point at the border of a piece.
-    assert ((seen[0] - seen[1]).abs().amax(1) > 1e-3).sum() <= 2
+DARK, LIGHT = (0.1, 0.1, 0.2), (0.7, 0.6, 0.5)
 
 
 def test_noise_is_that_of_its_lattice_continuous_and_has_a_period():
