@@ -22,7 +22,7 @@ from bench.clock import OTHER
 from bench.results import COLD
 from reports.comparison import written
 from reports.images import Picture
-from reports.lines import Lines
+from reports.lines import METHOD, Lines
 from reports.runs import Repeated, Run
 from reports.tables import NOT_AVAILABLE
 
@@ -197,7 +197,7 @@ def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
 def quality_along(lines: Lines, name: str, path: Path) -> None:
     """Write a PNG: PSNR over the numbers that the setting `name` has, a curve for each choice of
     the others, with intervals over seeds. Lines that lack the setting are dashed, all across."""
-    others = [of for other, of in lines.settings.items() if other != name and len(set(of)) > 1]
+    others = {x: of for x, of in lines.settings.items() if x != name and len(set(of)) > 1}
     curves: dict[str, dict[float, tuple[float, float]]] = {}
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
@@ -205,18 +205,19 @@ def quality_along(lines: Lines, name: str, path: Path) -> None:
     for number, line in enumerate(lines.lines):
         across, psnr = as_number(lines.settings[name][number]), line.mean("psnr")
         if psnr is not None and across is not None:
-            label = ", ".join(of[number] for of in others)
-            curves.setdefault(label, {})[across] = psnr, line.half("psnr")
+            words = (f"{x}={of[number]}".removeprefix(f"{METHOD}=") for x, of in others.items())
+            curves.setdefault(", ".join(words), {})[across] = psnr, line.half("psnr")
         elif psnr is not None:
             axes.axhline(psnr, **{**_style(number), "linestyle": "--"}, label=line.label)
     for number, (label, curve) in enumerate(curves.items()):
         means, bars = np.nan_to_num([curve[point] for point in sorted(curve)]).T
         style = {**_style(number), "capsize": 3, "label": label, "linestyle": "-"}
         axes.errorbar(sorted(curve), means, yerr=bars if bars.any() else None, **style)
-    low, *_, high = sorted({point for curve in curves.values() for point in curve})
-    if low > 0 and high > 10 * low:
+    ticks = sorted({point for curve in curves.values() for point in curve})
+    if ticks[0] > 0 and ticks[-1] > 10 * ticks[0]:
         axes.set_xscale("log")
-        axes.xaxis.set_major_formatter("{x:g}")
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.xaxis.set_minor_locator(NullLocator())
     if len(axes.get_legend_handles_labels()[1]) > 1:
         axes.legend(frameon=False)
     _save(figure, path)

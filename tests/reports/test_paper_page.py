@@ -125,7 +125,7 @@ def test_a_setting_with_numbers_has_a_curve_for_each_choice_of_the_others(run, t
     (low, high) = axes.collections[-1].get_segments()[1][:, 1]
     assert high - low == pytest.approx(2 * lines[4].half("psnr"))
     legend = {text.get_text() for text in axes.get_legend().get_texts()}
-    assert legend == {"field", "steernerf, 6", "steernerf, 8"}
+    assert legend == {"field", "steernerf, channels=6", "steernerf, channels=8"}
 
 
 def test_a_mark_stands_where_its_line_is_in_quality_and_cost(run, tmp_path, drawn):
