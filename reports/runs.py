@@ -392,6 +392,6 @@ def _joined(values: Sequence[Any]) -> Any:
 
 def _listed(values: Mapping[str, Any]) -> str:
     return ", ".join(
-        f"{name} {' + '.join(value) if isinstance(value, list) else value}"
+        f"{name} {' + '.join(value) or 'none' if isinstance(value, list) else value}"
         for name, value in values.items()
     )

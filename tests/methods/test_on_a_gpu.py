@@ -70,7 +70,7 @@ def steernerf(field: str, **others: Any) -> Method:
         "renderer": partial(UNet, width=4, aligned=True),
         "joint": small_joint(field=field, jitter=True, grid_samples=512, **FEW),
         "engine": TorchEngine(),
-        **{"name": "steernerf", "precision": "bf16", "seed": 0, "steps": None, "after": 1.0},
+        **{"name": "steernerf", "precision": "bf16", "seed": 0, "steps": None},
     }
     return SteerNerf(**given | others)
 
