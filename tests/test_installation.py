@@ -81,7 +81,7 @@ def steerbench(installed, tmp_path):
 @pytest.mark.slow
 def test_the_demo_of_the_wheel_writes_its_page(steerbench, tmp_path):
     steerbench("run", "+experiment=demo", *TINY)
-    assert "3D Gaussians" in (tmp_path / "outputs" / "demo" / "report.md").read_text()
+    assert "| gaussians |" in (tmp_path / "outputs" / "demo" / "report.md").read_text()
 
 
 @pytest.mark.slow
