@@ -236,4 +236,4 @@ def _as_written(annotation: Any) -> str:
     """A type as its signature has it."""
     if isinstance(annotation, str):
         return annotation
-    return re.sub(r"[a-z]\w*\.", "", inspect.formatannotation(annotation))  # without modules
+    return re.sub(r"\b[a-z_]\w*\.", "", inspect.formatannotation(annotation))  # without modules
