@@ -105,8 +105,9 @@ def _tradeoffs(lines: Lines) -> Iterator[Part]:
 
 def _ablations(lines: Lines) -> Iterator[Part]:
     """Plots of quality over the settings with several numbers."""
+    scored = [number for number, line in enumerate(lines.lines) if line.mean("psnr") is not None]
     for name, values in lines.settings.items():
-        if len({figures.as_number(value) for value in values} - {None}) > 2:
+        if len({figures.as_number(values[number]) for number in scored} - {None}) > 2:
             shows = f"PSNR in dB over {name}"
             yield f"## Quality over {name}"
             yield Picture(f"psnr-{name}", shows, partial(figures.quality_along, lines, name))

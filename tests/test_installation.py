@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from tests.sweeps.test_documents import write_files
+from tests.test_project import PACKAGES
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("bench", "methods", "reports", "sweeps")
 METADATA = ("pyproject.toml", "README.md", "LICENSE")
 TINY = (
     *("budget=tiny", "budget.steps=2", "budget.renderer_steps=2", "budget.frames=2"),
@@ -23,11 +23,10 @@ TINY = (
 def test_a_foreign_package_of_the_same_name_is_named_in_one_line(tmp_path):
     (tmp_path / "bench").mkdir()
     (tmp_path / "bench" / "__init__.py").touch()
-    places = os.pathsep.join((str(tmp_path), str(ROOT)))
     ran = subprocess.run(
         [sys.executable, "-c", "import sweeps"],
         cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": places},
+        env={**os.environ, "PYTHONPATH": f"{tmp_path}:{ROOT}"},
         capture_output=True,
         text=True,
     )
@@ -40,12 +39,10 @@ def test_a_foreign_package_of_the_same_name_is_named_in_one_line(tmp_path):
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The `steerbench` of an environment that has the wheel, and the libraries of this one."""
-    folder = tmp_path_factory.mktemp("wheel")
-    source, environment = folder / "source", folder / "environment"
-    source.mkdir()
+    source, folder = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+    environment = folder / "environment"
     for name in PACKAGES:
-        leave_out = shutil.ignore_patterns("__pycache__")
-        shutil.copytree(ROOT / name, source / name, ignore=leave_out)
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     for path in (
         *ROOT.glob("*.py"),
         *map(ROOT.joinpath, ("pyproject.toml", "README.md", "LICENSE")),
@@ -56,9 +53,9 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     built = [*pip, "wheel", *alone, "--no-build-isolation", "-w", str(folder), str(source)]
     subprocess.run(built, check=True)
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
-    python = environment / "bin" / "python"
     (wheel,) = folder.glob("*.whl")
-    subprocess.run([*pip, "--python", str(python), "install", *alone, str(wheel)], check=True)
+    there = ["--python", str(environment / "bin" / "python")]
+    subprocess.run([*pip, *there, "install", *alone, str(wheel)], check=True)
     (libraries,) = environment.glob("lib/python*/site-packages")
     (libraries / "libraries.pth").write_text(sysconfig.get_path("purelib"))
     return environment / "bin" / "steerbench"

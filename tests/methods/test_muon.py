@@ -18,9 +18,8 @@ def test_the_first_step_is_the_gradient_with_all_singular_values_set_to_one(shap
         for _ in range(2)
     )
     before = weight.clone()
-    optimiser = Muon([weight], lr=0.1)
     weight.grad = gradient.clone()
-    optimiser.step()
+    Muon([weight], lr=0.1).step()
 
     rows = torch.stack([(before - weight).flatten(1), gradient.flatten(1)])
     change, slope = rows / (0.2 * 0.1 * max(rows.shape[1:]) ** 0.5)

@@ -12,8 +12,10 @@ from PIL import Image
 from bench.types import SteerbenchError
 from reports import figures
 from reports.images import Part
-from reports.page import write_page
+from reports.lines import Lines
+from reports.page import _ablations, write_page
 from reports.publish import publish
+from reports.runs import Repeated
 from reports.tables import Table
 from tests.reports.conftest import rewrite, run_of
 
@@ -124,6 +126,11 @@ def test_runs_that_differ_in_frames_or_figures_share_no_picture_and_no_plot(seve
     assert "## Quality against memory" not in text
     assert len(linked(page)) == 2 + 2 * 3
     assert "**" not in text
+
+
+def test_numbers_of_a_setting_without_a_score_have_no_plot():
+    lines = Lines([Repeated("", [])] * 3, {"method": ["ngp"] * 3, "steps": ["1", "2", "3"]})
+    assert not [*_ablations(lines)]
 
 
 @pytest.mark.parametrize("of", ["rows", "rows_with_cold"])
