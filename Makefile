@@ -10,7 +10,7 @@
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
-.PHONY: help install demo paper figures gpu test test-all fuzz lint format clean
+.PHONY: help install demo paper figures gpu test test-all fuzz lint format constraints clean
 
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -19,6 +19,7 @@ PIP_ARGS ?=
 DEMO_ARGS ?=
 FIGURES_ARGS ?=
 GPU_ARGS ?=
+CONSTRAINTS_ARGS ?=
 PAPER_ARGS ?= budget=paper protocol=paper-1 scene=totem,totem_hd
 
 # A complete interpreter is one that is new enough and can make environments with pip in them.
@@ -27,7 +28,7 @@ SUITS := import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))
 DRIVER := ls /proc/driver/nvidia/version /usr/lib/wsl/lib/nvidia-smi 2>/dev/null | grep -q .
 
 help: ## show this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' Makefile
 
 install: $(VENV)/.installed ## make $(VENV), install steerbench into it, compile the kernels of the demo
 
@@ -64,6 +65,12 @@ lint: install ## ruff and mypy
 format: install ## let ruff put the sources in order
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+constraints: install ## pin what pyproject.toml needs; CONSTRAINTS_ARGS=--upgrade: in its newest versions
+	$(BIN)/python -m pip install --disable-pip-version-check -q uv
+	UV_CUSTOM_COMPILE_COMMAND="make constraints" $(BIN)/uv pip compile pyproject.toml --all-extras --no-annotate -q \
+	  --python-version 3.11 --python-platform x86_64-manylinux_2_28 -o constraints.txt $(CONSTRAINTS_ARGS)
+	sed -i '/^\(nvidia\|cuda\)-/d' constraints.txt  # torch itself pins those that it was built with
 
 clean: ## remove the environment and caches; outputs/ stays
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
