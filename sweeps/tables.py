@@ -67,6 +67,8 @@ def _table(name: str, whole: Any, data_sets: Sequence[str]) -> PaperTable:
     own["lines"] = lines = {}
     for key, job in _jobs(said, label, grid(whole), where).items():
         of = {**job, **said.get(key, {})}
+        if isinstance(of["job"], Mapping):  # YAML reads numbers, Hydra words
+            of["job"] = {x: "null" if of_x is None else str(of_x) for x, of_x in of["job"].items()}
         published = _by_data_set(of.pop("published", {}))
         check_settings(Line, of, f"{where}.lines.{key}.", ("published", "added"))
         figures = {x: _figures(of_one, own["metrics"], where) for x, of_one in published.items()}
