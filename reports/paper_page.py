@@ -46,6 +46,7 @@ def write_paper_page(
         compared = []
     every: list[Part] = [f"## {PAGE['comparisons']}", claim_table(compared)] if compared else []
     of_paper = any(table.number is not None for table in tables)
+    shown = PAGE if of_paper else _of_own(tables)
     title = PAGE["title"] if of_paper else ", ".join(table.title for table in tables)
     published = any(line.published for table in tables for line in table.lines.values())
     reading = [PAGE["distances"].strip()] if published else []
@@ -60,12 +61,20 @@ def write_paper_page(
         PAGE["reading"].strip(),
         *([f"Measured: {', '.join(map(' '.join, said.items()))}."] if said else []),
         *(part for table in tables for part in section(table, measured, said)),
-        *(part for plot in PAGE["plots"] for part in _plot(plot, tables, measured)),
-        *(part for images in PAGE["images"] for part in _images(images, tables, measured)),
+        *(part for plot in shown["plots"] for part in _plot(plot, tables, measured)),
+        *(part for images in shown["images"] for part in _images(images, tables, measured)),
         *every,
         f"## Runs\n\nTheir keys in the store, and the commands:\n\n```\n{sources}\n```",
     ]
     return publish(parts, folder, runs)
+
+
+def _of_own(tables: Sequence[PaperTable]) -> Mapping[str, Any]:
+    """Plots and images of all lines, for tables that are not the paper's."""
+    every = ((table.name, key, line) for table in tables for key, line in table.lines.items())
+    lines = {line.label: (name, key) for name, key, line in every if not line.added}
+    plots = [{**plot, "lines": lines} for plot in PAGE["plots"] if "metric" in plot]
+    return {"plots": plots, "images": [{"title": "Pictures", "lines": lines}]}
 
 
 def _conclusions(found: Sequence[Comparison]) -> Iterator[Part]:

@@ -90,10 +90,11 @@ def test_a_page_of_nothing_still_says_what_is_missing(tmp_path):
     assert "![" not in text
 
 
-def test_a_page_of_ones_own_table_has_its_title(run, tmp_path):
+def test_a_page_of_ones_own_table_has_its_title_and_pictures(run, tmp_path):
     table = PaperTable("mine", "My table", ["psnr"], {"a": Line("here", {})})
     text = write_paper_page([table], measured_of(table, {"a": run}), tmp_path).read_text()
     assert text.startswith("# My table\n")
+    assert "![Ground truth, here; a detail of each; error maps]" in text
     assert "paper" not in text
 
 
