@@ -18,7 +18,7 @@ NOT_AVAILABLE = "n/a"
 ABSENT = "–"  # of a figure that the paper does not give or that cannot be measured here
 EMPTY = ("", ABSENT, NOT_AVAILABLE)
 DENSE = ".dense"  # suffix of a work counter for the work of a method that skips nothing
-NETS = ("alex", "vgg", "squeeze")  # of LPIPS
+NETS = ("alex", "vgg")  # of LPIPS
 
 
 @dataclass(frozen=True)
