@@ -87,9 +87,8 @@ def test_several_axes_have_a_line_for_each_combination(tmp_path):
 
 
 def test_what_is_no_text_in_a_job_is_given_as_hydra_reads_it(tmp_path):
-    lines = "  lines: {few: {job: {method.steps: 25, engine.calibration: null}}}"
-    (table,) = chosen("mine", declared(tmp_path, lines))
-    assert table.lines["few"].job == {"method.steps": "25", "engine.calibration": "null"}
+    (table,) = chosen("mine", declared(tmp_path, "  lines: {x: {job: {a: 25, b: null}}}"))
+    assert table.lines["x"].job == {"a": "25", "b": "null"}
 
 
 @pytest.mark.parametrize(
