@@ -53,8 +53,8 @@ class ConsoleLog:
         self._bars.start()
         try:
             yield bar
-            if (elapsed := bar.elapsed()) > WORTH_A_LINE_S:
-                bar.say(f"done in {_duration(elapsed)}")
+            if bar.elapsed > WORTH_A_LINE_S:
+                self.info(bar.line(f"done in {_duration(bar.elapsed)}"))
         finally:
             self._bars.remove_task(bar.id)
             self._bars.refresh()
@@ -71,19 +71,19 @@ class ConsoleLog:
 
 class _Bar:
     def __init__(self, log: ConsoleLog, bars: progress.Progress, label: str, total: int) -> None:
-        self._log, self._bars, self._label = log, bars, label
+        self._log, self._bars = log, bars
         self.id = bars.add_task(label, total=total, note="")
         self._task = bars.tasks[-1]
-        self._begun, self._shown = bars.get_time(), 0.0
+        self._shown = 0.0
 
     def advance(self, steps: int = 1, note: str = "") -> None:
         self._bars.update(self.id, advance=steps, note=note)
-        plain, elapsed = self._bars.disable, self.elapsed()
+        plain, elapsed = self._bars.disable, self.elapsed
         if elapsed - self._shown < (PLAIN_INTERVAL_S if plain else DRAW_INTERVAL_S):
             return
         self._shown, task = elapsed, self._task
         left = "?" if task.time_remaining is None else _duration(task.time_remaining)
-        line = self._line(f"{task.percentage:.0f} %, {_duration(elapsed)} elapsed, {left} left")
+        line = self.line(f"{task.percentage:.0f} %, {_duration(elapsed)} elapsed, {left} left")
         for tell in self._log.followers:
             tell(line)
         if plain:
@@ -91,15 +91,13 @@ class _Bar:
         else:
             self._bars.refresh()
 
+    @property
     def elapsed(self) -> float:
-        return self._bars.get_time() - self._begun
+        return self._task.elapsed or 0.0
 
-    def say(self, text: str) -> None:
-        self._log.info(self._line(text))
-
-    def _line(self, text: str) -> str:
+    def line(self, text: str) -> str:
         note = self._task.fields["note"]
-        return f"{self._label}: {text}" + (f", {note}" if note else "")
+        return f"{self._task.description}: {text}" + (f", {note}" if note else "")
 
 
 def _duration(seconds: float) -> str:
