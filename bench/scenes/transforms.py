@@ -13,14 +13,7 @@ from torch import Tensor
 from bench.cameras import scale_camera
 from bench.errors import unexpected
 from bench.records import read_json
-from bench.scenes.assemble import (
-    Box,
-    assemble,
-    box_of_cameras,
-    describe_splits,
-    space_of,
-    tight,
-)
+from bench.scenes.assemble import Box, assemble, box_of_cameras, describe_splits, space_of, tight
 from bench.scenes.files import (
     data_folder,
     describe,
@@ -38,8 +31,6 @@ from bench.scenes.masks import frame_mask
 from bench.scenes.remarks import Remarks, says_something
 from bench.scenes.splits import Listed, divide, read_lists
 from bench.types import Camera, Log, Scene
-
-CAMERA_FILE = "transforms.json"
 
 NGP_SCALE, NGP_OFFSET = 0.33, [0.5, 0.5, 0.5]  # x becomes scale * x + offset in its unit cube
 
@@ -97,7 +88,7 @@ def load(
     Masks are those of `mask_path`, or instant-ngp's `dynamic_mask_NAME.png` beside a picture.
     """
     root = data_folder(path)
-    record = read_json(path := root / CAMERA_FILE)
+    record = read_json(path := root / "transforms.json")
     lists = read_lists(root, split, record, path)
     splits = divide(read_views(root, record, path, log), split_every, lists, path, log)
     pictures = describe_splits(splits, downscale, log)
