@@ -5,7 +5,6 @@ from pathlib import Path
 from bench.records import read_json
 from bench.scenes.assemble import assemble, cube, describe_splits, hull_box, parse_box
 from bench.scenes.files import data_folder
-from bench.scenes.images import View
 from bench.scenes.transforms import read_views
 from bench.types import Log, Scene
 
@@ -30,8 +29,14 @@ def load(
     left out if none of its pictures exist.
     """
     root = data_folder(path)
-    read = ((split, read_split(root, split, log)) for split in ("train", "val", "test"))
-    views = {split: of_split for split, of_split in read if of_split}
+    views = {}
+    for split in ("train", "val", "test"):
+        file, optional = root / camera_file(split), split == "val"
+        if optional and not file.exists():
+            continue
+        listed = read_views(root, read_json(file), file, log, every=True, optional=optional)
+        if listed:
+            views[split] = [view for _, view in listed if view]
     pictures = describe_splits(views, downscale, log)
     train, box = pictures["train"], cube(HALF_EXTENT)
     if bounds == "auto":
@@ -47,12 +52,3 @@ def load(
 
 def camera_file(split: str) -> str:
     return f"transforms_{split}.json"
-
-
-def read_split(root: Path, split: str, log: Log) -> list[View]:
-    """The views of a split; empty if it is val, and its pictures do not exist."""
-    path, optional = root / camera_file(split), split == "val"
-    if optional and not path.exists():
-        return []
-    listed = read_views(root, read_json(path), path, log, every=True, optional=optional)
-    return [view for _, view in listed if view]
