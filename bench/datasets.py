@@ -91,10 +91,8 @@ def _unpack(archive: Path, wanted: Mapping[str, str], folder: Path) -> None:
 
 def _wrong(folder: Path, wanted: Mapping[str, str]) -> list[str]:
     """The `wanted` files that are present but differ, or missing although a loader needs them."""
-    needed = {n for n in wanted if (folder / n).exists() or not any(m in n for m in GROUND_TRUTH)}
-    return [
-        name for name in wanted if name in needed and file_sha256(folder / name) != wanted[name]
-    ]
+    needed = [n for n in wanted if (folder / n).exists() or not any(m in n for m in GROUND_TRUTH)]
+    return [name for name in needed if file_sha256(folder / name) != wanted[name]]
 
 
 @dataclass(frozen=True)
