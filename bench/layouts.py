@@ -23,7 +23,7 @@ from torch import Tensor
 from bench.errors import explained, unexpected
 from bench.metrics import as_bytes
 from bench.paths import write_path
-from bench.scenes.export import check_empty, data_camera, write_blender
+from bench.scenes.export import data_camera, write_blender
 from bench.threads import in_parallel
 from bench.trajectories import Trajectory
 from bench.types import Log, Scene, Split, composite
@@ -36,7 +36,8 @@ def export(scene: Scene, path: Trajectory, folder: Path, layout: str, log: Log) 
 
     Raises SteerbenchError if a frame has no true picture, or the layout cannot hold the scene.
     """
-    check_empty(folder)
+    if folder.exists() and any(folder.iterdir()):
+        raise unexpected(folder, "a new or an empty folder", "one with files")
     cameras = [step.camera for step in path.steps]
     names = list(map(str, range(len(cameras))))
     splits = {"train": scene.splits["train"], "test": Split(cameras, _Truths(scene, path), names)}

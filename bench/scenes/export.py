@@ -9,7 +9,6 @@ import torch
 from PIL import Image
 
 from bench.cameras import move_camera
-from bench.errors import unexpected
 from bench.scenes.blender import camera_file
 from bench.scenes.files import opengl_to_opencv
 from bench.threads import in_parallel
@@ -19,12 +18,6 @@ from bench.types import Camera, Log, Scene, Split
 def data_camera(scene: Scene, camera: Camera) -> Camera:
     """A `camera` in scene units as the data set has it; its pose is float64."""
     return move_camera(camera, scene.unit_length, scene.origin, torch.float64)
-
-
-def check_empty(folder: Path) -> None:
-    """Raise SteerbenchError unless `folder` is new or empty."""
-    if folder.exists() and any(folder.iterdir()):
-        raise unexpected(folder, "a new or an empty folder", "one with files")
 
 
 def picture_file(split: str, number: int) -> str:
