@@ -52,7 +52,7 @@ def between(first: Camera, second: Camera, turn: Tensor, share: float) -> Camera
     camera = lens_between(first, second, share)
     rotation = first.c2w[:, :3].double() @ _rotation(share * turn)
     centre = torch.lerp(first.c2w[:, 3].double(), second.c2w[:, 3].double(), share)
-    return replace(camera, c2w=_pose(rotation, centre).to(first.c2w))
+    return replace(camera, c2w=torch.column_stack((rotation, centre)).to(first.c2w))
 
 
 def lens_between(first: Camera, second: Camera, share: float) -> Camera:
@@ -131,7 +131,7 @@ def _turned(camera: Camera, target: Tensor, turn: Tensor, zoom: float) -> Camera
     """`camera` turned rigidly about `target` by `turn` [3], its distance times `zoom`."""
     rotation = _rotation(turn)
     centre = target.double() + zoom * (rotation @ _offset(camera, target))
-    pose = _pose(rotation @ camera.c2w[:, :3].double(), centre)
+    pose = torch.column_stack((rotation @ camera.c2w[:, :3].double(), centre))
     return replace(camera, c2w=pose.to(camera.c2w))
 
 
@@ -141,7 +141,3 @@ def _offset(camera: Camera, target: Tensor) -> Tensor:
 
 def _rotation(turn: Tensor) -> Tensor:
     return axis_angle_to_rotation_matrix(turn[None])[0]
-
-
-def _pose(rotation: Tensor, centre: Tensor) -> Tensor:
-    return torch.cat((rotation, centre[:, None]), dim=1)
