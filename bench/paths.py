@@ -217,8 +217,7 @@ def write_path(
 
 def _plain(camera: Camera) -> bool:
     """Whether pixels are square and the principal point is at the centre."""
-    centre = (camera.width / 2, camera.height / 2)
-    pairs = ((camera.fx, camera.fy), *zip((camera.cx, camera.cy), centre, strict=True))
+    pairs = ((camera.fx, camera.fy), (2 * camera.cx, camera.width), (2 * camera.cy, camera.height))
     return all(math.isclose(*pair, rel_tol=1e-6) for pair in pairs)
 
 
