@@ -12,6 +12,7 @@ import os
 import platform
 import subprocess
 import sys
+from contextlib import suppress
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -109,8 +110,11 @@ def libraries(*things: Any) -> dict[str, str]:
     packages = {name.partition(".")[0] for name in imported} - set(OURS)
     names = {name for package in packages for name in _distributions().get(package, ())}
     names |= {name for thing in things for name in getattr(thing, "libraries", ())}
-    versions = ((name, _version(name)) for name in sorted(names))
-    return {name: version for name, version in versions if version is not None}
+    versions = {}
+    for name in sorted(names):
+        with suppress(metadata.PackageNotFoundError):
+            versions[name] = _version(name)
+    return versions
 
 
 def sources(*things: Any) -> dict[str, Path]:
@@ -188,14 +192,7 @@ def _parsed(path: Path, changed: int) -> tuple[str, ...]:
     return tuple(names)
 
 
-@cache
-def _version(distribution: str) -> str | None:
-    try:
-        return metadata.version(distribution)
-    except metadata.PackageNotFoundError:
-        return None
-
-
+_version = cache(metadata.version)  # of a distribution
 _distributions = cache(metadata.packages_distributions)  # that provide each top-level package
 
 
