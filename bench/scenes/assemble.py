@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -222,14 +223,12 @@ def cube(half: float) -> Box:
 
 def parse_box(value: object) -> Box:
     """A box from a user's [[x0, y0, z0], [x1, y1, z1]]."""
-    expected = "auto, full or a lower and an upper corner [x, y, z]"
-    try:
+    with suppress(TypeError, ValueError):
         corners = torch.tensor(value, dtype=torch.float64)
-    except (TypeError, ValueError) as error:
-        raise unexpected("bounds", expected, repr(value)) from error
-    if corners.shape != (2, 3) or not corners.isfinite().all() or (corners[1] <= corners[0]).any():
-        raise unexpected("bounds", expected, repr(value))
-    return Box(corners[0], corners[1])
+        if corners.shape == (2, 3) and corners.isfinite().all() and (corners[0] < corners[1]).all():
+            return Box(*corners)
+    expected = "auto, full or a lower and an upper corner [x, y, z]"
+    raise unexpected("bounds", expected, repr(value))
 
 
 @torch_threads(1)
