@@ -20,7 +20,6 @@ from bench.types import Log, Unavailable
 
 Cell = tuple[str, str]  # a backend or an engine, and a precision
 Computation = Callable[[str], tuple[Tensor, ...]]  # computes the outputs with a backend
-Prepare = Callable[[str], Computation]  # makes the inputs on a device
 Given = Mapping[str, Any]  # the inputs of an operation, by name
 Tolerance = float | Tensor  # the largest allowed error of a result, or of each of its numbers
 
@@ -110,7 +109,7 @@ class Difference:
     """Computes how far results are from those of the reference backend on the CPU, where they are
     nearest to their `tolerances`."""
 
-    prepare: Prepare
+    prepare: Callable[[str], Computation]  # makes the inputs on a device
     tolerances: Callable[[], Sequence[Tolerance]]
 
     def __call__(self, backend: str, device: str, precision: str) -> Deviation:
