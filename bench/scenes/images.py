@@ -245,8 +245,6 @@ def shrink(image: Tensor, factor: int) -> Tensor:
 
 def shrunk_camera(camera: Camera, factor: int, where: Path) -> Camera:
     """The exact camera of a picture after `shrink`; raises if it is smaller than a block."""
-    if factor == 1:
-        return camera
     width, height = camera.width // factor, camera.height // factor
     if not height or not width:
         got = f"{camera.width} x {camera.height}"
