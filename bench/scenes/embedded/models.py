@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 from bench.scenes.embedded.raytrace import Ball, Media, Part, SceneModel, Solids
 from bench.scenes.embedded.solids import (
@@ -128,8 +128,7 @@ def cage() -> list[Part]:
     corners = [(x, y, z) for x in (-h, h) for y in (-h, h) for z in (-h, h)]
     edges = [
         wire(a, b, radius, INK)
-        for i, a in enumerate(corners)
-        for b in corners[i + 1 :]
+        for a, b in combinations(corners, 2)
         if sum(p != q for p, q in zip(a, b, strict=True)) == 1
     ]
     bars = [
