@@ -194,13 +194,10 @@ class Pixels:
         """Contiguous tensors of their own."""
         return Pixels(*(x.clone(memory_format=torch.contiguous_format) for x in self.columns))
 
-    def put(self, index: Tensor | slice, pixels: Pixels) -> None:
+    def put(self, index: Tensor, pixels: Pixels) -> None:
         """Replace, in place, the rays at `index`."""
         for column, new in zip(self.columns, pixels.columns, strict=True):
-            if isinstance(index, slice):
-                column[index] = new
-            else:  # a row at a time; `x[index]` goes number by number
-                column.index_copy_(0, index, new)
+            column.index_copy_(0, index, new)  # a row at a time; `x[index]` goes number by number
 
     @property
     def columns(self) -> tuple[Tensor, Tensor, Tensor]:
