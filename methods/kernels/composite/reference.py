@@ -2,6 +2,7 @@
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from methods.kernels.types import Intervals, Pixels
 
@@ -56,18 +57,10 @@ def _padded_weights(
     sigma: Tensor, delta: Tensor, slots: tuple[Tensor, Tensor], stop: float, front: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Weights [R, N] of samples, which of them get light, and their optical thickness."""
-    tau = _padded(_thickness(sigma, delta), slots)
-    transmittance = front[:, None] * _transmittance(tau)
+    # A sample of length 0 has thickness 0 even at infinite density (avoids inf * 0).
+    tau = _padded(torch.where(delta > 0, sigma * delta, 0), slots)
+    # Shifted rather than subtracted: behind an infinite thickness, inf - inf would be NaN.
+    in_front = functional.pad(tau, (1, 0)).cumsum(dim=1)[:, :-1]
+    transmittance = front[:, None] * torch.exp(-in_front)
     lit = transmittance > stop
     return torch.where(lit, transmittance * -torch.expm1(-tau), 0), lit, tau
-
-
-def _thickness(sigma: Tensor, delta: Tensor) -> Tensor:
-    # A sample of length 0 has thickness 0 even at infinite density (avoids inf * 0).
-    return torch.where(delta > 0, sigma * delta, 0)
-
-
-def _transmittance(tau: Tensor) -> Tensor:
-    """Transmittance in front of each sample, from optical thicknesses [R, N]."""
-    # Shifted rather than subtracted: behind an infinite thickness, inf - inf would be NaN.
-    return torch.exp(-torch.nn.functional.pad(tau, (1, 0)).cumsum(dim=1)[:, :-1])
