@@ -1,9 +1,6 @@
 """Ray marching in plain torch: test every step of every ray, keep those in occupied cells."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -17,7 +14,7 @@ BLOCK = 1 << 12  # rays that are tested at a time: [BLOCK, 1024, 3] positions ar
 
 
 def march(segments: Segments, occupancy: Occupancy) -> Samples:
-    steps = _Steps.of(segments, occupancy)
+    steps = _Steps(segments, occupancy)
     parts = zip(*steps.taken(occupancy), strict=True)
     kept, counts, resume = (torch.cat(column) for column in parts)
     offsets = offsets_of(counts)
@@ -31,27 +28,17 @@ def march(segments: Segments, occupancy: Occupancy) -> Samples:
     return Samples(*where, longest=longest)
 
 
-@dataclass(frozen=True)
 class _Steps:
     """The steps of R rays, at most `most` for each; see `clip`."""
 
-    segments: Segments
-    near: Tensor
-    far: Tensor
-    length: Tensor
-    alive: Tensor
-    most: int
-    course: Course | None  # in contracted space
-
-    @classmethod
-    def of(cls, segments: Segments, occupancy: Occupancy) -> _Steps:
-        course = course_of(segments, occupancy)
-        near, far, length, alive = clip(segments, course)
-        most = longest_ray(segments.step)
-        if alive.device.type == "cpu" and course is None:  # a GPU would make the host wait
-            count = torch.where(alive, (far - near) / length, 0).ceil()
-            most = int(functional.pad(count, (0, 1)).max().clamp(max=most))
-        return cls(segments, near, far, length, alive, most, course)
+    def __init__(self, segments: Segments, occupancy: Occupancy) -> None:
+        self.segments, self.most = segments, longest_ray(segments.step)
+        self.course = course_of(segments, occupancy)
+        self.near, self.far, self.length, self.alive = clip(segments, self.course)
+        # A GPU would make the host wait.
+        if self.alive.device.type == "cpu" and self.course is None:
+            count = torch.where(self.alive, (self.far - self.near) / self.length, 0).ceil()
+            self.most = int(functional.pad(count, (0, 1)).max().clamp(max=self.most))
 
     def at(self, ray: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
         """t [...] and positions [..., 3] of the steps `k` of the rays `ray`."""
