@@ -324,21 +324,10 @@ def _contract(middle, reach, begin, length, t, ray, positions, delta):
 
 
 @jit()
-def _march_chunk(
-    floats,
-    integers,
-    active,
-    words,
-    clearance,
-    resolution,
-    limit,
-    contracted,
-    scratch,
-    owners,
-    counts,
-    resume,
-):
+def _march_chunk(floats, integers, active, grid, resolution, limit, contracted, found):
     """March the rays in the first `active` columns to their ends."""
+    words, clearance, _ = grid
+    scratch, owners, counts, resume = found
     used = u64(0)
     side = resolution // 4
     size, width = f32(resolution), f32(1) / f32(resolution)
@@ -349,7 +338,7 @@ def _march_chunk(
             _locate(floats, integers, active, size)
         for i in range(active - 1, -1, -1):  # a ray that ends makes room for one seen before
             t = floats[_at(T, i)]
-            ray, found = u64(integers[_at(RAY, i)]), integers[_at(COUNT, i)]
+            ray, count = u64(integers[_at(RAY, i)]), integers[_at(COUNT, i)]
             again = -1
             if t < INF:
                 x, y, z = _three(integers, CELL, i)
@@ -359,12 +348,12 @@ def _march_chunk(
                 scratch[used], owners[used] = t, ray
                 sample = bit & (t >= floats[_at(FIRST, i)])
                 used += u64(sample)
-                found += sample
-                integers[_at(COUNT, i)] = found
-                if found < limit:
+                count += sample
+                integers[_at(COUNT, i)] = count
+                if count < limit:
                     continue
                 again = integers[_at(K, i)] + 1
-            counts[ray], resume[ray] = found, again
+            counts[ray], resume[ray] = count, again
             active -= 1
             _move(floats, integers, active, i)
         if contracted:
@@ -376,7 +365,7 @@ def _march_chunk(
 @jit(parallel=True)
 def _find(given, ways, grid, resolution, step, most, contracted, found):
     origins, directions, window, jitter, start = given
-    words, clearance, bounds = grid
+    bounds = grid[2]
     scratch, owners, counts, resume = found
     rays = len(origins)
     for chunk in prange((rays + CHUNK - 1) // CHUNK):
@@ -397,8 +386,7 @@ def _find(given, ways, grid, resolution, step, most, contracted, found):
                 active -= 1
                 _move(floats, integers, active, i)
         own = scratch[first * most :], owners[first * most :], counts[first:], resume[first:]
-        part = floats, integers, active, words, clearance, resolution, most, contracted
-        _march_chunk(*part, *own)
+        _march_chunk(floats, integers, active, grid, resolution, most, contracted, own)
 
 
 @jit(parallel=True)
