@@ -95,13 +95,6 @@ def _corner_weights(x, y, z):
     return gx * w00, x * w00, gx * w10, x * w10, gx * w01, x * w01, gx * w11, x * w11
 
 
-@jit()
-def _put(weights, i, found):
-    """Store the eight weights of a sample."""
-    weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3] = found[0:4]
-    weights[i, 4], weights[i, 5], weights[i, 6], weights[i, 7] = found[4:8]
-
-
 @jit(fastmath=FAST)
 def _mean_weights(ax, ay, az, bx, by, bz):
     """A weight is a cubic along the segment, for which two Gauss-Legendre nodes are exact."""
@@ -151,7 +144,8 @@ def _segment_weights(origins, directions, ray, near, far, coordinates, voxel, re
             origin, direction = three(origins, ray[i]), three(directions, ray[i])
             corner = three(coordinates, voxel[i])
             found = _weights_between(origin, direction, near[i], far[i], resolution, corner)
-            _put(weights, i, found)
+            weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3] = found[0:4]
+            weights[i, 4], weights[i, 5], weights[i, 6], weights[i, 7] = found[4:8]
 
 
 @jit()
