@@ -83,7 +83,7 @@ class KiloNerf(FieldStudent):
         bounds = scene.cells.to(self.teacher.device)
         self.occupancy = teacher.occupancy
         self.grid, pieces = place_networks(teacher.occupancy, bounds, self.networks)
-        training = KiloTraining(self, self.new_field(), teacher, scene, budget)
+        training = KiloTraining(self, teacher, scene, budget)
         training.pieces = pieces
         return training
 

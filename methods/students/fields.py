@@ -81,7 +81,7 @@ class FieldStudent(Student):
 
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> StudentTraining:
         self.occupancy = self.occupied(teacher)
-        return StudentTraining(self, self.new_field(), teacher, scene, budget)
+        return StudentTraining(self, teacher, scene, budget)
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         self.occupancy = Occupancy(tensors["cells"].to(self.teacher.device), self.contracted)
@@ -101,28 +101,22 @@ class FieldStudent(Student):
 
 
 class StudentTraining(PixelTraining):
-    """Trains on points of the teacher, then on rays of the photos, within occupied cells. On rays,
-    samples that the teacher's density hides are left out: it costs less than the density of a large
-    network. The training follows the settings of `student`."""
+    """Trains a new field on points of the teacher, then on rays of the photos, within occupied
+    cells. On rays, samples that the teacher's density hides are left out: it costs less than the
+    density of a large network. The training follows the settings of `student`."""
 
     def __init__(
-        self,
-        student: FieldStudent,
-        field: StudentField,
-        teacher: TrainedField,
-        scene: Scene,
-        budget: Budget,
+        self, student: FieldStudent, teacher: TrainedField, scene: Scene, budget: Budget
     ) -> None:
         options, seed = student.training, student.teacher.seed
         samples, device = math.ceil(options.share * budget.samples), teacher.field.device
         super().__init__(scene, device, budget.renderer_steps, samples, options, seed)
-        self.field, self.teacher = field, teacher.field
+        self.field, self.teacher = student.new_field(), teacher.field
         self.occupancy, self.sampling = student.occupancy, student.sampling(budget)
         self.cells = self.occupancy.cells.nonzero()
         self.points_until = options.points * self.steps if len(self.cells) else 0
-        self.optimiser = torch.optim.Adam(
-            field.parameters(), betas=(0.9, 0.99), eps=1e-15, fused=True
-        )
+        parameters = self.field.parameters()
+        self.optimiser = torch.optim.Adam(parameters, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
     def advance(self) -> dict[str, float]:
         """Take one step; return its mean squared error, of opacities and colours or of pixels."""
