@@ -59,8 +59,7 @@ class External:
     frame_s: float
     seed: int
 
-    def __post_init__(self) -> None:
-        self.train_s = 0.0
+    train_s = 0.0
 
     @property
     def _typed(self) -> list[str]:

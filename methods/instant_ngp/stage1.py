@@ -99,13 +99,12 @@ class OnField(Checked):
     device: str
     seed: int
 
-    memory = 0
+    memory, train_s = 0, 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         where = self.backend, self.device, self.seed
         self.setup = Setup.resolved(self.grid, self.training, self.precision, *where)
-        self.train_s = 0.0
 
     def reset(self) -> None:
         """Do nothing: every frame stands alone."""

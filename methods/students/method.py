@@ -37,7 +37,7 @@ class Student(Checked, ABC):
     name: str  # as shown in result rows
     steps: Steps  # of its own training; None: `budget.renderer_steps`
 
-    memory = 0
+    memory, train_s = 0, 0.0
     kind: ClassVar[str]  # name of its trained stage, for example "nerf"
     model: ClassVar[tuple[str, ...]] = ()  # its settings that its training depends on
     computed: ClassVar[Mapping[str, str]] = {}  # what rows say of it but not of its teacher
@@ -48,10 +48,6 @@ class Student(Checked, ABC):
         parts=dict.fromkeys(("rays", "march", "composite"), "field"),
         chosen=("stop",),
     )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.train_s = 0.0
 
     @abstractmethod
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> loop.Training:
