@@ -44,8 +44,7 @@ def corner_gather(
     check_shape("weights", weights, len(voxel), CORNERS)
     if grad_buffer is not None:
         check_shape("grad_buffer", grad_buffer, *table.shape)
-        if not table.requires_grad:
-            table = table.detach().requires_grad_()  # otherwise there is no backward pass
+        table = table.detach().requires_grad_()  # otherwise there may be no backward pass
     if len(voxel) and voxel.device.type == "cpu":  # on a GPU the check would wait
         low, high = (int(end) for end in torch.aminmax(voxel))
         rows, found = f"rows of the {len(corners)} voxels", f"{low} to {high}"

@@ -64,7 +64,6 @@ def shade_voxels(
     check_shape("directions", directions, None, 3)
     if grad_buffer is not None:
         check_shape("grad_buffer", grad_buffer, *harmonics.shape)
-        if not harmonics.requires_grad:
-            harmonics = harmonics.detach().requires_grad_()  # otherwise there is no backward pass
+        harmonics = harmonics.detach().requires_grad_()  # otherwise there may be no backward pass
     kernel = implementation(__name__, backend, harmonics.device)
     return kernel.shade_voxels(harmonics, voxel, ray, directions, grad_buffer)

@@ -35,7 +35,6 @@ def shade_voxels(
     harmonics: Tensor, voxel: Tensor, ray: Tensor, directions: Tensor, grad_buffer: Tensor | None
 ) -> Tensor:
     if grad_buffer is not None:
-        harmonics = harmonics.detach().requires_grad_()
         harmonics.register_hook(grad_buffer.add_)
     towards = directions[ray.long()]
     return shade(harmonics[voxel.long()], towards, backend="reference").sigmoid()
