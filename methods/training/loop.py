@@ -93,7 +93,7 @@ def train(training: Training, finished: Path, label: str, log: Log) -> None:
         if to_train:
             _drive(training, finished, label, log)
         else:
-            load_result(training, finished)
+            resume(training, finished, done=True)
             log.info(f"{label}: found in {finished}")
 
 
@@ -130,20 +130,15 @@ def save(training: Training, path: Path, done: bool = False) -> None:
     checkpoint.write(path, training.result() | ({} if done else more), figures)
 
 
-def load_result(training: Training, path: Path) -> None:
-    """Load into `training` a result that `train` wrote to `path`; raise `SteerbenchError` if the
-    file is damaged, or belongs to another training."""
+def resume(training: Training, path: Path, done: bool = False) -> None:
+    """Restore what `save` wrote to `path`: the result and, unless `done`, the state; raise
+    `SteerbenchError` if the file is damaged, or belongs to another training."""
     tensors, figures = checkpoint.read(path)
     with checkpoint.restoring(path):
-        training.restore_result(tensors)
-        training.seconds, training.peak_bytes = figures["seconds"], figures["peak_bytes"]
-
-
-def resume(training: Training, path: Path) -> None:
-    """Restore `training` to the state of a checkpoint; it raises what `load_result` raises."""
-    tensors, figures = checkpoint.read(path)
-    with checkpoint.restoring(path):
-        training.restore(tensors, figures)
+        if done:
+            training.restore_result(tensors)
+        else:
+            training.restore(tensors, figures)
         training.step, training.seconds = int(figures["step"]), figures["seconds"]
         training.peak_bytes = figures["peak_bytes"]
 
