@@ -99,8 +99,7 @@ class Occupancy:
         size = self.resolution
         lower, upper = torch.ones(3), torch.zeros(3)
         for axis in range(3):
-            other = [a for a in range(3) if a != axis]
-            filled = self.cells.any(dim=other[1]).any(dim=other[0]).nonzero()
+            filled = self.cells.any(dim=[a for a in range(3) if a != axis]).nonzero()
             if len(filled):
                 lower[axis], upper[axis] = filled[0] / size, (filled[-1] + 1) / size
         return torch.stack((lower, upper))
