@@ -258,15 +258,8 @@ class FieldOptimiser:
         loop.step_at(self._networks, rate)
         field = self._field
         assert field.gradients is not None
-        hash_adam_(
-            field.table.detach(),
-            field.gradients,
-            field.grid,
-            self.table,
-            rate,
-            packed=field.packed,
-            backend=field.backend,
-        )
+        given = field.table.detach(), field.gradients, field.grid, self.table, rate
+        hash_adam_(*given, packed=field.packed, backend=field.backend)
 
     @property
     def parts(self) -> checkpoint.Optimisers:
