@@ -8,7 +8,6 @@ used. After a number of patches they are replaced, by those before another view.
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import accumulate
 
 import torch
@@ -81,6 +80,9 @@ class Patches:
         self.pictures = [*real.images, *distilled.images]
         self.masks = [*(real.masks or [None] * len(real)), *[None] * len(distilled)]
         self._real, self._distilled = len(real), len(distilled)
+        shortest = min(min(camera.width, camera.height) for camera in self.cameras)
+        # Of all patches, in low-resolution pixels; even the smallest picture has one.
+        self._side = min(options.patch, -(-shortest // pipeline.model.scale))
 
     def draw(self, count: int) -> Batch:
         """Draw `count` patches."""
@@ -123,12 +125,6 @@ class Patches:
         truth = self._truth(example, top, left, cut.full)
         points = [cloud.shown_in(cut.full) for cloud in example.buffer]
         return Patch(example, cut, truth, points)
-
-    @cached_property
-    def _side(self) -> int:
-        """The side of all patches, in low-resolution pixels; even the smallest picture has one."""
-        shortest = min(min(camera.width, camera.height) for camera in self.cameras)
-        return min(self.options.patch, -(-shortest // self.pipeline.model.scale))
 
     def _truth(self, example: Example, top: int, left: int, full: Camera) -> Tensor:
         """The true picture [H, W, 3] of the patch. Beyond the border of a picture whose sides are
