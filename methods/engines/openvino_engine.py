@@ -4,7 +4,7 @@ import contextlib
 import logging
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -63,7 +63,7 @@ class OpenVino(Engine):
         model = self._openvino.Core().read_model(path)
         weights = [op for op in model.get_ops() if op.get_type_name() == "Constant"]
         size = sum(op.data.nbytes for op in weights)
-        return Built(_Compiled(self._openvino, model, self._dtype), size, self._dtype)
+        return Built(_compiled(self._openvino, model, self._dtype), size, self._dtype)
 
     def _convert(self, network: nn.Module, samples: Sequence[Tensor]) -> Any:
         # Only C is fixed: frames may have another size than the samples.
@@ -137,28 +137,23 @@ def _capabilities(openvino: Any) -> list[str]:
     return openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
 
 
-class _Compiled:
+def _compiled(openvino: Any, model: Any, dtype: torch.dtype) -> Callable[[Tensor], Tensor]:
     """A model compiled for pictures of any size: to compile it for each size gains little, and each
     compilation holds its own memory."""
+    half = dtype == torch.bfloat16
+    settings = {
+        "INFERENCE_PRECISION_HINT": "bf16" if half else "f32",
+        "PERFORMANCE_HINT": "LATENCY",
+        "INFERENCE_NUM_THREADS": torch.get_num_threads(),
+    }
+    request = openvino.Core().compile_model(model, "CPU", settings).create_infer_request()
 
-    def __init__(self, openvino: Any, model: Any, dtype: torch.dtype) -> None:
-        self._openvino, self._dtype = openvino, dtype
-        settings = {
-            "INFERENCE_PRECISION_HINT": "bf16" if dtype == torch.bfloat16 else "f32",
-            "PERFORMANCE_HINT": "LATENCY",
-            "INFERENCE_NUM_THREADS": torch.get_num_threads(),
-        }
-        compiled = openvino.Core().compile_model(model, "CPU", settings)
-        self._request = compiled.create_infer_request()
-
-    def __call__(self, picture: Tensor) -> Tensor:
-        given = self._tensor(picture.movedim(1, -1).to(self._dtype).contiguous())
-        found = self._request.infer([given], share_inputs=True, share_outputs=True)
+    def run(picture: Tensor) -> Tensor:
+        x = picture.movedim(1, -1).to(dtype).contiguous()
+        given = x.view(torch.int16).numpy() if half else x.numpy()
+        if half:  # numpy has no bfloat16; the memory is the same
+            given = openvino.Tensor(given, list(x.shape), openvino.Type.bf16)
+        found = request.infer([given], share_inputs=True, share_outputs=True)
         return torch.from_numpy(found[0]).movedim(-1, 1)
 
-    def _tensor(self, x: Tensor) -> Any:
-        """`x` for OpenVINO, in the same memory; numpy has no bfloat16."""
-        if x.dtype != torch.bfloat16:
-            return x.numpy()
-        kind = self._openvino.Type.bf16
-        return self._openvino.Tensor(x.view(torch.int16).numpy(), list(x.shape), kind)
+    return run
