@@ -58,8 +58,7 @@ def restoring(path: Path) -> Iterator[None]:
 
 def part(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     """The tensors whose names begin with `prefix`, without it."""
-    begun = (name for name in tensors if name.startswith(prefix))
-    return {name.removeprefix(prefix): tensors[name] for name in begun}
+    return {name.removeprefix(prefix): x for name, x in tensors.items() if name.startswith(prefix)}
 
 
 Optimisers = Mapping[str, torch.optim.Optimizer | AdamState]
