@@ -53,7 +53,6 @@ class StudentField(nn.Module, Field):
 
     @property
     def device(self) -> torch.device:
-        """The device of its parameters."""
         return next(self.parameters()).device
 
     @abstractmethod
