@@ -1,8 +1,7 @@
 """Features at the corners of sparse voxels, and the decoder of their integrals (Wu et al. 2022)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
+from typing import Self
 
 import torch
 from torch import Tensor, nn
@@ -72,9 +71,7 @@ class CornerModel(nn.Module):
 
     @classmethod
     @torch.no_grad()
-    def taught(
-        cls, teacher: TrainedField, resolution: int, generator: torch.Generator
-    ) -> CornerModel:
+    def taught(cls, teacher: TrainedField, resolution: int, generator: torch.Generator) -> Self:
         """Make a model with voxels where the trained field is occupied, and a random decoder. The
         features of a corner are its hash encoding, 16 levels of 2, divided by their standard
         deviation; ValueError if it has more than 32 channels."""

@@ -1,8 +1,7 @@
 """A scene as 3D Gaussians, its pictures (Kerbl et al. 2023), and how it is stored in few bytes."""
 
-from __future__ import annotations
-
 import math
+from typing import Self
 
 import torch
 from torch import Tensor, nn
@@ -43,7 +42,7 @@ class Gaussians(nn.Module):
     @classmethod
     def at(
         cls, points: Tensor, colours: Tensor, scales: Tensor, opacity: float, degree: int
-    ) -> Gaussians:
+    ) -> Self:
         """Make round Gaussians at `points` [N, 3], with standard deviations `scales` [N] and
         `colours` [N, 3] that are the same from all sides."""
         count = len(points)

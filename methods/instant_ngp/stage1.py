@@ -1,9 +1,8 @@
 """The trained field of a scene: trained once and shared by every method that builds on it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict, dataclass, replace
+from typing import Self
 
 import torch
 
@@ -42,7 +41,7 @@ class Setup:
         backend: str,
         device: str,
         seed: int,
-    ) -> Setup:
+    ) -> Self:
         """Make a setup with `auto` replaced by what it means on this machine."""
         if not DEVICE.fullmatch(device):
             raise ValueError(f"device: expected auto, cpu, cuda or cuda:N, got {device!r}")
@@ -67,7 +66,7 @@ class Setup:
             "field_precision": self.precision if multiplied else "bf16 in fp32",
         }
 
-    def suited(self, scene: Scene) -> Setup:
+    def suited(self, scene: Scene) -> Self:
         """This setup with the hash table that `scene` needs, if it leaves that to the scene."""
         grid = self.grid.of(scene) if isinstance(self.grid, SuitedGrid) else self.grid
         return replace(self, grid=grid)

@@ -2,13 +2,11 @@
 trained field (Yu et al. 2021, Sections 3 and 4): which are needed, how dense they are, and their
 colours."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Self
 
 import torch
 from torch import Tensor
@@ -47,7 +45,7 @@ class Octree:
         """The cells of `CELL`^3 leaves that contain any."""
         return Occupancy.at(self.voxels.coordinates // CELL, self.voxels.resolution // CELL)
 
-    def visible(self, stored: str = "fp32") -> Octree:
+    def visible(self, stored: str = "fp32") -> Self:
         """The leaves that show anything, those whose density is positive; with "fp16", rounded as
         in a file of 16-bit numbers."""
         density, harmonics = self.light.density, self.light.harmonics
@@ -55,7 +53,7 @@ class Octree:
             density, harmonics = _half(density), _half(harmonics)
         shown = density > 0
         voxels = Voxels(self.voxels.coordinates[shown], self.voxels.resolution)
-        return Octree(voxels, Light(density[shown], harmonics[shown]))
+        return replace(self, voxels=voxels, light=Light(density[shown], harmonics[shown]))
 
     def sizes(self, width: int) -> dict[str, int]:
         """Bytes of the values, `width` each, and of the index: a word for each brick of the cube;
@@ -74,7 +72,7 @@ class Octree:
         }
 
     @classmethod
-    def of(cls, tensors: Mapping[str, Tensor], device: torch.device) -> Octree:
+    def of(cls, tensors: Mapping[str, Tensor], device: torch.device) -> Self:
         """Make an octree of what `tensors` returned."""
         density, harmonics = (tensors[x].to(device, copy=True) for x in ("density", "harmonics"))
         coordinates = tensors["coordinates"].to(device).int()

@@ -1,9 +1,8 @@
 """Volume rendering of frames: features, depth and opacity of the pixels of a camera."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -41,7 +40,7 @@ class FeatureFrame:
     alpha: Tensor  # [h, w] opacity
 
     @classmethod
-    def of(cls, camera: Camera, pixels: Pixels, background: Tensor) -> FeatureFrame:
+    def of(cls, camera: Camera, pixels: Pixels, background: Tensor) -> Self:
         """Make a frame of all pixels of `camera`, and composite them on `background` [K]."""
         values = pixels.over(background).values
         seen = pixels.alpha > EMPTY_ALPHA

@@ -4,10 +4,9 @@ As in the release, pixels are unprojected through their corners, which shifts al
 s / 2 - 1/2 pixels, and of several points in a pixel the last one is shown.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass, replace
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -39,7 +38,7 @@ class PointCloud:
     alpha: Tensor  # [N] opacity
 
     @classmethod
-    def of(cls, frame: FeatureFrame) -> PointCloud:
+    def of(cls, frame: FeatureFrame) -> Self:
         """Unproject the pixels of `frame`."""
         camera, alpha = frame.camera, frame.alpha.flatten()
         depth = frame.depth.flatten().nan_to_num(posinf=0) * alpha  # sum w t again; inf where empty
@@ -53,7 +52,7 @@ class PointCloud:
         """[N] bool, which points have a reliable expected depth."""
         return self.alpha > RELIABLE_ALPHA
 
-    def expected(self) -> PointCloud:
+    def expected(self) -> Self:
         """The same with depths sum w t / sum w; no view sees points that are not reliable."""
         alpha, centre = torch.where(self.reliable, self.alpha, torch.nan), self.camera.c2w[:, 3]
         return replace(self, points=centre + (self.points - centre) / alpha[:, None])

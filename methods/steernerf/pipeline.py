@@ -1,10 +1,9 @@
 """One frame of SteerNeRF, from top to bottom, following Section 3 of the paper."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -32,7 +31,7 @@ class TwoScales:
     low: Camera  # the same view at 1/s of the resolution; K_l of Eq. 7
     scale: int  # s
 
-    def crop(self, part: Rectangle) -> TwoScales:
+    def crop(self, part: Rectangle) -> Self:
         """The view of a part of the low-resolution pixels."""
         (top, bottom, _), (left, right, _) = (
             one.indices(side)
@@ -40,7 +39,7 @@ class TwoScales:
         )
         s, sides = self.scale, (right - left, bottom - top)
         full = crop_camera(self.full, left * s, top * s, *(side * s for side in sides))
-        return TwoScales(full, crop_camera(self.low, left, top, *sides), s)
+        return replace(self, full=full, low=crop_camera(self.low, left, top, *sides))
 
 
 class Pipeline:

@@ -4,12 +4,11 @@ If no feature of a table entry has a gradient, the entry keeps its value and mom
 would keep moving it by momentum, and would read and write the whole table every step.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -32,7 +31,7 @@ class AdamState:
     gradient: Tensor | None = None  # where a GPU adds up gradients: 0 between steps
 
     @classmethod
-    def like(cls, table: Tensor) -> AdamState:
+    def like(cls, table: Tensor) -> Self:
         """A fresh state for `table`."""
         return cls(
             torch.zeros_like(table),
