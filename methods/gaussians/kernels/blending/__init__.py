@@ -38,6 +38,5 @@ def blend(
     check_shape("colours", colours, count, 3)
     check_shape("centres", ellipses.centres, count, 2)
     check_shape("conics", ellipses.conics, count, 3)
-    return implementation(__name__, backend, opacities.device).blend(
-        ellipses, opacities, colours, width, height, stop
-    )
+    kernel = implementation(__name__, backend, opacities.device)
+    return kernel.blend(ellipses, opacities, colours, width, height, stop)

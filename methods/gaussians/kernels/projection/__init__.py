@@ -60,9 +60,8 @@ def project_gaussians(
     check_shape("scales", scales, count, 3)
     check_shape("rotations", rotations, count, 4)
     check_shape("opacities", opacities, count)
-    return implementation(__name__, backend, means.device).project_gaussians(
-        means, scales, rotations, opacities.detach(), camera
-    )
+    kernel = implementation(__name__, backend, means.device)
+    return kernel.project_gaussians(means, scales, rotations, opacities.detach(), camera)
 
 
 def covariances(scales: Tensor, rotations: Tensor) -> Tensor:

@@ -46,9 +46,8 @@ def locate(
     check_shape("positions", positions, None, 3)
     check_shape("cubes", cubes, None, None, None)
     check_shape("corner", corner, 3)
-    return implementation(__name__, backend, positions.device).locate(
-        positions, cubes, corner, side
-    )
+    kernel = implementation(__name__, backend, positions.device)
+    return kernel.locate(positions, cubes, corner, side)
 
 
 def order(networks: Tensor, count: int, *, backend: str = "auto") -> tuple[Tensor, Tensor]:
@@ -87,9 +86,8 @@ def grouped_linear(
     check_shape("inputs", inputs, None, channels)
     check_shape("biases", biases, networks, outputs)
     check_shape("offsets", offsets, networks + 1)
-    return implementation(__name__, backend, inputs.device).grouped_linear(
-        inputs, weights, biases, offsets, relu
-    )
+    kernel = implementation(__name__, backend, inputs.device)
+    return kernel.grouped_linear(inputs, weights, biases, offsets, relu)
 
 
 def densities(
