@@ -33,10 +33,9 @@ class TwoScales:
 
     def crop(self, part: Rectangle) -> Self:
         """The view of a part of the low-resolution pixels."""
-        (top, bottom, _), (left, right, _) = (
-            one.indices(side)
-            for one, side in zip(part, (self.low.height, self.low.width), strict=True)
-        )
+        rows, columns = part
+        top, bottom, _ = rows.indices(self.low.height)
+        left, right, _ = columns.indices(self.low.width)
         s, sides = self.scale, (right - left, bottom - top)
         full = crop_camera(self.full, left * s, top * s, *(side * s for side in sides))
         return replace(self, full=full, low=crop_camera(self.low, left, top, *sides))
