@@ -73,7 +73,7 @@ class Baked:
             pixels, crossed, shaded = render_segments(
                 rays, self.corners, layers, towards, stop=stop, faint=faint, backend=self.backend
             )
-        segments, colours = map(int, to_host([crossed.sum(), shaded.sum()]))
+        segments, colours = to_host([crossed.sum(), shaded.sum()])
         probe.count("segments", segments)
         probe.count("shaded_segments", colours, segments)
         probe.count("table_reads", CORNERS * segments)
