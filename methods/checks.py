@@ -1,10 +1,9 @@
 """All kernels, and all checks: the `cases.py` and `experiments.py` of the folders."""
 
 import importlib
-from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parent.parent
+from bench.provenance import ROOT
 
 
 def kernels(having: str = "reference") -> list[str]:
