@@ -14,13 +14,7 @@ from omegaconf import OmegaConf
 from reports import figures
 from reports.claims import NOT_MEASURED, Comparison, claim_table, finding_table
 from reports.images import Part, Picture, frame_section, kept_frames
-from reports.paper_tables import (
-    Measured,
-    PaperTable,
-    comparisons,
-    measured_where,
-    section,
-)
+from reports.paper_tables import Measured, PaperTable, comparisons, measured_where, section
 from reports.publish import publish
 from reports.runs import Repeated, Run
 
@@ -28,10 +22,7 @@ PAGE: Any = OmegaConf.to_container(OmegaConf.load(Path(__file__).parent / "paper
 
 
 def write_paper_page(
-    tables: Sequence[PaperTable],
-    measured: Measured,
-    folder: Path,
-    missing: Mapping[str, str] = {},
+    tables: Sequence[PaperTable], measured: Measured, folder: Path, missing: Mapping[str, str] = {}
 ) -> Path:
     """Write `folder/report.md` with its pictures, and the same as `report.html`; return the former.
 
