@@ -56,9 +56,9 @@ def exported_tables(tables: Sequence[PaperTable], measured: Measured, form: str)
     """
     if form == "latex":
         return "\n".join(_latex(table, measured) for table in tables)
-    blocks = [(table, block) for table in tables for block in table.shown(measured)]
+    blocks = [block for table in tables for block in table.shown(measured)]
     if form == "markdown":
-        return "\n".join(figure_table(block).section() for _, block in blocks)
+        return "\n".join(figure_table(block).section() for block in blocks)
     return _for_programs(_figures(blocks), form)
 
 
@@ -70,7 +70,7 @@ def _for_programs(figures: pd.DataFrame, form: str) -> str:
 
 def _latex(table: PaperTable, measured: Measured) -> str:
     blocks = table.shown(measured)
-    runs = [run for block in blocks for line in block.measured for run in line.runs]
+    runs = [run for block in blocks for line in block.measured.values() for run in line.runs]
     where = f"{conditions_of(runs)}." if runs else ""
     caption = f"{table.title}. {where[:1].upper()}{where[1:]}"
     heads = ["", *(shown_as(metric).heading for metric in table.metrics)]
@@ -105,18 +105,16 @@ def _tabular(
 
 def _rows(block: Shown) -> list[list[str]]:
     """The cells of a block; labels of a further one also have its data set."""
-    columns = [
-        marked(block.measured, metric, MARKS, partial(_written, metric))
-        for metric in block.table.metrics
-    ]
+    lines, metrics = list(block.measured.values()), block.table.metrics
+    columns = [marked(lines, metric, MARKS, partial(_written, metric)) for metric in metrics]
     where = f" ({block.title})" if block.title else ""
     return [
         [escaped(line.label + where), *((text or "--").replace("±", r"$\pm$") for text in row)]
-        for line, *row in zip(block.measured, *columns, strict=True)
+        for line, *row in zip(lines, *columns, strict=True)
     ]
 
 
-def _figures(blocks: Sequence[tuple[PaperTable, Shown]]) -> pd.DataFrame:
+def _figures(blocks: Sequence[Shown]) -> pd.DataFrame:
     """One figure per row, in the units of `steerbench results`.
 
     A row has the measured mean, the number of runs, half the 95 % interval, and the paper's figure.
@@ -124,19 +122,19 @@ def _figures(blocks: Sequence[tuple[PaperTable, Shown]]) -> pd.DataFrame:
     """
     return pd.DataFrame(
         {
-            "table": table.name,
+            "table": block.table.name,
             "data_set": block.title,
             "line": key,
-            "label": line.label,
+            "label": block.lines[key].label,
             "metric": metric,
             "measured": found.mean(metric),
             "half_interval": found.half(metric),
             "runs": len(found.runs),
             "published": block.published(metric).get(key),
         }
-        for table, block in blocks
-        for key, (line, found) in block.lines.items()
-        for metric in table.metrics
+        for block in blocks
+        for key, found in block.measured.items()
+        for metric in block.table.metrics
     )
 
 

@@ -97,39 +97,35 @@ class PaperTable:
 
     def _shown(self, data_set: str, measured: Measured) -> Shown:
         """With the line that `instead` has for one that was not measured, and a note about it."""
-        lines = {}
-        for key, line in self.blocks[data_set].items():
+        lines, found = dict(self.blocks[data_set]), dict[str, Repeated]()
+        for key, line in lines.items():
             place = Place(self.name, data_set, key)
-            lines[key] = line, measured.get(place, Repeated(line.label, ()))
+            found[key] = measured.get(place, Repeated(line.label, ()))
         called = {key: line.called or line.label for key, line in self.lines.items()}
-        there = {key for key, (_, found) in lines.items() if found.runs}
+        there = {key for key, line in found.items() if line.runs}
         notes, standing = list(self.notes), {}
         for missing, other in self.instead.items():
             if missing in lines.keys() - there and other in there:
-                line, found = lines.pop(missing)
-                stand_in, runs = lines[other]
-                lines[other] = replace(stand_in, published=line.published), runs
+                line, gaps = lines.pop(missing), found.pop(missing).gaps
+                lines[other] = replace(lines[other], published=line.published)
                 standing[missing], called[missing] = other, called[other]
-                why = ": ".join(found.gaps) or "not measured"
-                notes.append(f'"{stand_in.label}" stands for "{line.label}" ({why}).')
-        claims = [
-            replace(
-                claim,
-                lines=[standing.get(key, key) for key in claim.lines],
-                says=claim.says.format_map(called),
-            )
-            for claim in self.claims
-        ]
-        return Shown(self, data_set, lines, claims, notes)
+                why = ": ".join(gaps) or "not measured"
+                notes.append(f'"{lines[other].label}" stands for "{line.label}" ({why}).')
+        claims = []
+        for claim in self.claims:
+            keys = [standing.get(key, key) for key in claim.lines]
+            claims.append(replace(claim, lines=keys, says=claim.says.format_map(called)))
+        return Shown(self, data_set, lines, found, claims, notes)
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A block of a table as a page shows it: each line with what was measured, by key."""
+    """A block of a table as a page shows it: its lines and what was measured of each, by key."""
 
     table: PaperTable
     data_set: str
-    lines: Mapping[str, tuple[Line, Repeated]]
+    lines: Mapping[str, Line]
+    measured: Mapping[str, Repeated]
     claims: Sequence[Claim]
     notes: Sequence[str]
 
@@ -138,15 +134,9 @@ class Shown:
         """The data set; of the first block, which has the title of the table, ""."""
         return "" if self.data_set == self.table.data_sets[0] else self.data_set
 
-    @property
-    def measured(self) -> list[Repeated]:
-        return [found for _, found in self.lines.values()]
-
     def published(self, metric: str) -> dict[str, float]:
         """The paper's figures, by key, of the lines that have one."""
-        figures = {
-            key: line.published.get(self.data_set, {}) for key, (line, _) in self.lines.items()
-        }
+        figures = {key: line.published.get(self.data_set, {}) for key, line in self.lines.items()}
         return {key: of[metric] for key, of in figures.items() if metric in of}
 
 
@@ -156,11 +146,7 @@ def comparisons(table: PaperTable, measured: Measured) -> list[Comparison]:
         replace(each, table=table.called, data_set=block.title)
         for block in table.shown(measured)
         for claim in block.claims
-        for each in compare(
-            claim,
-            dict(zip(block.lines, block.measured, strict=True)),
-            block.published(claim.metric),
-        )
+        for each in compare(claim, block.measured, block.published(claim.metric))
     ]
 
 
@@ -191,12 +177,12 @@ def _block(block: Shown, said: Collection[str]) -> list[str | Table]:
     All figures are shown where lines are methods, or where there are no distances. Notes are those
     of the table below its first block, and those on figures that could not be measured.
     """
-    table, runs = block.table, [run for line in block.measured for run in line.runs]
+    table, runs = block.table, [run for line in block.measured.values() for run in line.runs]
     facts = {name: value for name, value in measured_where(runs).items() if name not in said}
     where = ", ".join(map(" ".join, facts.items())) if runs else ""
-    published = any(line.published.get(block.data_set) for line, _ in block.lines.values())
+    published = any(line.published.get(block.data_set) for line in block.lines.values())
     parts: list[str | Table] = [where and f"Measured: {where}."]
-    if not published or any(METHOD in line.job for line, _ in block.lines.values()):
+    if not published or any(METHOD in line.job for line in block.lines.values()):
         parts.append(figure_table(block))
     if published:
         parts += [f"Paper: {table.published_on[block.data_set]}.", distance_table(block)]
@@ -210,15 +196,15 @@ def figure_table(block: Shown) -> Table:
     Among measured figures under the same conditions, the best of a column is bold and, of at least
     three, the second best is italic.
     """
-    columns = {metric: marked(block.measured, metric, BOLD) for metric in block.table.metrics}
-    title = block.title or block.table.title
-    return _of_columns(title, "measured", block.measured, columns)
+    lines = list(block.measured.values())
+    columns = {metric: marked(lines, metric, BOLD) for metric in block.table.metrics}
+    return _of_columns(block.title or block.table.title, "measured", lines, columns)
 
 
 def distance_table(block: Shown) -> Table:
     """The figures of the table's reference, then how far each line is from it, here and in the
     paper, by metric."""
-    runs = dict(zip(block.lines, block.measured, strict=True))
+    runs = dict(block.measured)
     first = block.table.reference if block.table.reference in runs else next(iter(runs))
     reference = runs.pop(first)
     columns = {}
