@@ -105,9 +105,7 @@ def quality_against(
     colour for each value of the first that differs, a marker for the others.
     """
     _, unit, label = COSTS[metric]
-    figure = Figure(figsize=(8, 4.5), layout="constrained")
-    axes = figure.subplots()
-    _label(axes, label)
+    figure, axes = _of_quality(label)
     first = next(iter(settings.values()), range(len(lines)))  # methods
     styles: Sequence[Mapping[str, Any]] = [_style(number) for number in range(len(lines))]
     handles: Sequence[Line2D] = ()
@@ -182,9 +180,7 @@ def _name(axes: Axes, points: Sequence[tuple[str, tuple[float, float]]]) -> None
 
 def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
     """Write a PNG: PSNR of scored frames along the path, one curve per run; cold are hollow."""
-    figure = Figure(figsize=(8, 3.5), layout="constrained")
-    axes = figure.subplots()
-    _label(axes, "frame of the path")
+    figure, axes = _of_quality("frame of the path", height=3.5)
     for number, run in enumerate(runs):
         scored = run.frames.dropna(subset=["psnr"])
         colour, cold = COLOURS[number % len(COLOURS)], scored[scored["phase"] == COLD]
@@ -199,9 +195,7 @@ def quality_along(lines: Lines, name: str, path: Path) -> None:
     the others, with intervals over seeds. Lines that lack the setting are dashed, all across."""
     others = {x: of for x, of in lines.settings.items() if x != name and len(set(of)) > 1}
     curves: dict[str, dict[float, tuple[float, float]]] = {}
-    figure = Figure(figsize=(8, 4.5), layout="constrained")
-    axes = figure.subplots()
-    _label(axes, name)
+    figure, axes = _of_quality(name)
     for number, line in enumerate(lines.lines):
         across, psnr = as_number(lines.settings[name][number]), line.mean("psnr")
         if psnr is not None and across is not None:
@@ -236,11 +230,15 @@ def _style(number: int) -> dict[str, Any]:
     return {"marker": marker, "color": colour, "linestyle": "none"}
 
 
-def _label(axes: Axes, across: str) -> None:
+def _of_quality(across: str, height: float = 4.5) -> tuple[Figure, Axes]:
+    """An empty plot of the PSNR, with the label of the axis across."""
+    figure = Figure(figsize=(8, height), layout="constrained")
+    axes = figure.subplots()
     axes.set_xlabel(across)
     axes.set_ylabel("PSNR, dB")
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
+    return figure, axes
 
 
 def frontier_plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
