@@ -114,10 +114,8 @@ def _view(run: Run, frame: str) -> RunView:
     cold = figures["phase"] == COLD
     ms = figures["frame_ms"] if cold else run.values["frame_ms"]
     title = f"PSNR {figures['psnr']:.2f} dB, {ms:,.1f} ms{', cold' if cold else ''}"
-    pictures = [
-        read_picture(run.pictures / f"{frame}-{kind}.png") for kind in ("rendered", "error")
-    ]
-    return RunView((run.label, title), *pictures)
+    files = (run.pictures / f"{frame}-{kind}.png" for kind in ("rendered", "error"))
+    return RunView((run.label, title), *map(read_picture, files))
 
 
 def find_detail(truth: np.ndarray, renderings: Sequence[np.ndarray]) -> tuple[Box, str]:

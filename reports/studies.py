@@ -17,7 +17,7 @@ from bench.convergence import observed_order
 from reports.figures import frontier_plot
 from reports.images import Part, Picture
 from reports.runs import Run
-from reports.tables import BOLD, DENSE, Table, amount, decimal, megabytes, share, spread
+from reports.tables import BOLD, DENSE, Table, amount, decimal, megabytes, share
 
 ON_FRONTIER = "— (frontier)"
 WORK = "work."
@@ -283,7 +283,7 @@ def _psnr(line: Measured) -> str:
 
 
 def _of_rounds(line: Measured) -> str:
-    return spread(line.fastest, line.slowest)
+    return f"{decimal(line.fastest, 1)} – {decimal(line.slowest, 1)}"
 
 
 def _tail(line: Measured) -> str:

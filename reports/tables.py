@@ -67,10 +67,6 @@ BOLD = ("**%s**", "*%s*")
 """What the best and, where that is shown, the second-best figure of a column look like."""
 
 
-def spread(low: float, high: float) -> str:
-    return f"{decimal(low, 1)} – {decimal(high, 1)}"
-
-
 def decimal(value: float | None, decimals: int) -> str:
     """`value` with this number of `decimals`, or `n/a`. A value that rounds to 0 gets no sign."""
     if value is None or math.isnan(value):
