@@ -48,8 +48,6 @@ examples
 
 PLACES = ("outputs", "report")
 
-INTERRUPTED = 130  # an exit status, as of a shell
-
 # Errors of the file system that deserve a plain sentence rather than a traceback.
 REFUSALS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR}
 
@@ -71,7 +69,7 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
     except SteerbenchError as error:
         return _fail(str(error), 2)
     except KeyboardInterrupt:
-        return _fail("interrupted", INTERRUPTED)
+        return _fail("interrupted", 130)
     except BrokenPipeError:
         # Python flushes standard output again at exit; redirect that to /dev/null.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
