@@ -51,9 +51,6 @@ W = TypeVar("W")
 R = TypeVar("R")
 
 
-# Where work is done
-
-
 @dataclass(frozen=True)
 class Launcher:
     """Where work is done, as Hydra's `config` says; errors quote the `words` of the command."""
@@ -141,9 +138,6 @@ def _numbered(work: Callable[[W], R], on: Sequence[W], config: Any) -> R | Excep
         return error
 
 
-# How jobs end
-
-
 @dataclass(frozen=True)
 class Ended:
     """How a job ended: with the key of its `run`, which was `measured` unless the store had it, or
@@ -215,9 +209,6 @@ def _progress(folder: Path, total: int, begun: float) -> str:
     return f"; {done} of {total} jobs done{left}"
 
 
-# All jobs of a command
-
-
 def run_jobs(jobs: Sequence[Job], launcher: Launcher) -> list[Ended]:
     """Run the jobs, equal ones only once, and say how each of them ended.
 
@@ -276,11 +267,9 @@ def _attempted(group: Group, total: int, begun: float) -> dict[str, Ended]:
     return attempt(group, total, Path(HydraConfig.get().runtime.output_dir), begun)
 
 
-# Trainings in parallel, because small ones gain little from a second core
-
-
 def train_ahead(jobs: Sequence[Job], measured: Collection[str]) -> None:
-    """Train the models of `jobs`, which share one budget, as many at a time as the cores allow.
+    """Train the models of `jobs`, which share one budget, as many at a time as the cores allow:
+    small trainings gain little from a second core.
 
     Trainings of jobs whose key is in `measured` are skipped. The jobs load the stored stages when
     they are measured. A training that fails here fails again then, and is reported then.
@@ -317,9 +306,8 @@ def room(config: DictConfig) -> int:
 def _training(job: Job) -> str:
     """A key of all settings that a training may depend on; equal for jobs that share it."""
     method = job.settings["method"]
-    left_out = {*OF_MEASUREMENT, "method"}
     chosen = study_of(target_of(method)).chosen
-    others = {name: value for name, value in job.settings.items() if name not in left_out}
+    others = {name: value for name, value in job.settings.items() if name not in OF_MEASUREMENT}
     own = {name: value for name, value in method.items() if name not in chosen}
     return content_key({**others, "method": own})
 
