@@ -7,7 +7,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -36,8 +36,6 @@ from sweeps.configured import (
 from sweeps.experiments import axes
 from sweeps.overrides import target_of
 from sweeps.processes import device_lock
-
-J = TypeVar("J", bound="Job")
 
 PLACES = ("outputs", "report", "weights_dir")
 """Settings that are only locations and do not change a row."""
@@ -160,7 +158,7 @@ def obtain(jobs: Sequence[Job]) -> tuple[list[str], bool]:
     return _told(ready, measured, log), measured
 
 
-def stored(jobs: Sequence[J]) -> dict[str, J]:
+def stored(jobs: Sequence[Job]) -> dict[str, Job]:
     """Those of `jobs` that can be used here, by the keys that `obtain` would find in the store, if
     it has all of them; otherwise none."""
     log, left = ConsoleLog(jobs[0].outputs), list(jobs)
