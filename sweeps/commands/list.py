@@ -7,7 +7,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from bench.errors import SteerbenchError, Unavailable
+from bench.errors import SteerbenchError
 from reports.tables import Table
 from sweeps.overrides import choices, described, engine_kinds, plug_ins
 from sweeps.terminal import console, show
@@ -61,7 +61,7 @@ def _brings(folder: Path | str, words: Sequence[str]) -> str:
 def _state(name: str, kind: Any) -> str:
     try:
         kind(kind.precisions[0])
-    except (Unavailable, SteerbenchError) as reason:
+    except SteerbenchError as reason:
         return str(reason)
     with suppress(metadata.PackageNotFoundError):  # an engine's name may differ from its library's
         return f"usable (version {metadata.version(name)})"
