@@ -9,7 +9,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from bench.errors import Unavailable, unexpected
-from reports.paper_tables import METHOD, PaperTable
+from reports.paper_tables import METHOD, PaperTable, Place
 from sweeps import experiments
 from sweeps.configured import build
 from sweeps.data_sets import DataSet, data_set_of
@@ -20,14 +20,10 @@ from sweeps.processes import on_gpu
 
 @dataclass(frozen=True, kw_only=True)
 class Planned(Job):
-    """A job of a table, for a line of one of its blocks; both are named by their keys.
+    """A job for the line of a table at a `place`; `label` is what the line is shown as. `scene` is
+    one of several, or of a data set, or empty."""
 
-    `label` is what the line is shown as. `scene` is one of several, or of a data set, or empty.
-    """
-
-    table: str
-    block: str
-    line: str
+    place: Place
     label: str
     scene: str
 
@@ -76,8 +72,7 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
     for data_set, key, line in lines:
         if "precision" in line.job and line.job["precision"] not in precisions:
             continue
-        own_settings = {name: of for name, of in line.job.items() if name not in asked}
-        settings = [f"{name}={value}" for name, value in own_settings.items()]
+        settings = [f"{name}={of}" for name, of in line.job.items() if name not in asked]
         groups = [word for word in settings if choices(word.partition("=")[0], fixed)]
         values = [word for word in settings if word not in groups]
         repeated = line.every_seed or METHOD not in line.job
@@ -97,8 +92,9 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
             parts = (f"{table.name}: {line.label}", scene, f"seed {config.seed}")
             told = ", ".join(filter(None, parts))
             turns = turns_of(table.name, config) if experiment.in_turns else ""
-            where = {"table": table.name, "block": data_set, "line": key, "scene": scene}
-            jobs.append(Planned(config, command, told, turns, label=line.label, **where))
+            where = Place(table.name, data_set, key)
+            job = Planned(config, command, told, turns, place=where, label=line.label, scene=scene)
+            jobs.append(job)
     return jobs
 
 

@@ -83,9 +83,8 @@ def gather(jobs: Sequence[Planned], runs: Mapping[str, Sequence[Run]]) -> dict[P
     """
     blocks: dict[tuple[str, str], dict[Place, list[Outcome]]] = {}
     for job in jobs:
-        place = Place(job.table, job.block, job.line)
-        of_block = blocks.setdefault((job.table, job.block), {})
-        of_block.setdefault(place, []).append(_outcome(job, runs.get(job.key, ())))
+        of_block = blocks.setdefault(job.place[:2], {})
+        of_block.setdefault(job.place, []).append(_outcome(job, runs.get(job.key, ())))
     return {place: line for block in blocks.values() for place, line in _lines(block).items()}
 
 
@@ -124,8 +123,7 @@ def _line(outcomes: Sequence[Outcome], common: set[str]) -> Repeated:
     gaps = list(_gaps(outcomes))
     if by_scene and not common:
         gaps.append("no scene that all lines have")
-    several = {each.job.scene for each in outcomes} != {""}
-    if not several:
+    if {each.job.scene for each in outcomes} == {""}:
         return Repeated(label, runs, gaps)
     return Repeated(label, runs, gaps, by_scene, [run for of_seed in complete for run in of_seed])
 

@@ -174,7 +174,7 @@ def test_what_is_chosen_afterwards_is_no_training_of_its_own():
 def test_nothing_is_trained_for_a_line_whose_fellow_is_measured(monkeypatch):
     """Say one that fails each time, at a precision that this CPU does not have."""
     every = plan(TABLES["table1"], ["budget=paper"])
-    jobs = [job for job in every if job.line in ("int8", "int8_calibrated")]
+    jobs = [job for job in every if job.place.line in ("int8", "int8_calibrated")]
     assert len(jobs) > len({execute._training(job) for job in jobs}) > 1
     measured = {execute._training(job): job.key for job in jobs}  # one of each training
     monkeypatch.setattr(execute, "room", lambda config: 2)

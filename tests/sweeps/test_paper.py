@@ -185,7 +185,7 @@ def psnr(store: Store, stored_run: str, monkeypatch: pytest.MonkeyPatch, elsewhe
         keys = list(TABLE5.lines)
         runs = {}
         for job in jobs:
-            place = (keys.index(job.line), job.scene, job.config.seed)
+            place = (keys.index(job.place.line), job.scene, job.config.seed)
             if place in found:
                 facts = {"scene": job.scene, "seed": job.config.seed}
                 run = changed(source, {"psnr": found[place]}, **facts)

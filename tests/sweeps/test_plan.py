@@ -34,7 +34,7 @@ def with_one_seed(name: str) -> tuple[Planned, ...]:
 def test_every_line_that_can_be_measured_has_its_job(name):
     jobs = with_one_seed(name)
     lines = TABLES[name].lines
-    assert [(job.line, job.label) for job in jobs] == [(key, x.label) for key, x in lines.items()]
+    assert [(x.place.line, x.label) for x in jobs] == [(key, x.label) for key, x in lines.items()]
     assert len({job.key for job in jobs}) == len(lines)
 
 
@@ -56,7 +56,7 @@ def test_a_budget_says_how_often_lines_are_repeated_unless_seeds_are_asked_for(w
 def test_the_field_that_the_papers_method_is_trained_from_is_rendered_with_every_seed():
     seeds: dict[str, set[int]] = {}
     for job in plan(TABLES["table1"], ["tables.seeds=2"]):
-        seeds.setdefault(job.line, set()).add(job.config.seed)
+        seeds.setdefault(job.place.line, set()).add(job.config.seed)
     own = {line for line, of in seeds.items() if of == {0, 1}}
     assert {"ngp", "fp32"} <= own <= {"ngp", "fp32", "bf16", "int8", "int8_calibrated"}
     assert seeds["diver"] == {0}
@@ -92,7 +92,7 @@ def test_the_lines_of_table_3_differ_in_l_alone():
 def test_tables_share_the_run_that_they_have_in_common():
     """But for the tables of times: a time in turns is another figure than one alone."""
     jobs = [
-        next(x for x in plan(TABLES[name], ["budget=paper", "seed=0"]) if x.line == line)
+        next(x for x in plan(TABLES[name], ["budget=paper", "seed=0"]) if x.place.line == line)
         for name, line in (("table4", "6"), ("table6", "16"), ("table3", "2"))
     ]
     assert jobs[0].key == jobs[1].key != jobs[2].key
@@ -161,7 +161,7 @@ def test_a_scene_is_compared_with_the_figures_of_its_data_set():
     for job in plan(tables["table1"], words):
         assert job.config.scene.height == {"totem": None, "totem_hd": 1080}[job.scene]
         assert job.config.scene.downscale == 2
-        of_block.setdefault(job.block, set()).add((job.scene, job.line))
+        of_block.setdefault(job.place.block, set()).add((job.scene, job.place.line))
         again = composed([text for text in job.command[2:] if text != "hydra.mode=RUN"])
         assert described(again) == described(job.config)
     assert list(of_block) == list(DATA_SETS)
