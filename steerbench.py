@@ -42,10 +42,10 @@ from reports.regression import Assertion
 from reports.runs import Run, load_runs
 from sweeps import configured
 from sweeps.baseline import checked
+from sweeps.commands.score import score
 from sweeps.hydra_runs import run_hydra
 from sweeps.measurement import Job, obtain
 from sweeps.overrides import composed, described
-from sweeps.scored import score
 from sweeps.terminal import write_page
 
 __all__ = [
