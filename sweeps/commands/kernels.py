@@ -2,7 +2,7 @@
 
 import argparse
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +54,7 @@ def _saving_most_first(rows: Sequence[Row]) -> list[Row]:
     return sorted(compared, key=lambda row: row.get("ms", -math.inf) - (row["reference_ms"] or 0.0))
 
 
-def _line(row: Mapping[str, Any]) -> tuple[str, ...]:
+def _line(row: Row) -> tuple[str, ...]:
     labels = (row["kernel"], row["case"], row["backend"], row["dtype"], *errors(row))
     if row["status"] != "ok":
         return (*labels, "", row["status"], "", "")
@@ -63,7 +63,7 @@ def _line(row: Mapping[str, Any]) -> tuple[str, ...]:
     return (*labels, *times, ratio)
 
 
-def errors(row: Mapping[str, Any]) -> tuple[str, str]:
+def errors(row: Row) -> tuple[str, str]:
     """The cells of the error of a check and of its tolerance."""
     error = "not finite" if row["error"] is None else f"{row['error']:.1e}"
     return error, "" if row["tolerance"] is None else f"{row['tolerance']:.1e}"

@@ -5,7 +5,6 @@ import math
 from collections.abc import Iterable, Iterator
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -14,7 +13,7 @@ from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from methods import checks
 from reports.tables import Table
-from sweeps.commands.kernels import errors
+from sweeps.commands.kernels import Row, errors
 from sweeps.terminal import print_rows, show
 
 COLUMNS = (
@@ -22,8 +21,6 @@ COLUMNS = (
     *("worst", "at most", "status"),
 )
 NEAREST = 5  # cases that are also shown by themselves
-
-Row = dict[str, Any]
 
 
 def main(options: argparse.Namespace) -> int:
