@@ -36,10 +36,8 @@ def comparison(lines: Lines, failures: Mapping[str, str]) -> list[Table]:
     missing, by label: each is a line of its own.
     """
     metrics = columns_of(lines)
-    title = (
-        f"Comparison: {conditions_of(lines.runs, lines.settings)}" if lines.lines else "Comparison"
-    )
-    tables = [_table(title, lines.settings, lines.lines, metrics)]
+    where = f": {conditions_of(lines.runs, lines.settings)}" if lines.lines else ""
+    tables = [_table(f"Comparison{where}", lines.settings, lines.lines, metrics)]
     blank = ("",) * (len(tables[0].columns) - 1)
     failed = tuple((f"{label}: failed: {why}", *blank) for label, why in failures.items())
     tables[0] = replace(tables[0], lines=tables[0].lines + failed)
@@ -68,13 +66,11 @@ def _table(
         columns["frames"] = phases
     if any(len(line.runs) > 1 for line in lines):
         columns["seeds"] = [str(len(line.runs)) for line in lines]
-    figures = {
-        metric: [text or NOT_AVAILABLE for text in marked(lines, metric, BOLD[:1])]
-        for metric in metrics
-    }
-    heads = (*columns, *(shown_as(metric).heading for metric in metrics))
-    cells = tuple(zip(*columns.values(), *figures.values(), strict=True))
-    return Table(title, heads, cells, sources=tuple(line.keys for line in lines))
+    for metric in metrics:
+        texts = marked(lines, metric, BOLD[:1])
+        columns[shown_as(metric).heading] = [text or NOT_AVAILABLE for text in texts]
+    cells = tuple(zip(*columns.values(), strict=True))
+    return Table(title, tuple(columns), cells, sources=tuple(line.keys for line in lines))
 
 
 def shown_as(metric: str) -> Metric:
