@@ -116,9 +116,7 @@ def scenes_of(words: Sequence[str], data: DataSet | None = None) -> list[str]:
     """The names of the scenes in `data` or in `words`; of a folder, its last part."""
     if data:
         return list(data.scenes)
-    folders = [
-        word.partition("=")[2] for word in words if word.lstrip("+").startswith("scene.path=")
-    ]
+    _, folders = _taken(words, "scene.path")
     return [Path(unquoted(folders[-1])).name] if folders else _taken(words, "scene")[1] or [""]
 
 
