@@ -53,8 +53,7 @@ class Settings:
 
 
 def checked_settings(config: DictConfig) -> Settings:
-    names = [field.name for field in fields(Settings)]
-    values = {name: config[name] for name in names if name in config}
+    values = {each.name: config[each.name] for each in fields(Settings) if each.name in config}
     if values.get("frame_size") is not None:
         values["frame_size"] = list(values["frame_size"])
     check_settings(Settings, values)

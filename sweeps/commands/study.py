@@ -26,9 +26,8 @@ def main(options: argparse.Namespace) -> int:
     """Measure what the store lacks of a study, print its tables and write its page; return 1 if a
     line failed that can run here."""
     study = options.command
-    within = None
-    if study == "accuracy" and options.within is not None:
-        within = decibels(options.within)
+    limit = getattr(options, "within", None)
+    within = None if limit is None else decibels(limit)
     words, of_hydra = divided(options.overrides)
     given = {name: getattr(options, name) for name in ("only", "trained") if name in options}
     found = subjects(study, words)

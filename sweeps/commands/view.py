@@ -215,8 +215,7 @@ class Viewer:
                 stages=gui.add_markdown(""),
             )
             first = gui.add_button("first view")
-        controls = browser.shown, browser.split, browser.height, browser.exact, browser.record
-        for control in controls:
+        for control in (shown, split, browser.height, browser.exact, browser.record):
             control.on_update(lambda _: self._want(client.client_id))
         first.on_click(lambda _: self._look(client.camera, self.first))
         self.browsers[client.client_id] = browser
