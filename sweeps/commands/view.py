@@ -101,7 +101,7 @@ class Viewer:
         self.server = _serve(host, port)
         cameras = self.scene.splits["train"].cameras
         up = -torch.stack([camera.c2w[:, 1] for camera in cameras]).sum(dim=0)
-        self.server.scene.set_up_direction(_three(functional.normalize(up, dim=0)))
+        self.server.scene.set_up_direction(functional.normalize(up, dim=0).double().numpy())
         self._look(self.server.initial_camera, self.first)
         self._add_knobs()
         self.server.on_client_connect(self._join)
@@ -156,7 +156,7 @@ class Viewer:
         position, middle = camera.c2w[:, 3], self.scene.bounds.mean(dim=0)
         ahead = camera.c2w[:, 2]
         distance = torch.dot(middle - position, ahead).clamp(min=0.1)
-        at.position, at.look_at = _three(position), _three(position + distance * ahead)
+        at.position, at.look_at = position.numpy(), (position + distance * ahead).numpy()
         at.fov = 2 * float(np.arctan(camera.height / 2 / camera.fy))
 
     def _add_knobs(self) -> None:
@@ -280,11 +280,6 @@ def _camera(handle: CameraHandle, height: int) -> Camera:
 
 def _same(one: Camera, other: Camera) -> bool:
     return torch.equal(pack_camera(one), pack_camera(other))
-
-
-def _three(vector: Tensor) -> tuple[float, float, float]:
-    x, y, z = vector.tolist()
-    return x, y, z
 
 
 def _figures(
