@@ -19,7 +19,6 @@ from reports.images import Part, Picture
 from reports.runs import Run
 from reports.tables import BOLD, DENSE, Table, amount, decimal, megabytes, share
 
-ON_FRONTIER = "— (frontier)"
 WORK = "work."
 
 
@@ -127,7 +126,7 @@ def accuracy(found: Sequence[Measured]) -> list[Part]:
         "PSNR, dB ↑": _psnr,
         "lost, dB ↓": lambda line: decimal(line.lost, 2),
         "PSNR to the first, dB ↑": _apart,
-        "better at no more time": lambda line: line.better.label if line.better else ON_FRONTIER,
+        "better at no more time": lambda line: line.better.label if line.better else "— (frontier)",
     }
     parts: list[Part] = []
     for method, lines in by_method(found).items():
