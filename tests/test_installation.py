@@ -43,10 +43,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     environment = folder / "environment"
     for name in PACKAGES:
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for path in (
-        *ROOT.glob("*.py"),
-        *map(ROOT.joinpath, ("pyproject.toml", "README.md", "LICENSE")),
-    ):
+    for path in (*ROOT.glob("*.py"), *map(ROOT.joinpath, METADATA)):
         shutil.copy(path, source)
     pip = [sys.executable, "-m", "pip", "-q", "--disable-pip-version-check"]
     alone = ["--no-deps", "--no-index"]

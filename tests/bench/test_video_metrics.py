@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -19,7 +18,6 @@ from bench.video_metrics import DepthView, warping_error
 from tests.bench.test_metrics import noise
 from tests.conftest import QUICK
 
-ROOT = Path(__file__).parents[2]
 WHITE = torch.ones(3)
 
 

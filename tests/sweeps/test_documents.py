@@ -89,7 +89,7 @@ def typed(command: str) -> list[str]:
 WITHOUT_LPIPS = ("protocol.lpips=[]", "protocol.name=quick")
 
 
-def test_what_the_document_makes_is_listed_measured_and_studied(steerbench, mine, monkeypatch):
+def test_what_the_document_makes_is_listed_measured_and_studied(steerbench, mine):
     assert "The mean colour of the training pictures." in steerbench(*typed("list")).out
     measured = steerbench(*typed("run --config-dir"), *WITHOUT_LPIPS).ok()
     assert "19.83" in measured.out  # 20 log10(255 / 26)

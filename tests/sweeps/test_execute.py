@@ -53,8 +53,8 @@ def in_turns(*levels: float, turns: str = "table") -> list[Job]:
     return [Job(config, [], turns=turns) for config in configs]
 
 
-def measured(*levels: float, turns: str = "table") -> bool:
-    return obtain(in_turns(*levels, turns=turns))[1]
+def measured(*levels: float) -> bool:
+    return obtain(in_turns(*levels))[1]
 
 
 def test_lines_that_are_measured_in_turns_are_found_together_or_not_at_all(elsewhere):

@@ -37,11 +37,11 @@ GREY = """
 
 @pytest.fixture
 def write(tmp_path: Path):
-    """Write `worker.py`, or another: `GREY`, then further lines."""
+    """Write `worker.py`: `GREY`, then further lines."""
     shutil.copy(ROOT / "steerbench_worker.py", tmp_path)
 
-    def write(lines: str = "", name: str = "worker.py") -> None:
-        (tmp_path / name).write_text(f"{dedent(GREY)}\n{dedent(lines)}\nserve(Grey)\n")
+    def write(lines: str = "") -> None:
+        (tmp_path / "worker.py").write_text(f"{dedent(GREY)}\n{dedent(lines)}\nserve(Grey)\n")
 
     return write
 
@@ -145,7 +145,7 @@ def test_when_steerbench_is_killed_the_worker_ends(spawn, write, tmp_path):
 
 
 def test_a_worker_beside_its_yaml_is_found_from_anywhere_and_gets_variables(
-    steerbench, write, tmp_path, monkeypatch
+    steerbench, write, tmp_path
 ):
     write("""
         import os

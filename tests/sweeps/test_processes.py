@@ -32,7 +32,7 @@ def test_who_is_told_to_end_does_not_wait_for_its_processes():
     assert isinstance(waiting.exception(), BrokenProcessPool)
 
 
-def test_gpus_are_told_apart_by_their_uuid(tmp_path, monkeypatch):
+def test_gpus_are_told_apart_by_their_uuid(monkeypatch):
     names = {"cuda:0": "GPU-a", "cuda:1": "GPU-b"}
     monkeypatch.setattr(
         torch.cuda, "get_device_properties", lambda device: SimpleNamespace(uuid=names[device])

@@ -123,7 +123,7 @@ def test_an_ablation_is_a_table_over_seeds_in_every_form_and_grows_by_what_is_ne
     assert "invalid choice: 'word'" in run("--format", "word").refused()
 
 
-def test_a_sweep_and_a_run_of_the_store_are_frames_in_python(elsewhere, tmp_path):
+def test_a_sweep_and_a_run_of_the_store_are_frames_in_python(elsewhere):
     runs, table = python.sweep(*STAND_INS, *ABLATION[1:])
     assert table[["method", "level", "seeds"]].to_numpy().tolist() == [
         ["grey", "0.5", 2], ["grey", "0.25", 2]

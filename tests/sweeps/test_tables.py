@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 
 from bench.errors import SteerbenchError
-from reports.tables import QUALITY
 from sweeps.data_sets import DATA_SETS, FIRST
 from sweeps.experiments import experiment, grid
 from sweeps.tables import chosen
@@ -13,7 +12,6 @@ from sweeps.tables import chosen
 _, SECOND = DATA_SETS
 TABLES = {table.name: table for table in chosen()}
 BOTH = {table.name: table for table in chosen(data_sets=[FIRST, SECOND])}
-METRICS = {*QUALITY, "fps", "frame_ms", "size_bytes.total", "work.samples"}
 
 
 def test_the_experiments_declare_the_six_tables_of_the_paper():

@@ -10,13 +10,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from methods.engines import CALIBRATION, Built, Engine
+from methods.engines import CALIBRATION, Engine
 from methods.engines.openvino_engine import OpenVino
 from methods.engines.tensorrt_engine import TensorRt
 from tests.methods.engines.test_engines import CPU, unet
 
 Kind = Callable[[str, str], Engine]
-Build = Callable[..., Built]
 
 pytestmark = [
     pytest.mark.usefixtures("double", "no_bfloat16"),
