@@ -1,6 +1,5 @@
 """The digest of a thing follows the files it stands on; commit and machine are as they are."""
 
-import importlib
 import shutil
 import subprocess
 from importlib import metadata
@@ -169,7 +168,6 @@ def plugin(request, tree, tmp_path, monkeypatch) -> tuple[Path, type]:
     if request.param == "namespace":
         (folder / "__init__.py").unlink()
     monkeypatch.syspath_prepend(tmp_path / "site")
-    importlib.invalidate_caches()
     return folder, defined_in(f"foreign_{request.param}.method")
 
 
@@ -187,7 +185,6 @@ def test_all_of_a_plugin_and_what_it_imports_of_ours_count_and_not_where_it_lies
     elsewhere = folder.parent.with_name("elsewhere")
     shutil.move(folder.parent, elsewhere)
     monkeypatch.syspath_prepend(elsewhere)
-    importlib.invalidate_caches()
     assert digest(thing) == before
     for name in ("helper.py", "data/table.bin", "method.py"):
         before = digest(thing)
@@ -198,7 +195,6 @@ def test_all_of_a_plugin_and_what_it_imports_of_ours_count_and_not_where_it_lies
 def test_a_single_file_counts_with_the_module_that_it_imports(tree, tmp_path, monkeypatch):
     write(tmp_path / "site", {"single_file.py": "import its_helper\n", "its_helper.py": "A = 1\n"})
     monkeypatch.syspath_prepend(tmp_path / "site")
-    importlib.invalidate_caches()
     thing = defined_in("single_file")
     before = digest(thing)
     write(tmp_path / "site", {"its_helper.py": "A = 2\n"})
