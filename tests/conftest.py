@@ -1,17 +1,15 @@
 """What all tests share: devices, a poisoned `torch.empty`, a quiet log, tiny scene, method, run."""
 
-import importlib.util
 import math
 import os
 import re
 import signal
-import sys
+import threading
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import wraps
 from pathlib import Path
-from types import ModuleType
 
 import hypothesis
 import pytest
@@ -34,7 +32,7 @@ from bench.types import Budget, Camera, Frame, Log, Probe, Scene, Split, composi
 from bench.weights import BACKBONES
 from sweeps.overrides import CONFIGS
 from tests.pretended_gpu import PretendedGpu, pretended_gpu
-from tests.web import Web, served
+from tests.web import Web
 
 STEERBENCH_1 = instantiate(OmegaConf.load(CONFIGS / "protocol" / "steerbench-1.yaml"))
 QUICK = replace(STEERBENCH_1, name="quick", lpips=())  # without weights, which a test may lack
@@ -51,29 +49,12 @@ if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"
 
 
-def script(name: str) -> ModuleType:
-    """The program `docs/NAME.py` as a module."""
-    spec = importlib.util.spec_from_file_location(
-        f"docs_{name}", Path(__file__).parents[1] / "docs" / f"{name}.py"
-    )
-    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-FIRST = "test_end_to_end.py"
-"""The file that takes longest: begun last, it would run alone in the end."""
-
-
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the longest file first."""
-    items.sort(key=lambda item: item.path.name != FIRST)
+    """Put the file first that takes longest: begun last, it would run alone in the end."""
+    items.sort(key=lambda item: item.path.name != "test_end_to_end.py")
 
 
-DEVICES = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
-
-
-@pytest.fixture(params=DEVICES)
+@pytest.fixture(params=["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"])
 def device(request: pytest.FixtureRequest) -> str:
     """Every device of this machine in turn."""
     return request.param
@@ -91,8 +72,12 @@ def gpu() -> Iterator[PretendedGpu]:
 @pytest.fixture
 def web() -> Iterator[Web]:
     """A web server on the loopback address, with nothing on it."""
-    with served() as web:
+    with Web() as web:
+        thread = threading.Thread(target=web.serve_forever, args=(0.01,))
+        thread.start()
         yield web
+        web.shutdown()
+        thread.join()
 
 
 EMPTY = ((torch, "empty"), (torch, "empty_like"), (Tensor, "new_empty"))

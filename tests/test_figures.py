@@ -11,13 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.conftest import script
+from docs import figures
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 END = "<!-- end of figures -->"
-
-figures = script("figures")
 
 PROGRAM = f"""#!{sys.executable}
 import sys

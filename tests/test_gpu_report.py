@@ -8,11 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from docs import gpu as report
 from sweeps.cli import dispatch, guard
-from tests.conftest import script
 from tests.pretended_gpu import PretendedGpu
-
-report = script("gpu")
 
 TINY = [
     *("scene.width=16", "scene.train=4", "scene.test=2", "protocol.lpips=[]", "protocol.warmup=0"),

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 
@@ -38,15 +35,3 @@ class Web(ThreadingHTTPServer):
         self.breaks_after: int | None = None
         self.asked: list[str] = []
         self.address = f"http://127.0.0.1:{self.server_address[1]}/"
-
-
-@contextmanager
-def served() -> Iterator[Web]:
-    with Web() as web:
-        thread = threading.Thread(target=web.serve_forever, args=(0.01,))
-        thread.start()
-        try:
-            yield web
-        finally:
-            web.shutdown()
-            thread.join()
