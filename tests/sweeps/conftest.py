@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from hydra.core.plugins import Plugins
+from hydra._internal.core_plugins.basic_launcher import BasicLauncher
 
 from sweeps import cli
 
@@ -81,22 +81,15 @@ def run(steerbench: Callable[..., Outcome]) -> Callable[..., Outcome]:
 
 @pytest.fixture
 def launched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """How many jobs each launcher of Hydra's was handed."""
+    """How many jobs Hydra's usual launcher was handed, each time."""
     counts: list[int] = []
-    make = Plugins.instantiate_launcher
+    launch = BasicLauncher.launch
 
-    def made(self, **given):
-        launcher = make(self, **given)
-        launch = launcher.launch
+    def noted(self, jobs, initial_job_idx: int):
+        counts.append(len(jobs))
+        return launch(self, jobs, initial_job_idx)
 
-        def noted(jobs, initial_job_idx: int):
-            counts.append(len(jobs))
-            return launch(jobs, initial_job_idx)
-
-        monkeypatch.setattr(launcher, "launch", noted)
-        return launcher
-
-    monkeypatch.setattr(Plugins, "instantiate_launcher", made)
+    monkeypatch.setattr(BasicLauncher, "launch", noted)
     return counts
 
 

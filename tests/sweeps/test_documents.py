@@ -11,6 +11,7 @@ from pathlib import Path
 from textwrap import dedent
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -194,17 +195,11 @@ COMMANDS = [(named(path), words) for path in PRESENT for words in commands(path)
 
 def captured(monkeypatch: pytest.MonkeyPatch, words: list[str]) -> Namespace:
     """What the command of `words` would be called with."""
-    seen: list[Namespace] = []
-
-    def note(options: Namespace) -> int:
-        seen.append(options)
-        return 0
-
+    main = Mock(return_value=0)
     with monkeypatch.context() as patch:
-        imported = SimpleNamespace(main=note)
-        patch.setattr(cli.importlib, "import_module", lambda name: imported)
+        patch.setattr(cli.importlib, "import_module", lambda name: SimpleNamespace(main=main))
         assert cli.dispatch(words) == 0
-    return seen[0]
+    return main.call_args.args[0]
 
 
 @pytest.mark.parametrize(
