@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from PIL import Image
 
 from bench.results import STEADY, Store
+from tests.bench.test_pictures import write
 from tests.sweeps.conftest import Outcome
 
 QUICK = ("protocol.name=quick", "protocol.lpips=[]")
@@ -20,10 +20,8 @@ SCENE = ("scene=totem", "scene.width=24", "scene.train=2", "scene.test=3")
 def folders(tmp_path: Path) -> tuple[str, str]:
     """Two grey pictures that are 51 levels (0.2) too bright, and their truth."""
     for name, level in (("theirs", 151), ("true", 100)):
-        (tmp_path / name).mkdir()
-        for number in (0, 1):
-            image = torch.full((16, 20, 3), level, dtype=torch.uint8)
-            Image.fromarray(image.numpy()).save(tmp_path / name / f"{number}.png")
+        grey = torch.full((16, 20, 3), level, dtype=torch.uint8)
+        write(tmp_path / name, dict.fromkeys(("0.png", "1.png"), grey))
     return "theirs", "true"
 
 
