@@ -20,11 +20,6 @@ def there(*values: float) -> Tensor:
 
 
 HERE = torch.tensor([1.0, 2.0, 3.0])
-LATTICE, MIDDLE = (
-    HashGrid(levels=1, features=2, log2_table=6, n_min=4, n_max=4),
-    torch.full((2, 3), 0.5),
-)
-
 
 REFUSED: dict[str, Callable[[], object]] = {
     "a sum with the CPU": lambda: there(1, 2, 3) + HERE,
@@ -47,10 +42,11 @@ def test_what_cuda_refuses_is_refused(gpu, what):
 
 def test_a_triton_kernel_takes_no_tensor_of_the_cpu(gpu):
     pytest.importorskip("triton")
-    table, positions = torch.ones(LATTICE.entries, 2), MIDDLE.to("cuda")
-    assert encode(positions, table.cuda(), LATTICE, backend="gpu").tolist() == [[1, 1], [1, 1]]
+    grid = HashGrid(levels=1, features=2, log2_table=6, n_min=4, n_max=4)
+    table, positions = torch.ones(grid.entries, 2), torch.full((2, 3), 0.5).cuda()
+    assert encode(positions, table.cuda(), grid, backend="gpu").tolist() == [[1, 1], [1, 1]]
     with pytest.raises(ValueError, match="cannot be accessed from Triton"):
-        encode(positions, table, LATTICE, backend="gpu")
+        encode(positions, table, grid, backend="gpu")
 
 
 def masked(x: Tensor, value: float | Tensor, mask: Tensor) -> None:
@@ -122,18 +118,14 @@ def test_autocast_lowers_products(gpu, enabled):
     assert x.grad.dtype == torch.float32
 
 
-class Asking(nn.Module):
+class Asking(nn.Linear):
     """A network that asks for a number."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.factor = nn.Parameter(torch.ones(1))
-
     def forward(self, x: Tensor) -> Tensor:
-        return x * self.factor.item()
+        return x * self.bias.item()
 
 
 def test_planted_a_wait_in_a_network_is_found(gpu, tmp_path, quiet_log):
-    built = TorchEngine().build(Asking().to("cuda"), list, lambda: tmp_path, quiet_log)
+    built = TorchEngine().build(Asking(1, 1).to("cuda"), list, lambda: tmp_path, quiet_log)
     with pytest.raises(RuntimeError, match="stream is capturing"):
         built.run(torch.ones(1, 3, 4, 4, device="cuda"))

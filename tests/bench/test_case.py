@@ -64,11 +64,8 @@ def scaled(wrong: str) -> Operation:
 
     outputs = {"second": Bound("a", 0.1), "last": Bound("b", lambda given: given["y"].abs())}
     gradients = {"x": Bound("c", torch.tensor(0.01))}
-    return Operation("scaled", ("reference", "cpu"), compute, outputs, gradients, torch_ones)
-
-
-def torch_ones(generator: torch.Generator, shape: torch.Size) -> torch.Tensor:
-    return torch.ones(*shape)
+    backends = ("reference", "cpu")
+    return Operation("scaled", backends, compute, outputs, gradients, lambda _, x: torch.ones(x))
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,6 @@ import torch
 from sweeps.processes import LOCKS, lock_file, processes
 from tests.sweeps.conftest import PATH
 
-PATIENCE_S = 60.0
-"""A test that waits longer has failed."""
-
 
 @pytest.fixture(autouse=True)
 def locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -25,7 +22,7 @@ def locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_who_is_told_to_end_does_not_wait_for_its_processes():
     with suppress(SystemExit), processes(1) as pool:
-        waiting = pool.submit(select.select, [], [], [], PATIENCE_S)
+        waiting = pool.submit(select.select, [], [], [], 60.0)  # longer than a test may take
         while not waiting.running():
             os.sched_yield()
         raise SystemExit

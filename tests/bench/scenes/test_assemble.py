@@ -68,8 +68,7 @@ def camera(pose) -> Camera:
 def hull_of(part: Part, poses: list) -> Box:
     """The hull of what cameras at `poses` see of a model of one part."""
     cameras = [camera(pose) for pose in poses]
-    box = hull_box(cameras, [picture(Solids([part]), c) for c in cameras], cube(1.5))
-    return box
+    return hull_box(cameras, [picture(Solids([part]), c) for c in cameras], cube(1.5))
 
 
 @given(

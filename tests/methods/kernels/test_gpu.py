@@ -92,13 +92,10 @@ def test_every_kernel_compiles_for_gpus_that_are_not_here_without_spills(tmp_pat
 
 
 def test_what_it_does_not_serve_is_refused() -> None:
-    grid, table = (
-        HashGrid(levels=1, features=2, log2_table=3, n_min=2, n_max=2),
-        torch.zeros(2, 8).T,
-    )
+    grid = HashGrid(levels=1, features=2, log2_table=3, n_min=2, n_max=2)
+    table = torch.zeros(2, 8, device=DEVICE).T
     positions = torch.rand(2, 3, dtype=torch.float64, device=DEVICE)
     with pytest.raises(ValueError, match="expects positions of float32"):
-        encode(positions, table.to(DEVICE), grid, backend="gpu")
-    table = table.to(DEVICE)
+        encode(positions, table, grid, backend="gpu")
     with pytest.raises(ValueError, match="expects table to be contiguous"):
         sparse_adam_(table, table, AdamState.like(table), 0.1, backend="gpu")

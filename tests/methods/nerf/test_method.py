@@ -13,9 +13,6 @@ from tests.methods.conftest import Work
 from tests.methods.small_students import fitted
 from tests.methods.trainings import EXACT_TEACHER
 
-LONG = EXACT_TEACHER.training.march_step
-"""Step of the rays, in the usual ones."""
-
 
 def test_skipping_changes_no_picture_and_saves_products(ball_scene: Scene, shared_log: Log) -> None:
     method = fitted("nerf", ball_scene, shared_log, 20, stop=STOP)
@@ -25,20 +22,17 @@ def test_skipping_changes_no_picture_and_saves_products(ball_scene: Scene, share
     fast = method.render(camera, skipping)
     method.skip = False
     slow = method.render(camera, dense)
-    # A ray has at most 1024 / LONG samples; the faint ones, which only the dense picture has
-    # colours of, weigh at most that of `Sampling.least_weight` each. Sums differ by their rounding.
-    faint = 1024 / LONG * Sampling(stop=STOP).least_weight
+    # A ray has 1024 samples of the usual step at most; the faint ones, which only the dense picture
+    # has colours of, weigh at most `Sampling.least_weight` each. Sums differ by their rounding.
+    faint = 1024 / EXACT_TEACHER.training.march_step * Sampling(stop=STOP).least_weight
     torch.testing.assert_close(fast.rgb, slow.rgb, rtol=0, atol=faint + 1e-5)
     torch.testing.assert_close(fast.alpha, slow.alpha, rtol=0, atol=1e-5)
-    assert dense.done["products"] == dense.done["samples"] * products_of_a_sample()
-    assert skipping.done["products"] < dense.done["products"] / 3
-
-
-def products_of_a_sample() -> int:
-    """Weights of the network that the paper draws, without biases, and without those of the layer
-    between trunk and view, which no activation separates from the latter."""
+    # Weights of the network that the paper draws, without biases, and without those of the layer
+    # between trunk and view, which no activation separates from the latter.
     trunk = 63 * 256 + 4 * 256**2 + (63 + 256) * 256 + 2 * 256**2
-    return trunk + 256 + (256 + 27) * 128 + 128 * 3
+    products = trunk + 256 + (256 + 27) * 128 + 128 * 3
+    assert dense.done["products"] == dense.done["samples"] * products
+    assert skipping.done["products"] < dense.done["products"] / 3
 
 
 class PaperNerf(nn.Module):
