@@ -1,7 +1,7 @@
 """Small models, fields and pipelines: a test names only what it is about."""
 
-from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import torch
 
@@ -12,49 +12,33 @@ from methods.kernels.encode import HashGrid
 from methods.kernels.types import Occupancy
 from methods.rendering.occupancy import DensityGrid
 from methods.rendering.sampling import Sampling
-from methods.steernerf.options import (
-    EVERYWHERE,
-    JointOptions,
-    ModelOptions,
-    MotionOptions,
-    Rendering,
-    Skips,
-)
+from methods.steernerf.options import EVERYWHERE, MotionOptions
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.unet import UNet
+from tests.methods.usual import usual
 
 SMALL_GRID = HashGrid(levels=4, features=2, log2_table=8, n_min=4, n_max=16)
-MODEL = ModelOptions(channels=4, frames=2, scale=4, step=8.0, stop=STOP, feature_background=0.5)
-RENDERING = Rendering(8.0, STOP, EVERYWHERE, Skips(empty=True, hidden=True, background=True))
-MOTION = MotionOptions(degrees=(0.0, 2.5), pool=12, uses=16)
-JOINT = JointOptions(
-    field="joint",
-    optimiser="muon",
-    rate=1e-3,
-    field_rate=1e-3,
-    final_rate=1e-5,
-    half_waves=1,
-    patch=32,
-    batch=2,
-    jitter=False,
-    opacity_entropy=1e-3,
-    grid_samples=0,
-    distilled_views=100,
-    distilled_share=0.5,
-    motion=MOTION,
+STEPS = {"step": 8.0, "stop": STOP}
+
+small_model = partial(
+    usual, "method/steernerf", "model", **STEPS, channels=4, feature_background=0.5
 )
-
-
-small_model = partial(replace, MODEL)
 """K = 4, L = 2, s = 4, long steps; options replace fields, here and below."""
 
-small_rendering = partial(replace, RENDERING)
+small_rendering = partial(usual, "method/steernerf", "rendering", **STEPS, range=EVERYWHERE)
 """As `small_model()` is trained."""
 
-small_motion = partial(replace, MOTION)
+small_motion = partial(MotionOptions, degrees=(0.0, 2.5), pool=12, uses=16)
 """An example serves 16 patches."""
 
-small_joint = partial(replace, JOINT)
+small_joint = partial(
+    usual,
+    "method/steernerf",
+    "joint",
+    **{"field_rate": 1e-3, "final_rate": 1e-5, "patch": 32, "batch": 2, "jitter": False},
+    **{"grid_samples": 0, "distilled_views": 100, "distilled_share": 0.5},
+    motion=small_motion(),
+)
 """Two patches of at most 32 x 32 a step."""
 
 
@@ -83,9 +67,10 @@ def misty_field(precision: str = "bf16", backend: str = "auto", channels: int = 
     return field
 
 
-def new_pipeline(model: ModelOptions = MODEL) -> Pipeline:
+def new_pipeline(**options: Any) -> Pipeline:
     """A misty field and an untrained U-Net on white; always the same weights."""
     torch.manual_seed(0)
+    model = small_model(**options)
     field = misty_field(channels=model.channels)
     unet = UNet(model.channels, model.frames, model.scale, width=4, aligned=True)
     return Pipeline(trained_field(field), torch.ones(3), unet, model)

@@ -22,7 +22,6 @@ from tests.methods.models import (
     misty_field,
     new_pipeline,
     small_joint,
-    small_model,
     small_motion,
     trained_field,
 )
@@ -109,7 +108,7 @@ def new_patches(
     ]
     scene = replace(scene, splits={"train": halves[0]})
     options = small_joint(distilled_share=share, motion=motion, **joint)
-    pipeline, generator = new_pipeline(small_model(frames=frames)), torch.Generator().manual_seed(0)
+    pipeline, generator = new_pipeline(frames=frames), torch.Generator().manual_seed(0)
     return Patches(pipeline, scene, halves[1], options, generator)
 
 

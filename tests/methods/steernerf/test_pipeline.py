@@ -14,7 +14,7 @@ from methods.steernerf.options import RangeReduction
 from methods.steernerf.pipeline import near_matter
 from methods.steernerf.unet import RIM
 from tests.methods.conftest import Work, look_at_the_middle
-from tests.methods.models import new_pipeline, small_model, small_rendering
+from tests.methods.models import new_pipeline, small_rendering
 
 USUAL = small_rendering()
 CAMERA = look_at_the_middle(0.1, 0.3)
@@ -43,7 +43,7 @@ def test_a_part_of_a_view_looks_as_the_view_does():
 @pytest.mark.parametrize("frames", [0, 1, 3])
 @pytest.mark.parametrize("size", [(32, 32), (33, 30), (5, 3)])
 def test_frames_have_the_size_of_the_camera_whatever_is_remembered(frames, size):
-    pipeline = new_pipeline(small_model(frames=frames))
+    pipeline = new_pipeline(frames=frames)
     camera = replace(CAMERA, width=size[0], height=size[1])
     buffer = Buffer(maxlen=frames)
     for remembered in range(frames + 2):

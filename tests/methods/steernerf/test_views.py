@@ -6,11 +6,11 @@ import torch
 from methods.engines import Built
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.views import recorded_inputs
-from tests.methods.models import new_pipeline, small_joint, small_model
+from tests.methods.models import new_pipeline, small_joint
 
 
 def test_what_a_network_is_built_on_is_what_it_is_shown_whatever_ran_before(ball_scene, quiet_log):
-    pipeline = new_pipeline(small_model(frames=1))
+    pipeline = new_pipeline(frames=1)
     given = pipeline, ball_scene, small_joint(), 2, 0, quiet_log
     first = recorded_inputs(*given)
     assert pipeline.renderer.engine is None
@@ -30,9 +30,7 @@ def test_a_frame_is_recorded_as_in_training_behind_as_many_as_the_buffer_holds_a
 
     monkeypatch.setattr(Pipeline, "features", counted)
     frames, again, other = (
-        recorded_inputs(
-            new_pipeline(small_model(frames=1)), ball_scene, small_joint(), 3, seed, quiet_log
-        )
+        recorded_inputs(new_pipeline(frames=1), ball_scene, small_joint(), 3, seed, quiet_log)
         for seed in (0, 0, 1)
     )
     assert [preceding for _, preceding in rendered] == 9 * [0, 1, 1]
