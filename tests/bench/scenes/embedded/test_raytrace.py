@@ -30,22 +30,6 @@ def test_16_samples_stand_for_the_16_quarter_pixel_cells():
     assert sample_offsets(1).tolist() == [[0.5, 0.5]]
 
 
-def test_depth_of_a_sphere_is_the_closed_form():
-    camera = camera_at((3.0, 1.0, 2.0))
-    frame = render(Solids([sphere(0.7)]), camera, samples=1)
-    rays = cast(camera)
-    # |o + t d|^2 = r^2, the textbook's way, in double precision.
-    o, d = rays.origins.double(), rays.directions.double()
-    a, b, c = (d * d).sum(1), (o * d).sum(1), (o * o).sum(1) - 0.49
-    root = b * b - a * c
-    expected = torch.where(root > 0, (-b - root.clamp(min=0).sqrt()) / a, math.inf)
-    certain = root.abs() > 1e-4
-    torch.testing.assert_close(
-        frame.depth.flatten().double()[certain], expected[certain], rtol=0, atol=2e-4
-    )
-    assert torch.equal(frame.alpha.flatten()[certain] > 0, (root > 0)[certain])
-
-
 def test_silhouettes_of_a_sphere_and_a_thin_wire_have_their_closed_form_areas():
     camera = camera_at((0.0, -4.0, 0.0))
     alpha = render(Solids([sphere(0.8)]), camera, samples=16).alpha
