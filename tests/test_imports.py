@@ -16,11 +16,9 @@ MAY_IMPORT = {
     "sweeps": {"bench", "reports", "sweeps"},
 }
 REACHES = {
+    "sweeps/commands/checks.py": ("methods.checks", "methods.kernels.", "methods.trial."),
     "sweeps/commands/compile.py": "methods.checks",
-    "sweeps/commands/experiments.py": "methods.checks",
-    "sweeps/commands/kernels.py": ("methods.checks", "methods.kernels.", "methods.trial."),
     "sweeps/commands/list.py": "methods.kernels.",
-    "sweeps/commands/stress.py": "methods.checks",
 }
 """What measures and lists parts of methods reaches them directly; methods only through
 `_target_`."""

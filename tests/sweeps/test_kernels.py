@@ -44,7 +44,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], int]]:
         return Case(subject, "view", "", "", {}, lambda *cell: 0.0)
 
     monkeypatch.setattr("methods.checks.found", lambda name: [case("encode"), case("march")])
-    monkeypatch.setattr("sweeps.commands.kernels.timed_rows", timed_rows)
+    monkeypatch.setattr("sweeps.commands.checks.timed_rows", timed_rows)
     return calls
 
 
@@ -60,7 +60,7 @@ def test_the_last_line_is_json_and_a_wrong_kernel_fails(steerbench, asked):
 
 def test_a_fast_version_has_a_line_with_the_time_of_its_reference(steerbench, asked, monkeypatch):
     shown: list[Table] = []
-    monkeypatch.setattr("sweeps.commands.kernels.show", shown.append)
+    monkeypatch.setattr("sweeps.commands.checks.show", shown.append)
     steerbench("kernels")
     (table,) = shown
     wrong, right, small = (dict(zip(table.columns, line, strict=True)) for line in table.lines)
@@ -159,7 +159,7 @@ def test_cases_nearest_to_their_tolerances_are_shown_again(steerbench, monkeypat
     ]
     monkeypatch.setattr("methods.checks.found", lambda name: cases)
     shown: list[Table] = []
-    monkeypatch.setattr("sweeps.commands.stress.show", shown.append)
+    monkeypatch.setattr("sweeps.commands.checks.show", shown.append)
     steerbench("stress")
     nearest = shown[-1].lines
     assert [line[1] for line in nearest] == ["9", "8", "7", "6", "5"]
