@@ -94,7 +94,7 @@ def test_what_stands_for_a_line_that_was_not_measured_has_its_figures_and_says_w
     assert f'- "SteerNeRF, fp32" stands for "SteerNeRF, half precision" ({why}).' in text
 
 
-def test_a_section_shows_each_block_and_distances_in_each(run, tmp_path):
+def test_a_section_shows_its_blocks_with_distances_and_says_what_to_mind(run, tmp_path):
     table = of_two((31.0, 31.0), (32.0, 32.0))
     measured = {Place("table9", x, "a"): Repeated("here", [run]) for x in (FIRST, SECOND)}
     first, second = markdown(section(table, measured), tmp_path).split(f"### {SECOND}")
@@ -104,7 +104,10 @@ def test_a_section_shows_each_block_and_distances_in_each(run, tmp_path):
         assert "| here (paper) | PSNR, dB ↑ |" in text
         assert "| here | 30.46 |" in text
         assert f"| elsewhere | {ABSENT} (+1.00) |" in text
-    assert "Mind this." in first
+        assert f"scene {run.facts['scene']}" in text
+        assert "- lpips_alex: n/a. no weights were found" in text
+    assert first.startswith("## Table 9: What is shown")
+    assert "- Mind this." in first
     assert "Mind this." not in second
     alone = {place: line for place, line in measured.items() if place.block == FIRST}
     assert SECOND not in markdown(section(table, alone), tmp_path)
@@ -159,13 +162,3 @@ def test_the_best_is_bold_and_the_second_of_three_italic_on_each_machine(run):
     shown = figure_table(block(table, measured_of(table, runs)))
     cells = [line[1] for line in shown.lines]
     assert cells == ["1.00", "**2.00**", "3.00", "*4.00*", "**5.00**"]
-
-
-def test_a_section_says_on_what_and_what_to_mind(run, tmp_path):
-    measured = measured_of(TABLE, {"a": changed(run, {"psnr": 31.0}), "b": run})
-    text = markdown(section(TABLE, measured), tmp_path)
-    assert text.startswith("## Table 9: What is shown")
-    assert "Paper: Chair." in text
-    assert f"scene {run.facts['scene']}" in text
-    assert "- Mind this." in text
-    assert "- lpips_alex: n/a. no weights were found" in text
