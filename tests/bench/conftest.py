@@ -1,11 +1,14 @@
-"""A log that keeps what it was told."""
+"""A log that keeps what it was told; weights that nobody has."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
+
+from tests.web import Web
 
 
 class RememberingLog:
@@ -29,3 +32,12 @@ class RememberingLog:
 @pytest.fixture
 def log() -> RememberingLog:
     return RememberingLog()
+
+
+@pytest.fixture
+def publisher(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, web: Web) -> Web:
+    """An empty cache, no environment, and a publisher of weights with no file."""
+    monkeypatch.setattr("bench.weights.ADDRESS", web.address)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.delenv("STEERBENCH_WEIGHTS", raising=False)
+    return web

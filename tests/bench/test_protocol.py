@@ -35,10 +35,7 @@ def test_a_picture_is_composited_with_its_straight_alpha(device):
     torch.testing.assert_close(rgb, torch.tensor([[1.0, 0.0, 0.2]] * 3), atol=1e-7, rtol=0)
 
 
-def test_backbones_that_cannot_be_had_are_named(monkeypatch, tmp_path, log, web, lpips_weights):
-    monkeypatch.setattr("bench.weights.ADDRESS", web.address)  # it has none
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    monkeypatch.delenv("STEERBENCH_WEIGHTS", raising=False)
+def test_backbones_that_cannot_be_had_are_named(tmp_path, log, publisher, lpips_weights):
     (tmp_path / "alexnet_features.pth").symlink_to(lpips_weights / "alexnet_features.pth")
     weights = (tmp_path / "alexnet_features.pth").read_bytes()
     found = STEERBENCH_1.find_lpips(tmp_path, log)

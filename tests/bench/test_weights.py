@@ -10,21 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from bench import weights as searched
 from bench.types import SteerbenchError, Unavailable
 from bench.weights import BACKBONES, load_features, locate
-from tests.web import Web
 
 STATE = {"features.0.weight": torch.ones(2), "classifier.1.weight": torch.zeros(3)}
-
-
-@pytest.fixture
-def publisher(monkeypatch, tmp_path, web) -> Web:
-    """An empty cache, no environment, and a publisher of weights with no file."""
-    monkeypatch.setattr(searched, "ADDRESS", web.address)
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    monkeypatch.delenv("STEERBENCH_WEIGHTS", raising=False)
-    return web
 
 
 @pytest.fixture
