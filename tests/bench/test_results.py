@@ -5,6 +5,7 @@ import math
 import os
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pandas as pd
@@ -187,11 +188,9 @@ def test_fields_of_frames_and_records_that_are_not_there_are_named(store):
 
 
 def test_a_disk_that_refuses_is_a_clear_error_and_leaves_nothing(store, monkeypatch):
-    def refuse(handle: int) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "fsync", refuse)
-    said = f"cannot write to .*outputs.*{os.strerror(errno.ENOSPC)}.*outputs=DIR"
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr(os, "fsync", Mock(side_effect=full))
+    said = f"cannot write to .*outputs.*{full.strerror}.*outputs=DIR"
     with pytest.raises(SteerbenchError, match=said):
         store.save({}, measurement([1.0]))
     assert list(store.folder.iterdir()) == []

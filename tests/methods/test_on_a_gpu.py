@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pandas as pd
 import pytest
@@ -28,7 +29,6 @@ from methods.instant_ngp.training import FieldTraining
 from methods.kernels import availability, multiplies_bf16
 from methods.kernels.encode import HashGrid
 from methods.kernels.march import longest_ray
-from methods.kernels.types import Samples
 from methods.kilonerf.field import KiloField
 from methods.nerf.field import NerfField
 from methods.nsvf.field import NsvfField
@@ -234,19 +234,14 @@ def test_a_frame_waits_for_its_rays_and_once_a_round_of_samples(
 ) -> None:
     method = fitted(name, "cuda", scene, tmp_path)
     monkeypatch.setattr(frame, "GPU_SAMPLES", 1)
-    rounds, marched = [], frame.march
-
-    def counted(*args: Any, **options: Any) -> Any:
-        rounds.append(1)
-        return marched(*args, **options)
-
-    monkeypatch.setattr(frame, "march", counted)
+    march = Mock(wraps=frame.march)
+    monkeypatch.setattr(frame, "march", march)
     cameras = [scale_camera(c, 32, 32) for c in scene.splits["test"].cameras]
     for camera in [cameras[0], *cameras]:  # the last ones have all preceding frames
-        rounds.clear()
+        march.reset_mock()
         with device_waits() as waits:
             method.render(camera, NullProbe())
-        assert waits.total() <= 2 + len(rounds) <= 12
+        assert waits.total() <= 2 + march.call_count <= 12
 
 
 def test_a_step_of_stage_1_waits_less_than_three_times(gpu: PretendedGpu, scene: Scene) -> None:
@@ -334,9 +329,7 @@ def test_steps_and_frames_are_few_launches(
 ) -> None:
     """Each takes some microseconds, whatever it computes."""
     steps: list[int] = []
-    rounds: list[Samples] = []
-
-    advance, march = FieldTraining.advance, frame.march
+    advance, march = FieldTraining.advance, Mock(wraps=frame.march)
 
     def advanced(training: FieldTraining) -> dict[str, float]:
         before = gpu.launched
@@ -344,14 +337,10 @@ def test_steps_and_frames_are_few_launches(
         steps.append(gpu.launched - before)
         return errors
 
-    def marched(*given: Any, **options: Any) -> Samples:
-        rounds.append(march(*given, **options))
-        return rounds[-1]
-
     for owner, name in EMPTY:  # without the launches that poison it
         monkeypatch.setattr(owner, name, getattr(owner, name).__wrapped__)
     monkeypatch.setattr(FieldTraining, "advance", advanced)
-    monkeypatch.setattr(frame, "march", marched)
+    monkeypatch.setattr(frame, "march", march)
     splits = {name: fewer(split, 3, side=8) for name, split in ball_scene.splits.items()}
     method = smallest("ngp", device="cuda", backend="gpu")
     method.fit(
@@ -361,11 +350,11 @@ def test_steps_and_frames_are_few_launches(
     frames(method, replace(ball_scene, splits=splits))  # what later ones need is made once
     for samples in longest_ray(STEP), 1:
         monkeypatch.setattr(frame, "GPU_SAMPLES", samples)
-        rounds.clear()
+        march.reset_mock()
         before = gpu.launched
         method.render(splits["test"].cameras[0], NullProbe())
-        assert gpu.launched - before <= 87 + 37 * len(rounds)
-    assert len(rounds) > 1
+        assert gpu.launched - before <= 87 + 37 * march.call_count
+    assert march.call_count > 1
 
 
 GO_ON = [

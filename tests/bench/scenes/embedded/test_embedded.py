@@ -4,6 +4,7 @@ import json
 import math
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -107,10 +108,7 @@ def test_training_poses_are_those_of_their_seed():
 
 @pytest.mark.parametrize("fault", [KeyboardInterrupt, OSError("no space left on device")])
 def test_a_broken_write_leaves_nothing(tmp_path, monkeypatch, log, fault):
-    def fail(*args: object, **kwargs: object) -> None:
-        raise fault
-
-    monkeypatch.setattr(embedded, "picture", fail)
+    monkeypatch.setattr(embedded, "picture", Mock(side_effect=fault))
     with pytest.raises((KeyboardInterrupt, SteerbenchError)):
         embedded.load("void", **SMALL, root=tmp_path, log=log)
     assert list(tmp_path.iterdir()) == []
