@@ -52,17 +52,12 @@ def experiment_rows(
                 order = observed_order(*zip(*smooth, strict=True))
                 fit = {"order": order, "order_from": low, "order_to": high}
             times = times_ms([trial.call for trial in trials], repeats)
-            about = {"subject": experiment.subject, "knob": experiment.knob}
-            rows += [
-                {**about, "setting": trial.setting, "error": error, **_spread(of_trial), **fit}
-                for trial, error, of_trial in zip(trials, errors, times, strict=True)
-            ]
+            about = {"subject": experiment.subject, "knob": experiment.knob, **fit}
+            for trial, error, ms in zip(trials, errors, times, strict=True):
+                row = {"setting": trial.setting, "error": error, "ms": statistics.median(ms)}
+                rows.append({**about, **row, "ms_lo": min(ms), "ms_hi": max(ms)})
             progress.advance(note=experiment.subject)
     return rows
-
-
-def _spread(times: Sequence[float]) -> dict[str, float]:
-    return {"ms": statistics.median(times), "ms_lo": min(times), "ms_hi": max(times)}
 
 
 def observed_order(knob: Sequence[float], error: Sequence[float]) -> float:

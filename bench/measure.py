@@ -291,12 +291,8 @@ def _draw(take: _Take, task: Task, index: int, first: Tensor | None, *, scored: 
     """
     method, step, protocol = take.method, task.trajectory.steps[index], task.protocol
     before = task.trajectory.preceding[index]
-    waited = scored and protocol.waits
-    with (
-        device_waits() if waited else nullcontext() as waits,
-        take.metered(),
-        take.clock.frame(),
-    ):
+    counted = device_waits() if scored and protocol.waits else nullcontext()
+    with counted as waits, take.metered(), take.clock.frame():
         frame = method.render(step.camera, take.clock)
     check_frame(frame, step.camera, method.name, index)
     if not scored:

@@ -63,9 +63,8 @@ class HashField(nn.Module):
             "feature_mid": (HIDDEN_CHANNELS, HIDDEN_CHANNELS),
             "feature_out": (channels, HIDDEN_CHANNELS),
         }
-        self.layers = nn.ParameterDict(
-            {name: _xavier_uniform(*size, generator) for name, size in sizes.items()}
-        )
+        layers = {name: _xavier_uniform(*size, generator) for name, size in sizes.items()}
+        self.layers = nn.ParameterDict(layers)
         packed = pack(table) if precision == "bf16" else None
         self.packed: Tensor | None
         self.register_buffer("packed", packed, persistent=False)

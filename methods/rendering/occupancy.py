@@ -99,9 +99,8 @@ class DensityGrid:
     def update(self, field: Field, generator: torch.Generator, samples: int) -> None:
         """Visit `samples` random cells: half drawn from all cells, half from the occupied ones."""
         cells = self._draw(samples, generator)
-        sigma = torch.cat(
-            [self._visit(field, part, generator) for part in cells.split(CHUNK_SAMPLES)]
-        )
+        parts = cells.split(CHUNK_SAMPLES)
+        sigma = torch.cat([self._visit(field, part, generator) for part in parts])
         density = self.density.view(-1)
         values = torch.fmax(DECAY * density[cells], sigma.clamp(max=LARGEST))  # not NaN
         density.scatter_reduce_(0, cells, values, "amax", include_self=False)

@@ -146,10 +146,8 @@ def _html(part: Part, origins: dict[str, dict[str, str]], headings: dict[str, st
 
 def _svg(plot: Picture) -> str:
     """`plot` as SVG; its marks can be focused and have descriptions."""
-    with (
-        tempfile.TemporaryDirectory() as place,
-        matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": plot.stem}),
-    ):
+    style = {"svg.fonttype": "none", "svg.hashsalt": plot.stem}
+    with tempfile.TemporaryDirectory() as place, matplotlib.rc_context(style):
         plot.draw(drawn := Path(place) / "plot.svg")
         content = drawn.read_text(encoding="utf-8")
     root = ElementTree.fromstring(content)
