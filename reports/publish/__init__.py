@@ -146,7 +146,7 @@ def _html(part: Part, origins: dict[str, dict[str, str]], headings: dict[str, st
 
 def _svg(plot: Picture) -> str:
     """`plot` as SVG; its marks can be focused and have descriptions."""
-    style = {"svg.fonttype": "none", "svg.hashsalt": plot.stem}
+    style: Any = {"svg.fonttype": "none", "svg.hashsalt": plot.stem}
     with tempfile.TemporaryDirectory() as place, matplotlib.rc_context(style):
         plot.draw(drawn := Path(place) / "plot.svg")
         content = drawn.read_text(encoding="utf-8")
