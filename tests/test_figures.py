@@ -179,7 +179,6 @@ def regions() -> list[tuple[Path, re.Match[str]]]:
     return [(path, x) for path in DOCUMENTS for x in figures.REGION.finditer(path.read_text())]
 
 
-@pytest.mark.xfail(reason="the paper's tables and the widths are still to be measured again")
 def test_all_figures_of_the_documents_are_of_one_commit():
     commits = {re.search(r"\| ([0-9a-f]{12}) -->", found[0])[1] for _, found in regions()}
     assert len(commits) == 1

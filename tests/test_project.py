@@ -46,7 +46,7 @@ def closure(requirements: list[str]) -> Iterator[Requirement]:
                 ]
 
 
-MOST_LINES = {"product": 31_300, "tests": 20_600}
+MOST_LINES = {"product": 31_000, "tests": 20_500}
 """What is added is paid for with what is cut: lower these, never raise them."""
 
 
