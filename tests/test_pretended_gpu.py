@@ -70,7 +70,6 @@ WAITS: dict[str, tuple[int, Callable[[Tensor], object]]] = {
     "indices": (0, lambda x: x[x.long() % 3]),
     "indices from the CPU": (1, lambda x: x[HERE.long() % 3]),
     "a mask that is filled": (0, lambda x: masked(x, 0.0, x > 0)),
-    "a number put at indices": (1, lambda x: masked(x, 0.0, x.long() % 3)),
     "where": (0, lambda x: torch.where(x > 0, x, 0.0)),
     "where, with a number of the CPU": (1, lambda x: torch.where(x > 0, x, HERE.sum())),
     "unique": (1, lambda x: x.unique()),
