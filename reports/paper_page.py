@@ -63,7 +63,7 @@ def write_paper_page(
 def _of_own(tables: Sequence[PaperTable]) -> Mapping[str, Any]:
     """Plots and images of all lines, for tables that are not the paper's."""
     every = ((table.name, key, line) for table in tables for key, line in table.lines.items())
-    lines = {line.label: (name, key) for name, key, line in every if not line.added}
+    lines = {line.label: (name, key) for name, key, line in every}
     plots = [{**plot, "lines": lines} for plot in PAGE["plots"] if "metric" in plot]
     return {"plots": plots, "images": [{"title": "Pictures", "lines": lines}]}
 
@@ -82,9 +82,6 @@ def _plot(
     """A plot with heading and caption, if any of its lines was measured."""
     some: Sequence[Any] = _chosen(plot["lines"], tables, measured)
     if "metric" in plot:
-        every = ((table, key, line) for table in tables for key, line in table.lines.items())
-        added = {line.label: (table.name, key) for table, key, line in every if line.added}
-        some = [*some, *_chosen(added, tables, measured)]
         drawn = figures.quality_plot(some, plot["metric"])
     else:
         some = _first_runs(some, one_scene=plot.get("one_scene", False))
@@ -109,10 +106,13 @@ def _chosen(
     wanted: Mapping[str, Sequence[Any]], tables: Sequence[PaperTable], measured: Measured
 ) -> list[Repeated]:
     """The measured lines in `wanted`: by their label here, a table and a key; for one that was not
-    measured, the one that stands for it."""
-    known = {table.name: table for table in tables}
+    measured, the one that stands for it. After them, the lines added to these tables."""
+    named = {name for name, _ in wanted.values()}
+    known = {table.name: table for table in tables if table.name in named}
+    every = ((name, key, line) for name, of in known.items() for key, line in of.lines.items())
+    added = {line.label: (name, key) for name, key, line in every if line.added}
     chosen = []
-    for label, (name, key) in wanted.items():
+    for label, (name, key) in {**wanted, **added}.items():
         if table := known.get(name):
             keys = filter(None, (str(key), table.instead.get(str(key))))
             lines = [table.measured(each, measured) for each in keys]

@@ -39,7 +39,7 @@ def set_up() -> None:
 
 @contextmanager
 def processes(count: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool of `count` processes. They end with this one, at once if it is told to end.
+    """A pool of `count` processes. They end when this one ends, at once if it is interrupted.
 
     They are spawned, because threads do not survive a fork: for work on which threads would wait
     for Python's lock.

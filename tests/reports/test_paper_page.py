@@ -44,7 +44,7 @@ def test_the_page_has_every_table_and_every_figure(run, tmp_path):
     assert html.count('<div class="frame"') == 2
 
 
-def test_a_method_has_one_mark_at_its_first_measured_line_and_an_added_one_too(
+def test_a_method_has_one_mark_at_its_first_measured_line_and_an_added_one_is_in_all_figures(
     run, tmp_path, monkeypatch
 ):
     (table,) = chosen("table1", methods=["x"])
@@ -57,9 +57,13 @@ def test_a_method_has_one_mark_at_its_first_measured_line_and_an_added_one_too(
         return real(shown, metric)
 
     monkeypatch.setattr(figures, "quality_plot", watched)
-    write_paper_page([table], measured, tmp_path)
+    measured |= measured_of(TABLES["table5"], dict.fromkeys(("frozen", "joint"), run))
+    page = write_paper_page([table, TABLES["table5"]], measured, tmp_path)
     methods = ["NeRF", "NSVF", "KiloNeRF", "PlenOctree", "DIVeR", "Instant-NGP", "3D Gaussians"]
     assert drawn == 2 * [[*methods, "SteerNeRF", "x"]]
+    text = page.read_text()
+    assert "![Ground truth, Instant-NGP, SteerNeRF, x; a detail" in text
+    assert "![Ground truth, without joint training, with joint training; a detail" in text
 
 
 def test_findings_come_first_all_comparisons_last(run, tmp_path):
