@@ -114,7 +114,7 @@ def libraries(*things: Any) -> dict[str, str]:
     for name in sorted(names):
         with suppress(metadata.PackageNotFoundError):
             versions[name] = _version(name)
-    return versions
+    return {name: version for name, version in versions.items() if version}  # of a torn one, None
 
 
 def sources(*things: Any) -> dict[str, Path]:

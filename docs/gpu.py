@@ -78,7 +78,8 @@ def main(argv: Sequence[str]) -> int:
     for step in steps((*scene, *options.overrides), ("--filter", options.filter)):
         file = FOLDER / f"{step.name}.json"
         kept = json.loads(file.read_text()) if file.exists() else None
-        if kept and kept["made"] == [commit, *step.words] and kept["done"][0] == 0:
+        made = kept and kept["made"] == [commit, *step.words] and kept["done"][0] == 0
+        if made and not commit.endswith("-dirty"):
             done[step] = Done(*kept["done"])
         else:
             print(f"{step.name}: steerbench {' '.join(step.words)}", file=sys.stderr)

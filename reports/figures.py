@@ -109,7 +109,8 @@ def quality_against(
     first = next(iter(settings.values()), range(len(lines)))  # methods
     styles: Sequence[Mapping[str, Any]] = [_style(number) for number in range(len(lines))]
     handles: Sequence[Line2D] = ()
-    if len(set(first)) < len(lines) or len(lines) > MOST_NAMES:
+    crowded = len(set(first)) < len(lines) or len(lines) > MOST_NAMES
+    if crowded and any(len(set(of)) > 1 for of in settings.values()):
         styles, handles = _legend(settings)
     points = []
     for number, line in enumerate(lines):

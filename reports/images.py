@@ -35,8 +35,7 @@ INK, PAPER, MARK = (30, 30, 30), (255, 255, 255), (214, 0, 110)
 ZOOM = 4  # magnification of the detail relative to its picture
 
 Box = tuple[int, int, int, int]  # left, top, right, bottom
-Band = tuple[str, Sequence[Image.Image]]
-"""One row of panels below a caption."""
+Band = tuple[str, Sequence[Image.Image]]  # one row of panels below a caption
 
 
 @dataclass(frozen=True)
@@ -80,8 +79,7 @@ class ComparedFrame:
     errors: str
 
 
-Part = str | Table | Picture | ComparedFrame
-"""A part that is a string is Markdown."""
+Part = str | Table | Picture | ComparedFrame  # a part that is a string is Markdown
 
 
 def kept_frames(runs: Sequence[Run]) -> list[str]:

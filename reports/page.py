@@ -69,7 +69,7 @@ def _heading(lines: Lines, failures: Mapping[str, str]) -> Iterator[Part]:
             " Lines of cold frames, for which the path is too short, are not ranked with others:"
             " choose more frames (`budget.frames`), or a path without cuts (`trajectory=orbit`)."
         )
-    if any("**" in cell for line in first.lines for cell in line):
+    if any(cell.startswith("**") for line in first.lines for cell in line):
         reading += (
             " The best figure of each column is **bold**, with those from which the interval of its"
             " difference, seed by seed, does not tell it, among lines with the same frames,"

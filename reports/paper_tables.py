@@ -24,8 +24,7 @@ class Place(NamedTuple):
     line: str
 
 
-Measured = Mapping[Place, Repeated]
-"""What was measured of each line that was planned."""
+Measured = Mapping[Place, Repeated]  # what was measured of each line that was planned
 
 
 @dataclass(frozen=True)

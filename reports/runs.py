@@ -287,7 +287,8 @@ def unseeded(config: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """The `flat` settings of a run without its seed, and without those of its method, which have
     the same."""
     for name, value in flat(config):
-        if name != "seed" and not (name.startswith("method.") and name.endswith(".seed")):
+        of_method = name.startswith("method.") and name.endswith(".seed")
+        if name != "seed" and not (of_method and value == config.get("seed")):
             yield name, value
 
 

@@ -71,8 +71,7 @@ class Measured:
         }
 
 
-Columns = Mapping[str, Callable[[Measured], str]]
-"""What a column says of a line, by its heading."""
+Columns = Mapping[str, Callable[[Measured], str]]  # what a column says of a line, by its heading
 
 
 def pooled(found: Sequence[Measured]) -> list[Measured]:

@@ -66,6 +66,7 @@ def _stored(store: Store) -> list[Entry]:
 
 
 def read(path: Path) -> tuple[Mapping[str, Limit], list[Entry]]:
+    """The limits by metric and the runs of a baseline; SteerbenchError if it cannot be read."""
     try:
         held = read_record(path)
         if held["schema"] != SCHEMA:

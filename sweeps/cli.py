@@ -137,7 +137,7 @@ def parsed(argv: Sequence[str]) -> argparse.Namespace:
     overview: dict[str, str] = {}
     for name, about in COMMANDS.items():
         lines = overview.get(about["group"], f"{about['group']}\n")
-        overview[about["group"]] = f"{lines}  {name:11}{about['purpose']}\n"
+        overview[about["group"]] = f"{lines}  {name:12}{about['purpose']}\n"
     parser = Parser(
         prog="steerbench",
         usage="steerbench COMMAND [...]",

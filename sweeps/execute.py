@@ -4,6 +4,7 @@ Jobs in other processes share with this one only the store, and a folder in whic
 """
 
 import os
+import pickle
 import sys
 import time
 import uuid
@@ -44,8 +45,7 @@ OF_MEASUREMENT = ("engine", "precision", "protocol", "pictures", "exclusive")
 OF_METHOD = ("method", "engine", "precision")
 """Settings in which jobs may differ that are measured in turns."""
 
-Group = list[tuple[int, Job]]
-"""Jobs that are measured together, each with its number among all."""
+Group = list[tuple[int, Job]]  # jobs that are measured together, each with its number among all
 
 W = TypeVar("W")
 R = TypeVar("R")
@@ -127,15 +127,22 @@ def divided(words: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def _numbered(work: Callable[[W], R], on: Sequence[W], config: Any) -> R | Exception:
-    """The task of a launcher's job: the job's number says what it works on.
-
-    An exception is returned, because Hydra would print it in its own way.
-    """
+    """The task of a launcher's job: the job's number says what it works on. An exception is
+    returned, because Hydra would print it in its own way."""
     set_up()
     try:
         return work(on[HydraConfig.get().job.num])
     except Exception as error:
+        return portable(error)
+
+
+def portable(error: Exception) -> Exception:
+    """`error`, or only its message if another process could not read it."""
+    try:
+        pickle.loads(pickle.dumps(error))
         return error
+    except Exception:
+        return SteerbenchError(f"{type(error).__name__}: {reason(error)}")
 
 
 @dataclass(frozen=True)
@@ -151,6 +158,9 @@ class Ended:
     def failed(self) -> bool:
         """Whether it failed, and can run here."""
         return self.error is not None and not isinstance(self.error, Unavailable)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Ended, (self.run, self.measured, self.error and portable(self.error))
 
 
 def attempt(group: Group, total: int, folder: Path, begun: float) -> dict[str, Ended]:
@@ -174,7 +184,7 @@ def attempt(group: Group, total: int, folder: Path, begun: float) -> dict[str, E
                 print(f"steerbench: failed: {job.name}: {cause}", file=sys.stderr)
                 try:
                     job.keep_failure(reason(cause))
-                except SteerbenchError as problem:  # does not hide the failure
+                except Exception as problem:  # does not hide the failure
                     print(f"steerbench: {problem}", file=sys.stderr)
                 ended[job.key] = Ended(error=cause)
                 _count(folder, number)
@@ -224,7 +234,7 @@ def run_jobs(jobs: Sequence[Job], launcher: Launcher) -> list[Ended]:
         return scenes.index(job.settings["scene"]), seeds.index(job.settings["seed"])
 
     distinct.sort(key=place)
-    ahead, ended = launcher.in_process and room(jobs[0].config) > 1, dict[str, Ended]()
+    ahead, ended = launcher.in_process and room(jobs) > 1, dict[str, Ended]()
     of_scenes = [list(some) for _, some in groupby(distinct, lambda job: place(job)[0])]
     for some in of_scenes if ahead else [distinct]:
         groups, found = _groups(some, look_up=ahead)
@@ -268,8 +278,8 @@ def _attempted(group: Group, total: int, begun: float) -> dict[str, Ended]:
 
 
 def train_ahead(jobs: Sequence[Job], measured: Collection[str]) -> None:
-    """Train the models of `jobs`, which share one budget, as many at a time as the cores allow:
-    small trainings gain little from a second core.
+    """Train the models of `jobs`, as many at a time as the cores allow: small trainings gain little
+    from a second core.
 
     Trainings of jobs whose key is in `measured` are skipped. The jobs load the stored stages when
     they are measured. A training that fails here fails again then, and is reported then.
@@ -281,7 +291,7 @@ def train_ahead(jobs: Sequence[Job], measured: Collection[str]) -> None:
     todo = {name: job for name, job in todo.items() if job.key not in measured}
     if len(todo) < 2:
         return
-    workers, log = room(jobs[0].config), ConsoleLog(jobs[0].outputs)
+    workers, log = room(jobs), ConsoleLog(jobs[0].outputs)
     log.info(f"training {len(todo)} models, {workers} at a time")
     begun = time.monotonic()
     with processes(workers) as pool:
@@ -293,12 +303,12 @@ def train_ahead(jobs: Sequence[Job], measured: Collection[str]) -> None:
             print(f"{how}: {names[ended]}{left}", file=sys.stderr)
 
 
-def room(config: DictConfig) -> int:
+def room(jobs: Sequence[Job]) -> int:
     """How many trainings can run at a time; 1 on a GPU, or if nothing sets their threads."""
-    if on_gpu(config.device):
+    if any(on_gpu(job.config.device) for job in jobs):
         return 1
     try:
-        return len(os.sched_getaffinity(0)) // training_threads(config)
+        return len(os.sched_getaffinity(0)) // max(training_threads(job.config) for job in jobs)
     except SteerbenchError:  # as a job that cannot start says when it is measured
         return 1
 
@@ -316,4 +326,7 @@ def _train(config: DictConfig) -> float:
     """Train, or load the training, in a worker process; return the seconds it took."""
     log, quiet = (ConsoleLog(Path(config.outputs), quiet=each) for each in (False, True))
     quiet.followers = log.followers
-    return trained(config, log, progress=quiet).train_s
+    try:
+        return trained(config, log, progress=quiet).train_s
+    except Exception as error:
+        raise portable(error) from None

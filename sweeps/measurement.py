@@ -127,7 +127,7 @@ class Job:
         with explained(self.failure_file.parent):
             self.failure_file.parent.mkdir(parents=True, exist_ok=True)
             with whole(self.failure_file) as new:
-                new.write_text(f"{why}\n", encoding="utf-8")
+                new.write_text(f"{why}\n", encoding="utf-8", errors="backslashreplace")
 
 
 class JobFailed(SteerbenchError):

@@ -68,7 +68,7 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
         return composed([*fixed, *groups])
 
     jobs = []
-    lines = ((data_set, *line) for data_set, of in table.blocks.items() for line in of.items())
+    lines = ((x, key, line) for x, of in table.blocks.items() for key, line in of.items())
     for data_set, key, line in lines:
         if "precision" in line.job and line.job["precision"] not in precisions:
             continue
@@ -80,20 +80,20 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
         of_block = [name for name in scenes if data_set in (data_set_of(name), "")]
         for seed, name in product(of_line, of_block):
             scene = "" if single else name
-            place = [] if single or data else [f"scene={name}"]
-            config = changed(with_choices(*groups, *place), [*values, f"seed={seed}"])
+            of_scene = [] if single or data else [f"scene={name}"]
+            config = changed(with_choices(*groups, *of_scene), [*values, f"seed={seed}"])
             if data:
                 folder = str(data.scenes[name])
                 config.scene.path = folder
-                place = [setting("scene.path", folder)]
+                of_scene = [setting("scene.path", folder)]
             OmegaConf.resolve(config)  # once, or each build would resolve `${...}` again
-            own = [*settings, *place, f"seed={seed}"]
+            own = [*settings, *of_scene, f"seed={seed}"]
             command = ["steerbench", "run", *fixed, *own, "hydra.mode=RUN"]
             parts = (f"{table.name}: {line.label}", scene, f"seed {config.seed}")
             told = ", ".join(filter(None, parts))
             turns = turns_of(table.name, config) if experiment.in_turns else ""
-            where = Place(table.name, data_set, key)
-            job = Planned(config, command, told, turns, place=where, label=line.label, scene=scene)
+            place = Place(table.name, data_set, key)
+            job = Planned(config, command, told, turns, place=place, label=line.label, scene=scene)
             jobs.append(job)
     return jobs
 

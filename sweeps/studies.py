@@ -149,7 +149,7 @@ def scaling(subject: Subject, only: Sequence[str]) -> Iterator[StudyLine]:
     wanted = chosen(("pixels", "threads", *axes), only, "axis")
     config = subject.config
     if "threads" in wanted and subject.has_engine and subject.engine != "torch":
-        others = ", ".join(name for name in wanted if name != "threads")
+        others = ", ".join(("pixels", *axes))
         raise SteerbenchError(
             "threads: expected engine=torch, whose threads can be chosen afterwards; for another "
             f"engine choose from {others} with --only"

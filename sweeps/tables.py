@@ -68,7 +68,8 @@ def _table(name: str, whole: Any, data_sets: Sequence[str]) -> PaperTable:
     for key, job in _jobs(said, label, grid(whole), where).items():
         of = {**job, **said.get(key, {})}
         if isinstance(of["job"], Mapping):  # YAML reads numbers, Hydra words
-            of["job"] = {x: "null" if of_x is None else str(of_x) for x, of_x in of["job"].items()}
+            given = ((x, "null" if value is None else value) for x, value in of["job"].items())
+            of["job"] = {x: y if isinstance(y, Mapping) else str(y) for x, y in given}
         published = _by_data_set(of.pop("published", {}))
         check_settings(Line, of, f"{where}.lines.{key}.", ("published", "added"))
         figures = {x: _figures(of_one, own["metrics"], where) for x, of_one in published.items()}

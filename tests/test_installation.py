@@ -20,9 +20,12 @@ TINY = (
 )
 
 
-def test_a_foreign_package_of_the_same_name_is_named_in_one_line(tmp_path):
-    (tmp_path / "bench").mkdir()
-    (tmp_path / "bench" / "__init__.py").touch()
+@pytest.mark.parametrize(
+    ("found", "file"), [("bench", "bench/__init__.py"), ("bench.py", "bench.py")]
+)
+def test_a_foreign_package_of_the_same_name_is_named_in_one_line(tmp_path, found, file):
+    (tmp_path / file).parent.mkdir(exist_ok=True)
+    (tmp_path / file).touch()
     ran = subprocess.run(
         [sys.executable, "-c", "import sweeps"],
         cwd=tmp_path,
@@ -33,7 +36,7 @@ def test_a_foreign_package_of_the_same_name_is_named_in_one_line(tmp_path):
     (said,) = ran.stderr.splitlines()
     assert ran.returncode == 1
     assert said.startswith(f"steerbench: expected Python to find its package 'bench' in {ROOT}")
-    assert f"it finds {tmp_path / 'bench'}: rename" in said
+    assert f"it finds {tmp_path / found}: rename" in said
 
 
 @pytest.fixture(scope="module")

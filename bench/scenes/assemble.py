@@ -223,7 +223,7 @@ def cube(half: float) -> Box:
 
 def parse_box(value: object) -> Box:
     """A box from a user's [[x0, y0, z0], [x1, y1, z1]]."""
-    with suppress(TypeError, ValueError):
+    with suppress(TypeError, ValueError, OverflowError):
         corners = torch.tensor(value, dtype=torch.float64)
         if corners.shape == (2, 3) and corners.isfinite().all() and (corners[0] < corners[1]).all():
             return Box(*corners)

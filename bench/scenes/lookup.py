@@ -14,8 +14,7 @@ from bench.types import Log
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 """Of pictures, in the order in which they are tried where a name has none or another one."""
 
-There = Callable[[Path], bool]
-"""Whether something is there: os.path.isfile or isdir."""
+There = Callable[[Path], bool]  # whether something is there: os.path.isfile or isdir
 
 
 def tidy(name: str) -> str:

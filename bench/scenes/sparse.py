@@ -16,8 +16,7 @@ from bench.errors import unexpected
 from bench.records import read_text
 from bench.scenes.lookup import found
 
-Entry = tuple[str, Sequence[Any]]
-"""Where an entry is, for messages, and its words."""
+Entry = tuple[str, Sequence[Any]]  # where an entry is, for messages, and its words
 
 REAL = r"\s+([-+]?(?:(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|nan|inf))"
 IMAGE = re.compile(r"\d+" + 7 * REAL + r"\s+(\d+)\s+(.+)", re.IGNORECASE)

@@ -91,10 +91,9 @@ def _as_listed(
         parts[split], rest = rest, set()
     counts = ", ".join(f"{len(part)} {split}" for split, part in parts.items())
     both = len(parts["train"] & parts["test"])
-    log.info(
-        f"{file}: pictures as it lists them: {counts}"
-        + f"; {both} of them in train and test" * bool(both)
-        + f"; in no list, left out: {len(rest)}" * bool(rest)
-        + f"; no pictures: {', '.join(sorted(unknown))}" * bool(unknown)
-    )
+    said = [f"{file}: pictures as it lists them: {counts}"]
+    said += [f"{both} of them in train and test"] if both else []
+    said += [f"in no list, left out: {len(rest)}"] if rest else []
+    said += [f"no pictures: {', '.join(sorted(unknown))}"] if unknown else []
+    log.info("; ".join(said))
     return parts

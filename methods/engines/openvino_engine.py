@@ -146,13 +146,13 @@ def _compiled(openvino: Any, model: Any, dtype: torch.dtype) -> Callable[[Tensor
         "PERFORMANCE_HINT": "LATENCY",
         "INFERENCE_NUM_THREADS": torch.get_num_threads(),
     }
+    kind = openvino.Type.bf16 if half else openvino.Type.f32
     request = openvino.Core().compile_model(model, "CPU", settings).create_infer_request()
 
     def run(picture: Tensor) -> Tensor:
         x = picture.movedim(1, -1).to(dtype).contiguous()
-        given = x.view(torch.int16).numpy() if half else x.numpy()
-        if half:  # numpy has no bfloat16; the memory is the same
-            given = openvino.Tensor(given, list(x.shape), openvino.Type.bf16)
+        bits = x.view(torch.int16) if half else x  # numpy has no bfloat16; the memory is the same
+        given = openvino.Tensor(bits.numpy(), list(x.shape), kind)
         found = request.infer([given], share_inputs=True, share_outputs=True)
         return torch.from_numpy(found[0]).movedim(-1, 1)
 

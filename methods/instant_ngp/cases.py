@@ -132,7 +132,7 @@ def _keeps_a_good_state(rate: float, *where: str) -> float:
             raise
         except SteerbenchError:
             training = new()
-            loop.resume(training, kept)
+            loop.load(training, kept)
     loop.check_finite(training)
     return 0.0
 

@@ -114,7 +114,7 @@ def clearance(used: Tensor) -> Tensor:
 
 def total_and_longest(counts: Tensor, offsets: Tensor) -> list[int]:
     """How many samples rays with `counts` [R] have, and how many the one with the most; `offsets`
-    are those `of` the counts. The host waits for a GPU, once."""
+    are `offsets_of` the counts. The host waits for a GPU, once."""
     return torch.stack((offsets[-1], counts.amax())).tolist() if len(counts) else [0, 0]
 
 

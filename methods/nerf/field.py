@@ -16,8 +16,7 @@ from methods.students.networks import (
     products,
 )
 
-WIDTH, LAYERS = 256, 8
-"""Outputs of every layer of the trunk, and how many there are."""
+WIDTH, LAYERS = 256, 8  # outputs of every layer of the trunk, and how many there are
 
 SKIP = 5  # layers of the trunk after which the encoded position is concatenated again
 

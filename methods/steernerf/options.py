@@ -1,7 +1,6 @@
 """The settings of SteerNeRF: what is trained, how, and what is chosen afterwards."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -72,16 +71,14 @@ class Rendering(Checked):
         return Sampling(step=step, stop=self.stop if self.skip.hidden else 0.0)
 
 
-def _ordered(ends: Sequence[float]) -> bool:
-    return len(ends) == 2 and 0 <= ends[0] <= ends[1]
-
-
 @dataclass(frozen=True)
 class MotionOptions(Checked):
     """The synthetic motions of L frames before a training view."""
 
     # Range of the angular speed, in degrees per frame.
-    degrees: Annotated[tuple[float, float], Only("a range from 0 on", _ordered)]
+    degrees: Annotated[
+        tuple[float, float], Only("a range from 0 on", lambda x: len(x) == 2 and 0 <= x[0] <= x[1])
+    ]
     pool: Count  # examples kept at a time
     uses: Count  # patches cut from an example before it is replaced
 

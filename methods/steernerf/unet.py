@@ -17,8 +17,7 @@ from methods.steernerf.buffer import Points
 
 UNWATCHED = NullProbe()
 
-Rectangle = tuple[slice, slice]
-"""Rows and columns of a low-resolution frame."""
+Rectangle = tuple[slice, slice]  # rows and columns of a low-resolution frame
 
 WHOLE = slice(None), slice(None)
 

@@ -61,8 +61,7 @@ def part(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): x for name, x in tensors.items() if name.startswith(prefix)}
 
 
-Optimisers = Mapping[str, torch.optim.Optimizer | AdamState]
-"""Those of a training, by name."""
+Optimisers = Mapping[str, torch.optim.Optimizer | AdamState]  # those of a training, by name
 
 
 def of_optimisers(optimisers: Optimisers) -> dict[str, Tensor]:

@@ -93,14 +93,14 @@ def train(training: Training, finished: Path, label: str, log: Log) -> None:
         if to_train:
             _drive(training, finished, label, log)
         else:
-            resume(training, finished, done=True)
+            load(training, finished, done=True)
             log.info(f"{label}: found in {finished}")
 
 
 def _drive(training: Training, finished: Path, label: str, log: Log) -> None:
     unfinished = finished.with_name("checkpoint.safetensors")
     if unfinished.exists():
-        resume(training, unfinished)
+        load(training, unfinished)
         log.info(f"going on from step {training.step} of {unfinished}")
     began, saved = time.monotonic() - training.seconds, time.monotonic()
     means: dict[str, float] = {}
@@ -130,7 +130,7 @@ def save(training: Training, path: Path, done: bool = False) -> None:
     checkpoint.write(path, training.result() | ({} if done else more), figures)
 
 
-def resume(training: Training, path: Path, done: bool = False) -> None:
+def load(training: Training, path: Path, done: bool = False) -> None:
     """Restore what `save` wrote to `path`: the result and, unless `done`, the state; raise
     `SteerbenchError` if the file is damaged, or belongs to another training."""
     tensors, figures = checkpoint.read(path)

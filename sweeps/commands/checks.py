@@ -7,7 +7,7 @@ Each prints a table, then its rows as JSON in the last line.
 
 import argparse
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -98,7 +98,9 @@ def _stress(options: argparse.Namespace, log: ConsoleLog) -> int:
     rows = list(run_cases(cases, devices, log))
     wrong = sum(failed(row) for row in rows)
     title = f"Stress: {len(cases)} cases, {len(rows)} cells, {wrong} failed"
-    nearest = sorted(_worst_of_cases(rows), key=_nearness, reverse=True)[:NEAREST]
+    of_cases = groupby(rows, key=lambda row: (row["subject"], row["case"]))
+    worst = (max(cells, key=_nearness) for _, cells in of_cases)
+    nearest = sorted(worst, key=_nearness, reverse=True)[:NEAREST]
     show(Table(title, STRESS, tuple(map(_of_case, rows))))
     show(Table("Nearest to their tolerances", STRESS, tuple(map(_of_case, nearest))))
     print_rows(rows)
@@ -110,12 +112,6 @@ def _of_case(row: Row) -> tuple[str, ...]:
     seen, at_most = _errors(row)
     worst = "" if row["status"].startswith("unavailable") else seen
     return (*(row[name] for name in labels), worst, at_most, row["status"])
-
-
-def _worst_of_cases(rows: Iterable[Row]) -> Iterator[Row]:
-    """Of each case the cell that is nearest to its tolerance or exceeds it."""
-    for _, cells in groupby(rows, key=lambda row: (row["subject"], row["case"])):
-        yield max(cells, key=_nearness)
 
 
 def _nearness(row: Row) -> float:

@@ -208,6 +208,11 @@ def test_libraries_are_those_that_the_sources_import_and_a_class_lists(tree):
     assert libraries(thing) == {"scipy": metadata.version("scipy")}
 
 
+def test_a_library_that_was_half_removed_has_no_version_and_counts_as_absent(tree, monkeypatch):
+    monkeypatch.setattr(provenance, "_version", lambda name: None)
+    assert libraries(METHOD) == {}
+
+
 @pytest.mark.parametrize(
     "change",
     [

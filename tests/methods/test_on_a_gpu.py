@@ -220,7 +220,7 @@ def test_what_was_trained_at_one_place_goes_on_at_the_other(
     first, second = map(training, places)
     first.advance()
     loop.save(first, tmp_path / "half")
-    loop.resume(second, tmp_path / "half")
+    loop.load(second, tmp_path / "half")
     for one in (first, second):
         one.advance()
     assert second.field.device.type == places[1]

@@ -64,7 +64,7 @@ def goes_on_after_a_kill(new: Callable[[], loop.Training], killed_at: int, folde
         half.advance()
     loop.save(half, folder / "half")
     resumed = new()
-    loop.resume(resumed, folder / "half")
+    loop.load(resumed, folder / "half")
     while resumed.step < resumed.steps:
         resumed.advance()
     found, expected = resumed.result(), whole.result()

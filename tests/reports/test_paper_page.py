@@ -140,6 +140,17 @@ def test_a_mark_stands_where_its_line_is_in_quality_and_cost(run, tmp_path, draw
     assert mark.get_xydata().tolist() == [[104e-6, run.values["psnr"]]]
 
 
+@pytest.mark.parametrize("count", [2, 11])
+def test_lines_whose_settings_are_alike_or_unknown_have_names_however_many(
+    run, tmp_path, drawn, count
+):
+    lines = [of(run, str(number)) for number in range(count)]
+    for settings in ({}, {"method": count * ["ngp"]}):
+        path = tmp_path / "marks.png"
+        figures.quality_against(lines, "frame_ms", path, settings)
+        assert len(drawn.pop().axes[0].texts) == count
+
+
 def test_every_mark_has_its_name_beside_it_and_none_covers_another(run, tmp_path, drawn):
     """Even of marks that nearly coincide."""
     psnr = {"PlenOctree": 31.0, "DIVeR": 31.05, "3D Gaussians": 31.1, "Instant-NGP": 33.0}

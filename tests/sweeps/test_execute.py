@@ -1,6 +1,7 @@
 """How jobs end and what they leave behind; methods in turns; trainings side by side."""
 
 import os
+import pickle
 from contextlib import suppress
 from functools import cache
 from unittest.mock import Mock
@@ -9,7 +10,7 @@ import pytest
 
 import steerbench
 from bench import waiting
-from bench.errors import SteerbenchError
+from bench.errors import SteerbenchError, Unavailable
 from sweeps import execute
 from sweeps.execute import Ended
 from sweeps.hydra_runs import label
@@ -43,6 +44,20 @@ def test_a_failure_that_cannot_be_kept_is_printed_all_the_same(tmp_path, monkeyp
     printed = capsys.readouterr().err
     assert "failed: a job: the cause" in printed
     assert "cannot write to" in printed
+
+
+class Diverged(Exception):
+    def __init__(self, step: int, loss: float) -> None:  # cannot be read back from its message
+        super().__init__(f"step {step}: {loss}")
+
+
+@pytest.mark.parametrize(
+    "error", [SteerbenchError("cause"), Unavailable("cause"), Diverged(3, 9.0)]
+)
+def test_any_error_of_a_job_comes_back_from_another_process(error):
+    there = pickle.loads(pickle.dumps(Ended(error=error)))
+    assert str(error) in str(there.error)
+    assert there.failed == Ended(error=error).failed
 
 
 # Several methods in turns, and what the store has of them
@@ -98,8 +113,8 @@ def test_a_job_that_fails_is_left_out_and_the_others_are_measured_in_turns(
 
 def test_a_failure_is_kept_for_its_job_until_that_succeeds(elsewhere):
     (job,), (other,) = in_turns(0.5, turns=""), in_turns(0.75, turns="")
-    job.keep_failure("no room")
-    assert (job.failure, other.failure) == ("no room", None)
+    job.keep_failure("no room: \udce9")  # of a name of a file that is no UTF-8
+    assert (job.failure, other.failure) == (r"no room: \udce9", None)
     (timed,) = in_turns(0.5)
     assert timed.failure is None  # in turns it is another job
     obtain([job])
@@ -200,9 +215,11 @@ def test_each_line_of_an_ablation_is_a_training_of_its_own(name, lines):
     [("1", "cpu", 6), ("4", "cpu", 1), ("3", "cpu", 2), ("null", "cpu", 1), ("1", "cuda", 1)],
 )
 def test_there_are_as_many_at_a_time_as_cores_have_room_for(threads, device, together, monkeypatch):
+    """Beside smaller trainings on the CPU, too."""
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(6)))
-    config = composed([f"budget.threads={threads}", f"device={device}"])
-    assert execute.room(config) == together
+    kinds = ["budget.threads=1"], [f"budget.threads={threads}", f"device={device}"]
+    small, asked = (Job(composed(words), []) for words in kinds)
+    assert execute.room([asked]) == execute.room([small, asked]) == together
 
 
 SMALL = [

@@ -94,6 +94,7 @@ def test_what_is_no_text_in_a_job_is_given_as_hydra_reads_it(tmp_path):
     [
         ("  claim: []", "unknown setting 'experiment mine: table.claim'"),
         ("  lines: {0.75: {label: bright}}", "unknown line '0.75'"),
+        ("  lines: {0.5: {job: {method: {level: 2}}}}", "lines.0.5.job: expected"),
         ("  lines: {0.5: {lable: bright}}", "lines.0.5.lable'. Did you mean"),
         ("  lines: {0.5: {published: [30, 1]}}", "published_on: expected what `published` was"),
         (

@@ -152,7 +152,7 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_last_good_checkpoint(
     with pytest.raises(SteerbenchError, match=r"step 10.*feature_mid.*last good checkpoint"):
         trained(ball_scene, tmp_path)
     training = new_training(ball_scene)
-    loop.resume(training, stage(ball_scene, tmp_path) / "checkpoint.safetensors")
+    loop.load(training, stage(ball_scene, tmp_path) / "checkpoint.safetensors")
     assert training.step == 10
     assert all(layer.isfinite().all() for layer in training.field.layers.values())
 
