@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -86,7 +86,7 @@ class Comparison:
         if math.isnan(self.here.by):
             return UNKNOWN
         low, high = self.here.by - self.here.half, self.here.by + self.here.half
-        margin = math.log(self.claim.margin) if _by_ratio(self.claim.metric) else self.claim.margin
+        margin = math.log(self.claim.margin) if by_ratio(self.claim.metric) else self.claim.margin
         if self.claim.alike:  # "hardly any loss" holds of a gain, too
             return AS if high <= margin else LARGER if low > margin else OPEN
         if high < 0:
@@ -112,20 +112,21 @@ def compare(
     Where it gives the metric, but not of both lines, it claims nothing about them.
     """
     for smaller, larger in pairwise(claim.lines):
-        paper = apart(claim.metric, *(published.get(x, math.nan) for x in (smaller, larger)))
+        known = (published.get(x, math.nan) for x in (smaller, larger))
+        says, paper = claim.says, apart(claim.metric, *known)
         if published and math.isnan(paper):
             continue
         if paper < 0 and not claim.alike:
-            smaller, larger, paper = larger, smaller, -paper
-        if smaller in lines and larger in lines:
+            smaller, larger, paper, says = larger, smaller, -paper, ""
+        if smaller in lines and larger in lines and smaller != larger:
             one, other = lines[smaller], lines[larger]
             here = gap(claim.metric, one, other)
-            yield Comparison(claim, one.label, other.label, paper, here)
+            yield Comparison(replace(claim, says=says), one.label, other.label, paper, here)
 
 
 def apart(metric: str, one: float, other: float) -> float:
     """How far `other` is above `one`, as in `Gap`; nan if either is not known or has no ratio."""
-    if not _by_ratio(metric):
+    if not by_ratio(metric):
         return 0.0 if one == other else other - one  # of equal pictures, both are infinite
     return math.log(other / one) if one > 0 and other > 0 else math.nan
 
@@ -194,7 +195,7 @@ def _over_frames(metric: str, run: Run, twin: Run) -> tuple[float, str]:
     pairs = _frame_pairs(metric, run, twin)
     if len(pairs) < 2:
         return math.nan, "one figure each"
-    if _by_ratio(metric):
+    if by_ratio(metric):
         # A mean that is wrong by a small share shifts the logarithm by this share.
         below, above = (pairs / pairs.mean(axis=0)).T
         by_frame = above - below
@@ -210,7 +211,7 @@ def _of_frames(metric: str, run: Run) -> pd.Series:
     return frames[parts].sum(axis=1, min_count=1).dropna()
 
 
-def _by_ratio(metric: str) -> bool:
+def by_ratio(metric: str) -> bool:
     return metric.partition(".")[0] in RATIOS
 
 
@@ -218,7 +219,7 @@ def told(metric: str, by: float) -> str:
     """A gap as text: +0.61 or ×1.25."""
     if math.isnan(by):
         return ABSENT
-    if not _by_ratio(metric):
+    if not by_ratio(metric):
         return ("-" if by < 0 else "+") + shown_as(metric).write(abs(by))
     factor = math.exp(by)
     if factor < 0.1:
@@ -262,7 +263,7 @@ def claim_table(comparisons: Sequence[Comparison]) -> Table:
         sign = "≈" if each.claim.alike else "<"
         where = ", ".join(filter(None, (each.table, each.data_set, label)))
         name = f"{where}: {each.smaller} {sign} {each.larger}"
-        margin = f"×{each.claim.margin:g}" if _by_ratio(metric) else f"{each.claim.margin:g}"
+        margin = f"×{each.claim.margin:g}" if by_ratio(metric) else f"{each.claim.margin:g}"
         figures = (*_figures(each), each.here.over, margin)
         lines.append((name, *figures, each.verdict))
     columns = ("claim", "paper", "here", "95 % interval", "over", "margin", "against the paper")

@@ -130,7 +130,7 @@ def ranks(lines: Sequence[Repeated], metric: str, write: Write | None = None) ->
     known: dict[tuple[object, ...], dict[int, float]] = {}
     for row, line in enumerate(lines):
         mean = line.mean(metric)
-        if mean is not None and math.isfinite(mean):
+        if mean is not None and not math.isnan(mean):
             known.setdefault(line.conditions, {})[row] = mean
     places: dict[int, int] = {}
     for figures in known.values():
@@ -156,7 +156,7 @@ def _apart(one: Repeated, other: Repeated, metric: str, write: Write) -> bool:
     interval = math.hypot(*(half for x in (one, other) if (half := x.half(metric)) > 0))
     if low.keys() == high.keys() and len(low) > 1:
         interval = half_interval(np.array([high[seed] - low[seed] for seed in low]))
-    return abs(means[1] - means[0]) > interval
+    return not abs(means[1] - means[0]) <= interval  # nan: of a perfect seed
 
 
 def machines(runs: Sequence[Run]) -> str:

@@ -16,6 +16,7 @@ DECIMALS = {"ssim": 3, "lpips": 3, "frame": 2, "size": 1}
 ESCAPES = str.maketrans(
     {
         **{sign: f"\\{sign}" for sign in "&%$#_{}"},
+        **{sign: f"{{{sign}}}" for sign in "[]"},
         "\\": r"\textbackslash{}",
         "^": r"\textasciicircum{}",
         "~": r"\textasciitilde{}",

@@ -133,7 +133,8 @@ def quality_against(
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_locator(NullLocator())
     if handles:
-        figure.legend(handles=handles, loc="outside right upper", frameon=False)
+        columns = -(-len(handles) // 20)
+        figure.legend(handles=handles, loc="outside right upper", ncols=columns, frameon=False)
     else:
         _name(axes, points)
     _save(figure, path)
@@ -205,7 +206,7 @@ def quality_along(lines: Lines, name: str, path: Path) -> None:
         elif psnr is not None:
             axes.axhline(psnr, **{**_style(number), "linestyle": "--"}, label=line.label)
     for number, (label, curve) in enumerate(curves.items()):
-        means, bars = np.nan_to_num([curve[point] for point in sorted(curve)]).T
+        means, bars = np.nan_to_num([curve[point] for point in sorted(curve)], posinf=math.nan).T
         style = {**_style(number), "capsize": 3, "label": label, "linestyle": "-"}
         axes.errorbar(sorted(curve), means, yerr=bars if bars.any() else None, **style)
     ticks = sorted({point for curve in curves.values() for point in curve})
@@ -221,7 +222,8 @@ def quality_along(lines: Lines, name: str, path: Path) -> None:
 def as_number(value: str) -> float | None:
     """What a setting says, if that is a number; of a power of 2, the exponent."""
     try:
-        return float(value.removeprefix("2^"))
+        number = float(value.removeprefix("2^"))
+        return number if math.isfinite(number) else None
     except ValueError:
         return None
 

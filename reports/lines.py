@@ -7,8 +7,9 @@ from typing import Any
 
 import pandas as pd
 
-from bench.results import Store, content_key
+from bench.results import COLUMNS, Store, content_key
 from reports.runs import Repeated, Run, over_common_frames, readable, unseeded
+from reports.tables import QUALITY
 
 METHOD = "method"  # the first column
 
@@ -18,8 +19,11 @@ COMMON = ("scene", "resolution", "trajectory", "budget", "protocol", "device")
 FACTS = (*COMMON, "engine", "precision")
 """Columns of rows that are shown where they differ, beside the method."""
 
-HIDDEN = ("pictures", "budget.name", "protocol.name", "scene.name", "method.name")
+HIDDEN = ("pictures", "budget.name", "protocol.name", "scene.name")
 """Settings that make no column: what changes no figure, and what `FACTS` show."""
+
+TAKEN = (METHOD, "seeds", "frames", "frame_ms", "fps", "train_s", *QUALITY)
+"""Columns of our own, which no setting is shortened to."""
 
 LOGARITHM = "log2_"  # begins the names of settings that are exponents of 2
 
@@ -56,14 +60,18 @@ def as_lines(runs: Sequence[Run]) -> Lines:
 
     The label of a run is shown as its method.
     """
-    by_line: dict[str, list[Run]] = {}
+    by_line: dict[str, dict[int, Run]] = {}
     for run in over_common_frames(runs):
-        by_line.setdefault(_line_of(run), []).append(run)
-    firsts = [of_line[0] for of_line in by_line.values()]
+        by_line.setdefault(_line_of(run), {})[run.facts["seed"]] = run  # a seed counts once
+    groups = [[*of_line.values()] for of_line in by_line.values()]
+    firsts = [of_line[0] for of_line in groups]
     settings = {METHOD: [run.label for run in firsts], **differing(firsts)}
+    machines = [", ".join(run.computer) for run in firsts]
+    if not _follows(list(settings.values()), machines):
+        settings["machine"] = machines
     columns = list(settings.items())
     lines = []
-    for index, of_line in enumerate(by_line.values()):
+    for index, of_line in enumerate(groups):
         method = settings[METHOD][index]
         own = [f"{name}={of[index]}" for name, of in columns[1:] if of[index] not in ("", "none")]
         if settings[METHOD].count(method) == 1:
@@ -82,10 +90,10 @@ def differing(runs: Sequence[Run]) -> dict[str, list[str]]:
 
 
 def shortened(names: Sequence[str]) -> dict[str, str]:
-    """The last part of each of the `names` of settings or, if several end so, all of it."""
-    ends = [name.rpartition(".")[2] for name in names]
+    """The last part of each of the `names` of settings or, if several columns end so, all of it."""
+    ends = [*(name.rpartition(".")[2] for name in names), *TAKEN]
     return {
-        name: end if ends.count(end) == 1 else name for name, end in zip(names, ends, strict=True)
+        name: end if ends.count(end) == 1 else name for name, end in zip(names, ends, strict=False)
     }
 
 
@@ -119,7 +127,7 @@ def results(store: Store, report: Callable[[str], object] = lambda line: None) -
     `report` gets a line on those that cannot be read, for each reason.
     """
     runs = readable(store, report=report)
-    own = {name: values for name, values in varied(runs).items() if name not in FACTS}
+    own = {name: values for name, values in varied(runs).items() if name not in (*FACTS, *COLUMNS)}
     rows = [
         run.rows.assign(**{name: values[index] for name, values in own.items()})
         for index, run in enumerate(runs)
@@ -137,7 +145,8 @@ def _line_of(run: Run) -> str:
     """Equal for runs that differ only in their seed."""
     if "config" not in run.record["made_of"]:
         return run.key
-    return content_key({"settings": _settings(run), "where": list(map(str, run.conditions))})
+    settings = {x: of for x, of in unseeded(run.record["made_of"]["config"]) if x not in HIDDEN}
+    return content_key({"settings": settings, "where": list(map(str, run.conditions))})
 
 
 def _settings(run: Run) -> dict[str, str]:

@@ -87,7 +87,7 @@ def _plot(
         some = _first_runs(some, one_scene=plot.get("one_scene", False))
         draw = partial(getattr(figures, plot["draw"]), some)
         drawn = Picture(plot["file"], plot["title"], draw)
-    if some:
+    if some and (drawn.marks or "draw" in plot):
         yield from (f"## {plot['title']}", drawn, plot["caption"].strip())
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -113,7 +114,8 @@ class PaperTable:
         claims = []
         for claim in self.claims:
             keys = [standing.get(key, key) for key in claim.lines]
-            claims.append(replace(claim, lines=keys, says=claim.says.format_map(called)))
+            says = re.sub(r"\{([^{}]+)\}", lambda key: called.get(key[1], key[0]), claim.says)
+            claims.append(replace(claim, lines=keys, says=says))
         return Shown(self, data_set, lines, found, claims, notes)
 
 
@@ -204,7 +206,8 @@ def distance_table(block: Shown) -> Table:
     """The figures of the table's reference, then how far each line is from it, here and in the
     paper, by metric."""
     runs = dict(block.measured)
-    first = block.table.reference if block.table.reference in runs else next(iter(runs))
+    wanted = block.table.reference, block.table.instead.get(block.table.reference), *runs
+    first = next(key for key in wanted if key in runs)
     reference = runs.pop(first)
     columns = {}
     for metric in block.table.metrics:

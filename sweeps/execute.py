@@ -33,7 +33,7 @@ from bench.results import content_key
 from bench.study import study_of
 from reports.runs import load_runs
 from reports.tables import decimal
-from sweeps.configured import trained, training_threads
+from sweeps.configured import scene_folder, trained, training_threads
 from sweeps.measurement import Job, JobFailed, obtain, reason, stored
 from sweeps.overrides import CONFIGS, composed, explain, setting, target_of
 from sweeps.processes import on_gpu, processes, set_up
@@ -176,6 +176,12 @@ def attempt(group: Group, total: int, folder: Path, begun: float) -> dict[str, E
     while left:
         try:
             runs, measured = obtain([job for _, job in left])
+            for number, _ in left:
+                _count(folder, number, measured)
+            for (_, job), run in zip(left, runs, strict=True):
+                ended[job.key] = Ended(run, measured)
+                say(job, run, _progress(folder, total, begun))
+            left = []
         except Exception as error:
             alone = error.job if isinstance(error, JobFailed) else None
             cause = error.__cause__ if alone and isinstance(error.__cause__, Exception) else error
@@ -189,13 +195,6 @@ def attempt(group: Group, total: int, folder: Path, begun: float) -> dict[str, E
                 ended[job.key] = Ended(error=cause)
                 _count(folder, number)
             left = [each for each in left if each not in failed]
-        else:
-            for number, _ in left:
-                _count(folder, number, measured)
-            for (_, job), run in zip(left, runs, strict=True):
-                ended[job.key] = Ended(run, measured)
-                say(job, run, _progress(folder, total, begun))
-            left = []
     return ended
 
 
@@ -227,6 +226,9 @@ def run_jobs(jobs: Sequence[Job], launcher: Launcher) -> list[Ended]:
     otherwise each job trains what it needs.
     """
     first = {job.key: job for job in reversed(jobs)}
+    for job in jobs:  # of a folder, a key has the last part
+        if (one := scene_folder(first[job.key].config)) != (other := scene_folder(job.config)):
+            raise SteerbenchError(f"scene.path: {one}, {other}: expected folders with other names")
     distinct = [job for job in jobs if first[job.key] is job]
     scenes, seeds = ([job.settings[name] for job in distinct] for name in ("scene", "seed"))
 

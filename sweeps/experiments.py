@@ -17,12 +17,12 @@ def experiment(name: str, words: Sequence[str] = ()) -> Any:
         tables = [each for each, file in files.items() if "table" in loaded(file)]
         error = unknown("table", name, tables)
         raise SteerbenchError(f"{error} --config-dir DIR names a folder with further ones")
-    return loaded(files[name])
+    return loaded(files[name]) or {}
 
 
 def grid(declared: Any) -> dict[str, list[str]]:
     """The settings that an experiment varies, each with its values, by what its file holds."""
-    params = declared.get("hydra", {}).get("sweeper", {}).get("params", {})
+    params = declared.get("hydra", {}).get("sweeper", {}).get("params") or {}
     several = swept([f"{name}={values}" for name, values in params.items()])
     return {name: several.get(name, [str(values)]) for name, values in params.items()}
 
@@ -32,8 +32,10 @@ def axes(method: str) -> dict[str, Axis]:
     found = {}
     for name in choices("experiment"):
         declared = experiment(name)
-        table = declared.get("table", {})
-        if "axis" in table and {"override /method": method} in declared["defaults"]:
-            ((setting, values),) = grid(declared).items()
-            found[table["axis"]] = Axis(table["label"], setting, tuple(sorted(map(int, values))))
+        table, of_method = declared.get("table") or {}, {"override /method": method}
+        ways = ((x, of) for x, of in grid(declared).items() if all(map(str.isdecimal, of)))
+        setting, values = next(((x, of) for x, of in ways if x != SEED), ("", []))
+        if "axis" in table and of_method in (declared.get("defaults") or ()) and setting:
+            symbol, sizes = table["axis"], tuple(sorted(map(int, values)))
+            found[symbol] = Axis(table.get("label", f"{symbol} = {{}}"), setting, sizes)
     return found

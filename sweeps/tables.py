@@ -3,20 +3,20 @@
 A table is an experiment with a section `table`, in our folder or in one that `--config-dir` names.
 """
 
+import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
-from string import Formatter
 from typing import Any
 
 from bench.errors import SteerbenchError, unexpected, unknown
-from reports.claims import Claim
+from reports.claims import Claim, by_ratio
 from reports.comparison import shown_as
 from reports.paper_tables import METHOD, Line, PaperTable
 from sweeps.configured import check_settings
-from sweeps.data_sets import FIRST
+from sweeps.data_sets import DATA_SETS, FIRST
 from sweeps.experiments import SEED, experiment, grid
-from sweeps.overrides import choices
+from sweeps.overrides import choices, setting
 
 
 def chosen(
@@ -31,7 +31,11 @@ def chosen(
     methods. SteerbenchError if there is no such table, or what is declared of it is wrong.
     """
     if name is not None:
-        tables = [_table(name, experiment(name, words), data_sets)]
+        try:
+            tables = [_table(name, experiment(name, words), data_sets)]
+        except (AttributeError, LookupError, TypeError, ValueError, ZeroDivisionError) as error:
+            expected = "fields as in docs/extending.md"
+            raise unexpected(f"experiment {name}: table", expected, repr(error)) from error
     else:
         found = {name: experiment(name) for name in choices("experiment")}
         every = [_table(*each, data_sets) for each in found.items() if "table" in each[1]]
@@ -59,22 +63,23 @@ def _table(name: str, whole: Any, data_sets: Sequence[str]) -> PaperTable:
     own["beside"] = [*map(str, own.get("beside", ()))]
     label, said, _ = own.pop("label", None), own.pop("lines", {}), own.pop("axis", None)
     check_settings(PaperTable, own, f"{where}.", ("name", "lines", "data_sets"))
-    for metric in own["metrics"]:
+    for metric in (*own["metrics"], *own.get("scenes", ())):
         shown_as(metric)  # refuses a name that is no metric
     said = {str(key): of or {} for key, of in said.items()}
     if any("published" in of for of in said.values()) and not own["published_on"]:
         raise unexpected(f"{where}.published_on", "what `published` was measured on", "nothing")
     own["lines"] = lines = {}
     for key, job in _jobs(said, label, grid(whole), where).items():
-        of = {**job, **said.get(key, {})}
-        if isinstance(of["job"], Mapping):  # YAML reads numbers, Hydra words
-            given = ((x, "null" if value is None else value) for x, value in of["job"].items())
-            of["job"] = {x: y if isinstance(y, Mapping) else str(y) for x, y in given}
+        of = {**job, **said.get(key, {}), "job": job["job"]}
         published = _by_data_set(of.pop("published", {}))
         check_settings(Line, of, f"{where}.lines.{key}.", ("published", "added"))
         figures = {x: _figures(of_one, own["metrics"], where) for x, of_one in published.items()}
         lines[key] = Line(**of, published=figures)
     own["claims"] = [_claim(of, lines, f"{where}.claims.") for of in own.get("claims", ())]
+    for other in own["published_on"].keys() - DATA_SETS:
+        raise unknown("data set", other, DATA_SETS)
+    if len({line.label for line in lines.values()}) < len(lines):
+        raise unexpected(f"{where}.label", "another for each line", label)
     named = (own["reference"], *own["instead"], *own["instead"].values(), *own["beside"])
     _refuse_unknown(filter(None, named), lines)
     shown = [data_set for data_set in data_sets if data_set in own["published_on"]]
@@ -86,7 +91,9 @@ def _jobs(
 ) -> dict[str, dict[str, Any]]:
     """The job and the label of each line by key: of lines for which a `job` is `said`; if for none,
     of each job of the grid, whose key is made of its values."""
-    jobs = {key: {"label": key, "job": of["job"]} for key, of in said.items() if "job" in of}
+    jobs = {
+        key: {"label": key, "job": _words(of["job"])} for key, of in said.items() if "job" in of
+    }
     axes = {name: values for name, values in grid.items() if name != SEED}
     if not jobs and not axes:
         raise unexpected(where, "settings in hydra.sweeper.params, or lines with a job", "neither")
@@ -98,6 +105,14 @@ def _jobs(
     return jobs
 
 
+def _words(job: Any) -> Any:
+    """YAML's values as Hydra's words, but for what is wrong."""
+    if not isinstance(job, Mapping) or any(isinstance(of, Mapping) for of in job.values()):
+        return job
+    texts = {x: setting("", of)[1:] if isinstance(of, str) else of for x, of in job.items()}
+    return {x: "null" if of is None else str(of) for x, of in texts.items()}
+
+
 def _figures(
     published: Sequence[float | None], metrics: Sequence[str], where: str
 ) -> dict[str, float]:
@@ -106,7 +121,7 @@ def _figures(
         expected = f"{len(metrics)} figures, one for each of metrics"
         raise unexpected(f"{where}.lines.published", expected, len(published))
     pairs = zip(metrics, published, strict=True)
-    figures = {metric: figure for metric, figure in pairs if figure is not None}
+    figures = {metric: float(figure) for metric, figure in pairs if figure is not None}
     return {**figures, "frame_ms": 1000 / figures["fps"]} if "fps" in figures else figures
 
 
@@ -115,8 +130,10 @@ def _claim(declared: Mapping[str, Any], lines: Mapping[str, Line], where: str) -
     own = {name: of for name, of in declared.items() if name not in ("rising", "alike")}
     check_settings(Claim, own, where, ("lines", "alike"))
     shown_as(own["metric"])
+    if by_ratio(own["metric"]) and float(own["margin"]) < 1:
+        raise unexpected(f"{where}margin", "a ratio such as 1.1", own["margin"])
     keys = [str(key) for key in declared.get("rising") or declared.get("alike") or ()]
-    said = (key for _, key, _, _ in Formatter().parse(own.get("says", "")))
+    said = re.findall(r"\{([^{}]+)\}", own.get("says", ""))
     _refuse_unknown([*keys, *filter(None, said)], lines)
     return Claim(lines=keys, alike="alike" in declared, **own)
 

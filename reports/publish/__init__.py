@@ -84,7 +84,7 @@ def markdown(parts: Sequence[Part], folder: Path) -> str:
 
 def _shown(picture: Picture, folder: Path) -> str:
     """Draw `picture` into `folder`, named after its content; return the Markdown that shows it."""
-    with tempfile.TemporaryDirectory() as place:
+    with tempfile.TemporaryDirectory() as place, matplotlib.rc_context({"text.parse_math": False}):
         picture.draw(drawn := Path(place) / f"{picture.stem}.png")
         content = drawn.read_bytes()
     name = f"pictures/{picture.stem}-{hashlib.sha256(content).hexdigest()[:12]}.png"
@@ -146,7 +146,7 @@ def _html(part: Part, origins: dict[str, dict[str, str]], headings: dict[str, st
 
 def _svg(plot: Picture) -> str:
     """`plot` as SVG; its marks can be focused and have descriptions."""
-    style: Any = {"svg.fonttype": "none", "svg.hashsalt": plot.stem}
+    style: Any = {"svg.fonttype": "none", "svg.hashsalt": plot.stem, "text.parse_math": False}
     with tempfile.TemporaryDirectory() as place, matplotlib.rc_context(style):
         plot.draw(drawn := Path(place) / "plot.svg")
         content = drawn.read_text(encoding="utf-8")

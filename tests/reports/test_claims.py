@@ -211,10 +211,12 @@ def test_neighbours_are_compared_if_both_were_measured_and_the_paper_gives_both_
 def test_only_growth_is_turned_round_where_the_paper_has_the_opposite_order(run):
     """That three preceding frames gain no more than two stays a claim about the third."""
     both = {"one": 31.04, "two": 31.0}, {"one": 0.0, "two": 0.3}
-    (turned,), (alike,) = compared(run, *both), compared(run, *both, ALIKE)
+    claims = (replace(claim, says="gain of two") for claim in (RISING, ALIKE))
+    (turned,), (alike,) = (compared(run, *both, claim) for claim in claims)
     assert (turned.smaller, turned.larger) == ("two", "one")
     assert (turned.paper, turned.here.by) == (pytest.approx(0.04), pytest.approx(-0.3))
     assert (alike.smaller, alike.paper) == ("one", pytest.approx(-0.04))
+    assert (turned.claim.says, alike.claim.says) == ("", "gain of two")
     assert alike.verdict == LARGER + BY_ONE
 
 

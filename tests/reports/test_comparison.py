@@ -48,6 +48,11 @@ def test_the_best_is_the_highest_or_the_lowest_as_the_arrow_says(make):
     assert "LPIPS alex ↓" not in {column for _, column in bold(table)}  # not available
 
 
+def test_perfect_pictures_are_the_best(make):
+    table = table_of([make("perfect", psnr=math.inf), make("good", psnr=30.0)])
+    assert {label for label, column in bold(table) if "PSNR" in column} == {"perfect"}
+
+
 def test_one_run_or_runs_of_different_kinds_have_no_best(make):
     other = changed(make("c"), {}, protocol="quick")
     runs = [make("a"), elsewhere(make("b")), other, make("d", digest="other")]

@@ -65,7 +65,22 @@ def test_settings_are_compared_within_a_method_and_facts_across_methods(make):
 def test_the_same_settings_on_other_machines_are_lines_of_their_own(make):
     runs = [make({}), replace(make({}), record={**make({}).record, "machine": {
         "cpu": "Xeon", "threads": 2, "gpus": []}})]  # fmt: skip
-    assert len(as_lines(runs).lines) == 2
+    lines = as_lines(runs)
+    assert len(lines.lines) == 2
+    assert lines.settings["machine"] == ["same, EPYC, 2 threads", "same, Xeon, 2 threads"]
+
+
+def test_a_seed_counts_once_in_a_line(make):
+    runs = [make({}), make({})]
+    runs[1].record["made_of"]["config"]["pictures"] = 3
+    ((line,), several) = as_lines(runs).lines, as_lines([*runs, make({}, seed=1)]).lines[0]
+    assert [len(line.runs), len(several.runs)] == [1, 2]
+
+
+def test_a_setting_that_is_called_as_a_column_keeps_its_whole_name(make):
+    for own in ("method", "seeds", "frames", "fps", "psnr"):
+        (name,) = as_lines([make({"of": {own: n}}) for n in (0, 5)]).settings.keys() - {"method"}
+        assert name == f"method.of.{own}"
 
 
 def test_results_have_the_settings_that_differ(several):

@@ -36,7 +36,8 @@ def test_a_label_has_method_and_what_varies_by_whole_names_where_ends_are_alike(
 
 def test_a_failure_that_cannot_be_kept_is_printed_all_the_same(tmp_path, monkeypatch, capsys):
     cause = SteerbenchError("the cause")
-    monkeypatch.setattr(execute, "obtain", Mock(side_effect=cause))
+    monkeypatch.setattr(execute, "obtain", lambda jobs: ([job.key for job in jobs], True))
+    monkeypatch.setattr(execute, "say", Mock(side_effect=cause))  # of a stored run that is damaged
     (tmp_path / "outputs").touch()  # no folder can be made there
     job = Job(composed([f"outputs={tmp_path / 'outputs'}"]), [], "a job")
     ended = execute.attempt([(0, job)], 1, tmp_path / "sweep", 0.0)
@@ -109,6 +110,14 @@ def test_a_job_that_fails_is_left_out_and_the_others_are_measured_in_turns(
     if broken.startswith("device"):  # what cannot be used here is not looked for
         assert stored(jobs) == stored([first, last])
     assert capsys.readouterr().err.count("failed: broken") == 2
+
+
+def test_scenes_in_folders_of_one_name_are_refused_in_one_sweep(tmp_path):
+    """Both would be the run of one scene."""
+    folders = [tmp_path / part / "mic" for part in "ab"]
+    jobs = [Job(composed(["scene=blender", f"scene.path={folder}"]), []) for folder in folders]
+    with pytest.raises(SteerbenchError, match="expected folders with other names"):
+        execute.run_jobs(jobs, Mock())
 
 
 def test_a_failure_is_kept_for_its_job_until_that_succeeds(elsewhere):

@@ -85,8 +85,18 @@ def test_several_axes_have_a_line_for_each_combination(tmp_path):
 
 
 def test_what_is_no_text_in_a_job_is_given_as_hydra_reads_it(tmp_path):
-    (table,) = chosen("mine", declared(tmp_path, "  lines: {x: {job: {a: 25, b: null}}}"))
-    assert table.lines["x"].job == {"a": "25", "b": "null"}
+    job = "{a: 25, b: null, c: 'x, y', d: plain}"
+    (table,) = chosen("mine", declared(tmp_path, f"  lines: {{x: {{job: {job}}}}}"))
+    assert table.lines["x"].job == {"a": "25", "b": "null", "c": "'x, y'", "d": "plain"}
+
+
+def test_a_claim_names_lines_by_keys_that_are_numbers(tmp_path):
+    says = (
+        "  claims: [{metric: psnr, margin: 0.1, rising: [0.25, 0.5], says: '{0.5} { over {0.25}'}]"
+    )
+    (table,) = chosen("mine", declared(tmp_path, f"  label: 'v = {{}}'\n{says}"))
+    (shown,) = table.shown({})
+    assert shown.claims[0].says == "v = 0.5 { over v = 0.25"
 
 
 @pytest.mark.parametrize(
@@ -111,6 +121,11 @@ def test_what_is_no_text_in_a_job_is_given_as_hydra_reads_it(tmp_path):
         ("  reference: 1.0", "unknown line '1.0'"),
         ("  instead: {0.5: 1.0}", "unknown line '1.0'"),
         ("  beside: [1.0]", "unknown line '1.0'"),
+        ("  lines: []", "expected fields as in docs/extending.md, got AttributeError"),
+        ("  label: same", "table.label: expected another for each line, got same"),
+        ("  published_on: {Mine: here}", "unknown data set 'Mine'"),
+        ("  scenes: [psrn]", "psrn: no such metric"),
+        ("  claims: [{metric: fps, margin: 0.1, alike: [0.5]}]", "expected a ratio such as 1.1"),
     ],
 )
 def test_what_is_wrong_in_a_declaration_is_named(tmp_path, more, said):
