@@ -10,6 +10,7 @@ from dataclasses import asdict
 from glob import glob
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
+from unicodedata import normalize
 
 import pandas as pd
 import torch
@@ -74,6 +75,9 @@ def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
     if match == "order":
         if len(files) != len(names):
             raise unexpected(folder, f"{len(names)} pictures, as many as true ones", len(files))
+        if sorted(names) == [*names] != sorted(names, key=natural) and sorted(files) != files:
+            wanted = "numbers of one length in names, as true pictures are in the order of letters"
+            raise unexpected(folder, wanted, some([path.name for path in files]))
         return files
     keys, names = _keys([path.relative_to(folder).as_posix() for path in files]), _keys(names)
     if not any("/" in key for key in keys):
@@ -94,7 +98,8 @@ def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
 
 def _keys(names: Sequence[str]) -> list[str]:
     """`names` without ending, and without the folders that all of them are in."""
-    paths = [Path(name.lstrip("/")).with_suffix("") for name in names]
+    names = [normalize("NFC", name.lstrip("/")) for name in names]  # not as macOS writes accents
+    paths = [Path(name).with_suffix("") for name in names]
     shared = os.path.commonpath([str(path.parent) for path in paths] or [""])
     return [str(path.relative_to(shared)) for path in paths]
 
@@ -111,6 +116,8 @@ def listed(folder: Path) -> list[Path]:
             break
     else:
         raise unexpected(folder, f"pictures ({', '.join(SUFFIXES)})", some(below) or "none")
+    if wrong := [path for path in files if not str(path).isprintable()]:
+        raise unexpected(folder, "names in UTF-8 that can be printed", repr(wrong[0].name))
     stems = [path.relative_to(folder).with_suffix("").as_posix() for path in files]
     if twice := _repeated(stems):
         raise unexpected(folder, "one picture of a name", f"several of {some(twice)}")
@@ -184,7 +191,7 @@ def score(
             seen.update(picture.numpy().tobytes())
             truths.update(truth.numpy().tobytes())
             truths.update(b"" if mask is None else mask.numpy().tobytes())
-            alphas += picture.shape[2] == 4
+            alphas += 4 in (picture.shape[2], truth.shape[2])
             rgb = composite(picture, background)
             figures = scoring.score(index, rgb, truth, cut=not sequence, camera=camera, mask=mask)
             frames.append({"frame": index, "name": name, "phase": STEADY, **figures})

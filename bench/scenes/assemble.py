@@ -47,6 +47,9 @@ def describe_splits(
     if masked := sum(view.mask is not None for view in every):
         unused = "is not learnt from, nor scored unless protocol.mask=none"
         log.info(f"{masked} of {len(every)} pictures have masks: what they hide {unused}")
+    train, test = ({view.path for view in views.get(part, ())} for part in ("train", "test"))
+    if both := sorted(train & test):
+        log.info(f"in train and test: {len(both)} pictures, {both[0]} is the first")
     described = in_parallel(lambda view: describe(view, downscale), every, "read pictures", log)
     for turned, how in ((True, "turned"), (False, "not turned, as their cameras are")):
         if names := [of.view.name for of in described if of.turned is turned]:
@@ -213,7 +216,7 @@ def box_of_cameras(cameras: Sequence[Camera]) -> Box:
     sums = (across @ centres[:, :, None]).sum(dim=0).squeeze(1)
     middle = torch.linalg.solve(across.sum(dim=0), sums)
     half = (centres - middle).abs().max()
-    half = half if half > 0 else torch.ones_like(half)
+    half = half if half > 1e-9 * (1 + middle.abs().max()) else torch.ones_like(half)
     return Box(middle - half, middle + half)
 
 

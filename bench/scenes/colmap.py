@@ -1,5 +1,6 @@
 """Loads a capture reconstructed by COLMAP: a sparse model beside the pictures."""
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -118,6 +119,9 @@ def read_views(root: Path, images: str, folder: Path, masks: Path | None, log: L
         log.info(f"{place}: pictures are paired in the order of names: {first}")
     else:
         report(place, names, files, str(folder), log, False)
+    there = {file for file in place.rglob("*") if bare(file.name) != file.name}
+    if rest := sorted(there - {*files}):
+        log.info(f"{folder}: left out as not in it: {len(rest)} pictures, {rest[0]} is the first")
     views: list[tuple[str, View | None]] = []
     for entry, name, file in zip(entries, map(tidy, names), files, strict=True):
         mask = masks and mask_in(masks, name)
@@ -159,6 +163,7 @@ def read_camera(
     if not of_image.focal_length_idxs():
         raise unexpected(where, "a camera model with a focal length", of_image.model_name)
     qw, qx, qy, qz, *shift = (number(float(word), where) for word in pose)
+    number(math.hypot(qw, qx, qy, qz), f"{where}: length of its quaternion", 0)
     from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array((qx, qy, qz, qw))), np.array(shift))
     c2w = rigid_pose(from_world.inverse().matrix().tolist(), where, Remarks())
     (fx, _, cx), (_, fy, cy), _ = of_image.calibration_matrix().tolist()

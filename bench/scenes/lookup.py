@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from difflib import get_close_matches
 from functools import cache
 from pathlib import Path, PurePosixPath
+from unicodedata import normalize
 
 from bench.errors import unexpected
 from bench.types import Log
@@ -68,13 +69,16 @@ def find_all(root: Path, names: Sequence[str]) -> list[Path | None]:
     ending of a picture where `names` have none or another one. No picture is that of two names.
     """
 
+    def key(name: str) -> str:
+        return normalize("NFC", bare(name)).casefold()  # not as macOS writes accents
+
     @cache
     def beside(folder: Path) -> dict[str, list[Path]]:
         files = defaultdict(list)
         there = _children(in_any_case(folder, os.path.isdir))
         there = [file for file in there if bare(file.name) != file.name]
         for file in sorted(there, key=lambda file: ENDINGS.index(file.suffix.lower())):
-            files[bare(file.name).casefold()].append(file)
+            files[key(file.name)].append(file)
         return files
 
     files = {name: next(filter(os.path.isfile, [root / name]), None) for name in names}
@@ -82,7 +86,7 @@ def find_all(root: Path, names: Sequence[str]) -> list[Path | None]:
     for name in [name for name, file in files.items() if not file]:
         path = root / tidy(name)
         like = sorted(
-            beside(path.parent).get(bare(path.name).casefold(), []),
+            beside(path.parent).get(key(path.name), []),
             key=lambda file: (file != path, file.name.casefold() != path.name.casefold()),
         )
         files[name] = next((file for file in like if file not in taken), None)

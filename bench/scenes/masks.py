@@ -50,7 +50,12 @@ class Masks(Pictures):
         if picture.mask is None:
             return None
         view = picture.view
-        masked = (decode(picture.mask)[..., :3] > 0).any(-1) == view.hides
+        levels = decode(picture.mask)[..., :3]
+        lossy = picture.mask.view.path.suffix.lower() in (
+            ".jpg",
+            ".jpeg",
+        )  # its black is nearly black
+        masked = (levels > (levels.max() // 2 if lossy else 0)).any(-1) == view.hides
         if view.lens:
             masked = undistort(255 * masked.byte()[..., None], view.camera, view.lens)[..., 0] > 0
         return functional.max_pool2d(masked.float()[None], picture.downscale)[0] == 0

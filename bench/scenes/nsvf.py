@@ -46,6 +46,9 @@ def load(path: str | Path, *, downscale: int = 1, background: str = "white", log
         camera = replace(of_all, c2w=rigid_pose(rows, str(where), remarks))
         view = View(f"rgb/{file.name}", file, camera)
         views.setdefault(SPLITS[file.name[0]], []).append(view)
+    poses = {path.stem for path in (root / "pose").glob("*.txt")}
+    if rest := sorted(poses - {file.stem for file in files}):
+        log.info(f"{root}: poses without a picture: {len(rest)}, {rest[0]} is the first")
     if "test" not in views and "val" in views:
         log.info(f"{root / 'rgb'}: no pictures 2_*, so 1_* are the test split")
         views["test"] = views.pop("val")

@@ -38,7 +38,7 @@ def read_lists(
     names = [line for line in lines if line and not line.startswith("#")]
     if not names:
         raise unexpected(file, "names of pictures", "none")
-    return file, {next((of for of in SPLITS if file.stem.startswith(of)), "test"): names}
+    return file, {next((of for of in SPLITS if file.stem.lower().startswith(of)), "test"): names}
 
 
 def divide(
@@ -90,9 +90,7 @@ def _as_listed(
     for split in {"train", "test"} - {*parts}:
         parts[split], rest = rest, set()
     counts = ", ".join(f"{len(part)} {split}" for split, part in parts.items())
-    both = len(parts["train"] & parts["test"])
     said = [f"{file}: pictures as it lists them: {counts}"]
-    said += [f"{both} of them in train and test"] if both else []
     said += [f"in no list, left out: {len(rest)}"] if rest else []
     said += [f"no pictures: {', '.join(sorted(unknown))}"] if unknown else []
     log.info("; ".join(said))

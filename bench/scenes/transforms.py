@@ -93,12 +93,13 @@ def load(
     splits = divide(read_views(root, record, path, log), split_every, lists, path, log)
     pictures = describe_splits(splits, downscale, log)
     space = space_of(space, pictures, background)
-    if space == "all" and aabb_scale is None:
+    cube = record.keys() & {"aabb_scale", "scale", "offset"}  # which only instant-ngp has
+    if aabb_scale is None and (space == "all" or not cube):
         box = box_of_cameras([view.camera for view in splits["train"]])
     else:
         box = capture_box(path, record, aabb_scale)
-        if aabb_scale is None and record.get("aabb_scale", 1) > 1:
-            box = tight(box, pictures["train"])
+    if space == "box" and aabb_scale is None and (record.get("aabb_scale", 1) > 1 or not cube):
+        box = tight(box, pictures["train"])
     scene = assemble(
         root.name, pictures, box, background=background, space=space, camera_files=[path]
     )

@@ -268,9 +268,13 @@ class External:
                 self._expect(got == list(shape), f"{name} {list(shape)}", f"{name} {got}")
         rgb = torch.from_numpy(arrays["rgb"])
         rgb = rgb / 255 if rgb.dtype == torch.uint8 else rgb.float()
-        if not math.isfinite(rgb.sum()):  # which reads the picture once, and writes no other
+        if not math.isfinite(
+            total := float(rgb.sum())
+        ):  # which reads the picture once, and writes no other
             broken = int((~rgb.isfinite()).any(dim=2).sum())
             self._expect(not broken, "finite numbers", f"{broken} pixels that are NaN or infinite")
+        mean = total / rgb.numel()
+        self._expect(abs(mean) < 2, "rgb in [0, 1], or as bytes", f"a mean of {mean:.3g}")
         depth = torch.tensor(math.inf).expand(size)
         if "depth" in arrays:
             depth = torch.from_numpy(arrays["depth"]).float() / self._scene.unit_length

@@ -90,6 +90,11 @@ def test_pictures_in_subfolders_match_by_their_path(tmp_path, quiet_log, folder)
         pictures.pairs_with_split(flat, split)
 
 
+def test_accents_of_another_system_match(tmp_path):
+    ours = write(tmp_path / "ours", {"e\u0301.png": noise()})
+    assert pictures.matched(ours, ["\u00e9"], "name") == pictures.listed(ours)
+
+
 def test_depth_and_normals_beside_a_picture_are_ignored(tmp_path):
     names = ["r_0.png", "r_0_depth_0001.png", "r_0_normal.png", "r_1_depth.png"]
     there = pictures.listed(write(tmp_path / "there", dict.fromkeys(names, noise())))
@@ -105,6 +110,7 @@ def test_depth_and_normals_beside_a_picture_are_ignored(tmp_path):
         ("name", ["a.png", "a.jpg", "b.png"], "several of a"),
         ("name", [], "none"),
         ("order", ["a.png"], "2 pictures, as many as true ones, got 1"),
+        ("name", ["a.png", "\udce9.png"], r"names in UTF-8 that can be printed, got '.udce9.png'"),
     ],
 )
 def test_pictures_that_do_not_match_are_named(tmp_path, match, names, said):
@@ -132,6 +138,8 @@ def test_two_truths_of_one_name_have_no_picture_of_their_own(tmp_path):
     said = "--match order takes both in their order, got several of 0001"
     with pytest.raises(SteerbenchError, match=said):
         pictures.matched(ours, ["0001", "0001"], "name")
+    with pytest.raises(SteerbenchError, match=r"in the order of letters, got r_9\.png, r_10\.png"):
+        pictures.matched(ours, ["images/10", "images/9"], "order")
     files = pictures.matched(ours, ["0001", "0001"], "order")
     assert [file.name for file in files] == ["r_9.png", "r_10.png"]
 

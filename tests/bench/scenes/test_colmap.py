@@ -211,6 +211,12 @@ IMAGE, CAMERA = "3 1 0 0 0 0 0 0 002.png", "expected CAMERA_ID MODEL"
     [
         ("images", r"^3 .*", IMAGE, "line 9: expected IMAGE_ID QW .* got '3 1 0"),
         ("images", r"1 002.png", "7 002.png", "line 9: 002.png: .* CAMERA_ID 7 without an entry"),
+        (
+            "images",
+            r"^3 .* (?=1 002.png)",
+            "3 0 0 0 0 0 0 0 ",
+            "line 9: 002.png: length of its quaternion",
+        ),
         ("images", r"^3 \S+", "3 nan", "line 9: 002.png: expected a finite number, got nan"),
         ("cameras", r"PINHOLE", "PINHOLES", f"line 4: {CAMERA} .* got 1 PINHOLES"),
         ("cameras", r" \S+$", "", f"line 4: {CAMERA} .* got 1 PINHOLE 8 6 9"),

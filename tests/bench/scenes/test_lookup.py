@@ -11,7 +11,8 @@ from bench.scenes.lookup import find_all, report
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     """A folder `scan` with pictures, beside another one."""
-    for name in ("scan/rgb/a.png", "scan/rgb/b.JPG", "scan/rgb/other.png", "other/c.png"):
+    pictures = ("a.png", "b.JPG", "e\u0301.png", "other.png")
+    for name in (*(f"scan/rgb/{picture}" for picture in pictures), "other/c.png"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
     (tmp_path / "scan/link").symlink_to(tmp_path / "other")
@@ -26,6 +27,7 @@ def root(tmp_path: Path) -> Path:
         ("rgb/a", "rgb/a.png", False),
         ("rgb/b", "rgb/b.JPG", False),
         ("rgb\\a.png", "rgb/a.png", False),
+        ("rgb/\u00e9.png", "rgb/e\u0301.png", True),
         ("RGB/A.png", "rgb/a.png", True),
         ("rgb/b.png", "rgb/b.JPG", True),
         ("link/c.png", "link/c.png", False),

@@ -61,7 +61,9 @@ def test_without_2_the_1_are_the_test_split(folder, log):
     (folder / "rgb" / "2_003.png").unlink()
     scene = nsvf.load(folder, log=log)
     assert {split: len(views) for split, views in scene.splits.items()} == {"train": 2, "test": 1}
-    assert "1_* are the test split" in log.messages[0]
+    missing, remark = log.messages
+    assert missing.endswith("poses without a picture: 1, 2_003 is the first")
+    assert "1_* are the test split" in remark
 
 
 @pytest.mark.parametrize(("name", "further"), [("Mic", 1.2), ("Lego", 1.1), ("Chair", 1.0)])

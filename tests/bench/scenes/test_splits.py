@@ -33,7 +33,7 @@ def test_a_missing_picture_does_not_move_the_others(log):
         ({"test_filenames": []}, {"train": "012", "test": "3"}, "in no list, left out: 2"),
         ({"train_filenames": None}, {"train": "012", "val": "3", "test": "45"}, "3 train"),
         ({"val_filenames": ["9.png", "0"]}, {"val": "0"}, "left out: 1; no pictures: 9"),
-        ({"test_filenames": ["0", "5"]}, {"test": "05"}, "1 of them in train and test"),
+        ({"test_filenames": ["0", "5"]}, {"test": "05"}, "3 train, 1 val, 2 test"),
     ],
 )
 def test_lists_are_obeyed_and_counted(change, splits, said, log):
@@ -45,7 +45,7 @@ def test_lists_are_obeyed_and_counted(change, splits, said, log):
 
 @pytest.mark.parametrize("text", ["# of the paper\n1.png\n4\n\n", "/a/images/1.jpg\n./4"])
 def test_a_file_of_names_goes_before_the_lists_of_the_capture(tmp_path, log, text):
-    for name, split, others in (("mine.txt", "test", "train"), ("train_1.txt", "train", "test")):
+    for name, split, others in (("mine.txt", "test", "train"), ("Train_1.txt", "train", "test")):
         (tmp_path / name).write_text(text)
         for root, given in ((tmp_path, name), (Path(), str(tmp_path / name))):
             lists = read_lists(root, given, {"test_filenames": ["0"]}, Path())

@@ -126,18 +126,25 @@ def test_missing_pictures_are_named_once_and_left_out(folder, log):
     assert message.endswith(left_out)
 
 
+def test_a_picture_in_train_and_in_test_is_named(folder, log):
+    edit_json(folder / "transforms.json", of_picture(1, file_path="./images/000.png"))
+    transforms.load(folder, log=log)
+    assert log.messages[0].startswith(f"in train and test: 1 pictures, {folder}/images/000.png")
+
+
 BLACK = np.where(np.arange(8) < 3, 0, np.full((6, 8), 9)).astype(np.uint8)  # hides three columns
 
 
-@pytest.mark.parametrize("beside", [False, True], ids=["mask_path", "dynamic_mask"])
-def test_masked_pixels_do_not_count(folder, log, beside):
+@pytest.mark.parametrize("where", ["dynamic_mask", "m.png", "m.jpg"])
+def test_masked_pixels_do_not_count(folder, log, where):
     before = transforms.load(folder, log=log)
-    if beside:
+    if where == "dynamic_mask":
         white = Image.fromarray(np.where(BLACK == 0, 255, 0).astype(np.uint8))
         white.save(folder / "images" / "dynamic_mask_008.png")
     else:
-        Image.fromarray(BLACK).save(folder / "m.png")
-        edit_json(folder / "transforms.json", of_picture(8, mask_path="m.png"))
+        bright = 25 if where == "m.jpg" else 1  # its black is nearly black
+        Image.fromarray(bright * BLACK).save(folder / where, quality=70)
+        edit_json(folder / "transforms.json", of_picture(8, mask_path=where))
     scene = transforms.load(folder, log=log)
     assert scene.splits["test"].mask(0) is None is scene.splits["train"].mask(0)
     assert torch.equal(scene.splits["test"].mask(1), torch.from_numpy(BLACK > 0))
@@ -181,6 +188,18 @@ def test_the_cube_is_that_of_instant_ngp(folder, log, given, override, side, y):
     # Picture 0 was taken from (0, -4, 0): scale x + offset in instant-ngp's cube of side 1.
     expected = torch.tensor([0.5, y - 4 / side, 0.5])
     torch.testing.assert_close(scene.splits["test"].cameras[0].c2w[:, 3], expected)
+
+
+def test_an_object_in_a_file_without_a_cube_is_where_the_cameras_are(folder, log):
+    def change(record: dict) -> None:
+        del record["aabb_scale"]
+        for frame in record["frames"]:
+            frame["transform_matrix"][0][3] += 40
+
+    edit_json(folder / "transforms.json", change)
+    scene = transforms.load(folder, space="box", log=log)
+    eyes = torch.stack([camera.c2w[:, 3] for camera in scene.splits["train"].cameras])
+    assert ((eyes > -0.1) & (eyes < 1.1)).all()
 
 
 def test_in_all_of_space_the_box_is_the_middle_half_of_the_cube(folder, log):

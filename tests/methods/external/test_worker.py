@@ -54,6 +54,7 @@ FAULTS = {
         r"answered 'render' with rgb \[3, 2, 3\], expected rgb \[32, 40, 3\]",
     ),
     "no picture": ("render", 'channel.send("render", ns=1)', "rgb none, expected"),
+    "bytes as floats": ("render", PICTURE % (127.0, 1), "mean of 127, expected rgb in"),
     "not a number": ("render", PICTURE % ("np.nan", 1), "1280 pixels that are NaN or infinite"),
     "negative time": ("render", PICTURE % ("0.5", -1), "ns -1, expected ns above 0"),
     "more in its stages than in the frame": (
