@@ -143,7 +143,7 @@ def test_masked_pixels_do_not_count(folder, log, where):
         white.save(folder / "images" / "dynamic_mask_008.png")
     else:
         bright = 25 if where == "m.jpg" else 1  # its black is nearly black
-        Image.fromarray(bright * BLACK).save(folder / where, quality=70)
+        Image.fromarray(bright * BLACK).save(folder / where, quality=50)
         edit_json(folder / "transforms.json", of_picture(8, mask_path=where))
     scene = transforms.load(folder, log=log)
     assert scene.splits["test"].mask(0) is None is scene.splits["train"].mask(0)
