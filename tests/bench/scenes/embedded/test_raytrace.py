@@ -9,7 +9,7 @@ from bench.cameras import cast
 from bench.scenes.embedded import raytrace
 from bench.scenes.embedded.models import cloud, totem, wires
 from bench.scenes.embedded.raytrace import LIGHT, Ball, Media, Part, Solids, render, sample_offsets
-from bench.scenes.embedded.solids import Capsule, Carved, Ellipsoid
+from bench.scenes.embedded.solids import Carved, Ellipsoid
 from bench.scenes.embedded.textures import plain
 from bench.types import EMPTY_ALPHA, Camera
 from tests.bench.scenes.conftest import camera_at
@@ -30,19 +30,13 @@ def test_16_samples_stand_for_the_16_quarter_pixel_cells():
     assert sample_offsets(1).tolist() == [[0.5, 0.5]]
 
 
-def test_silhouettes_of_a_sphere_and_a_thin_wire_have_their_closed_form_areas():
+def test_the_silhouette_of_a_sphere_has_its_closed_form_area():
     camera = camera_at((0.0, -4.0, 0.0))
     alpha = render(Solids([sphere(0.8)]), camera, samples=16).alpha
     radius = camera.fx * math.tan(math.asin(0.8 / 4))
     # Only quarter-pixel cells that the outline crosses can be counted wrongly, half either way.
     diagonal = math.sqrt(2) / 4
     assert abs(alpha.sum().item() - math.pi * radius**2) <= 2 * math.pi * radius * diagonal
-    camera = camera_at((0.0, -4.0, 0.0), size=400)
-    alpha = render(Solids([Part(Capsule(0.006, 1.0), RED)]), camera, 16).alpha
-    width = 2 * camera.fx * math.tan(math.asin(0.006 / 4))
-    rows = alpha[150:250].sum(1)
-    # Sixteen columns of samples a pixel: each border is off by 1/16 at most.
-    assert (rows - width).abs().max() <= 2 / 16
 
 
 @pytest.mark.parametrize(
