@@ -19,12 +19,6 @@ from methods.kernels.shade import shade
 NEEDED = (*ply.POSITION, *ply.BASE, "opacity", *ply.SCALE, *ply.ROTATION)
 
 
-@pytest.fixture
-def moved_scene(tiny_scene: Scene) -> Scene:
-    """The unit cube is [-1, 2] x [-2, 1] x [5, 8] of the data set."""
-    return replace(tiny_scene, origin=torch.tensor([-1.0, -2.0, 5.0]), unit_length=3.0)
-
-
 def some(count: int = 50, degree: int = 3) -> Gaussians:
     generator = torch.Generator().manual_seed(0)
 
@@ -44,12 +38,13 @@ def some(count: int = 50, degree: int = 3) -> Gaussians:
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_what_is_written_is_read_and_holds_the_coordinates_of_the_data_set(
-    degree, moved_scene, tmp_path
+    degree, tiny_scene, tmp_path
 ):
-    path = tmp_path / "a.ply"
-    given = some(degree=degree)
-    ply.write(given, moved_scene, path)
-    found = ply.read(path, moved_scene, print)
+    """The unit cube is [-1, 2] x [-2, 1] x [5, 8] of the data set."""
+    scene = replace(tiny_scene, origin=torch.tensor([-1.0, -2.0, 5.0]))
+    path, given = tmp_path / "a.ply", some(degree=degree)
+    ply.write(given, scene, path)
+    found = ply.read(path, scene, print)
     for name, value in given.named_parameters():
         # A product and a sum in float32, of numbers below 8.
         torch.testing.assert_close(getattr(found, name), value, rtol=0, atol=8 * 2.0**-22)
