@@ -70,37 +70,28 @@ def test_its_times_are_those_of_the_frame_and_the_pipe_is_beside_them(
     assert (frame.alpha == 1).all()
 
 
-def test_depths_are_converted_to_scene_units(worker, external, moved_scene, quiet_log):
-    lines = """
-    class Deep(Grey):
-        def render(self, camera):
-            size = camera.height, camera.width
-            picture = np.full((*size, 3), 51, np.uint8)
-            return {"rgb": picture, "depth": np.full(size, 6.0), "alpha": np.zeros(size)}
-    """
-    method = external(worker(lines, after="serve(Deep)\n"))
-    method.fit(moved_scene, BUDGET, quiet_log)
-    frame = method.render(moved_scene.splits["test"].cameras[0], NullProbe())
-    torch.testing.assert_close(frame.rgb, torch.full((32, 40, 3), 0.2))
-    assert (frame.depth == 2).all()
-    assert (frame.alpha == 0).all()
-
-
-def test_cameras_are_in_the_units_of_the_data_set(worker, external, moved_scene, quiet_log):
+def test_cameras_and_depths_are_in_the_units_of_the_data_set(
+    worker, external, moved_scene, quiet_log
+):
     lines = """
     class Looks(Grey):
         def render(self, camera):
-            values = [*camera.c2w.flatten(), camera.fx, camera.fy, camera.cx, camera.cy]
-            picture = np.zeros((camera.height, camera.width, 3))
-            picture[0, :16, 0] = values
-            return picture
+            size = camera.height, camera.width
+            lens = camera.fx, camera.fy, camera.cx, camera.cy
+            picture, alpha = np.full((*size, 3), 51, np.uint8), np.zeros(size)
+            alpha[0, :16] = *camera.c2w.flatten(), *lens
+            return {"rgb": picture, "depth": np.full(size, 6.0), "alpha": alpha}
     """
     method = external(worker(lines, after="serve(Looks)\n"))
     method.fit(moved_scene, BUDGET, quiet_log)
     camera = moved_scene.splits["test"].cameras[1]
-    shown = method.render(camera, NullProbe()).rgb[0, :16, 0]
+    frame = method.render(camera, NullProbe())
+    torch.testing.assert_close(frame.rgb, torch.full((32, 40, 3), 0.2))
+    assert (frame.depth == 2).all()
     pose = move_camera(camera, 3.0, moved_scene.origin).c2w.flatten()
-    assert torch.equal(shown, torch.cat((pose, torch.tensor([60.0, 60.0, 20.0, 16.0]))))
+    told = torch.cat((pose, torch.tensor([60.0, 60.0, 20.0, 16.0])))
+    assert torch.equal(frame.alpha[0, :16], told)
+    assert not frame.alpha[1:].any()
 
 
 def test_it_sees_only_training_pictures(worker, external, moved_scene, quiet_log, tmp_path):
