@@ -10,13 +10,15 @@ from methods.engines.torch_engine import TorchEngine
 from methods.steernerf.unet import UNet
 from tests.methods.observations import shaken
 
-NO_BF16 = "BF16" not in _capabilities(OpenVino().import_library("openvino"))
-
+needs_bf16 = pytest.mark.skipif(
+    "BF16" not in _capabilities(OpenVino().import_library("openvino")),
+    reason="no bfloat16 on this CPU",
+)
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="for a machine with a GPU")
 ENGINES = [
-    *((TorchEngine, p) for p in ("fp32", "bf16")),
-    pytest.param(
-        OpenVino, "bf16", marks=pytest.mark.skipif(NO_BF16, reason="no bfloat16 on this CPU")
-    ),
+    *((TorchEngine, p, "cpu") for p in ("fp32", "bf16")),
+    pytest.param(OpenVino, "bf16", "cpu", marks=needs_bf16),
+    *(pytest.param(TorchEngine, p, "cuda", marks=needs_gpu) for p in TorchEngine.precisions),
 ]
 
 TOLERANCE = {"fp32": 1e-5, "bf16": 0.03, "int8": 0.1}
@@ -42,13 +44,13 @@ def assert_close(got: Tensor, want: Tensor, tolerance: float) -> None:
     assert error < tolerance * want.square().mean().sqrt()
 
 
-@pytest.mark.parametrize(("kind", "precision"), ENGINES)
-def test_an_engine_computes_what_the_network_does(kind, precision, build):
+@pytest.mark.parametrize(("kind", "precision", "where"), ENGINES)
+def test_an_engine_computes_what_the_network_does(kind, precision, where, build):
     network, inputs = unet()
-    built = build(kind(precision), network, inputs)
-    with torch.no_grad():
-        for some in inputs:
-            assert_close(built.run(some), network(some), TOLERANCE[precision])
+    wanted, seen = [network(some) for some in inputs], [some.to(where) for some in inputs]
+    built = build(kind(precision), network.to(where), seen)
+    for some, want in zip(seen, wanted, strict=True):
+        assert_close(built.run(some), want, TOLERANCE.get(precision, 0.03))
 
 
 @pytest.mark.parametrize("precision", ["fp32", "int8"])
@@ -108,13 +110,3 @@ def test_a_replay_gives_the_output_of_the_network_and_leaves_the_input_alone(gpu
         assert torch.equal(run(there).cpu(), want)
         assert torch.equal(there.cpu(), picture)
     assert len(run._recordings) == 2  # sizes
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="for a machine with a GPU")
-@pytest.mark.parametrize("precision", TorchEngine.precisions)
-def test_a_gpu_replays_the_outputs_of_the_network(precision, build):
-    network, inputs = unet()
-    wanted, seen = [network(some) for some in inputs], [some.cuda() for some in inputs]
-    built = build(TorchEngine(precision), network.to("cuda"), seen)
-    for some, want in zip(seen, wanted, strict=True):
-        assert_close(built.run(some), want, TOLERANCE.get(precision, 0.03))
