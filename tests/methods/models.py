@@ -74,3 +74,12 @@ def new_pipeline(**options: Any) -> Pipeline:
     field = misty_field(channels=model.channels)
     unet = UNet(model.channels, model.frames, model.scale, width=4, aligned=True)
     return Pipeline(trained_field(field), torch.ones(3), unet, model)
+
+
+def shaken(renderer: UNet) -> UNet:
+    """The renderer with no weight that is 0, as after some training."""
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in renderer.parameters():
+            parameter.add_(0.02 * torch.randn(parameter.shape, generator=generator))
+    return renderer

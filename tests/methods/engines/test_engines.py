@@ -8,7 +8,7 @@ from bench.errors import Unavailable
 from methods.engines.openvino_engine import OpenVino, _capabilities
 from methods.engines.torch_engine import TorchEngine
 from methods.steernerf.unet import UNet
-from tests.methods.observations import shaken
+from tests.methods.models import shaken
 
 needs_bf16 = pytest.mark.skipif(
     "BF16" not in _capabilities(OpenVino().import_library("openvino")),
