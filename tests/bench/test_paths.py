@@ -69,14 +69,6 @@ def test_a_path_comes_back_as_it_was_written(scene, tmp_path, asked, lens, shift
         assert found == pytest.approx(wanted)
 
 
-def test_a_key_frame_of_the_viewer_is_read_as_nerfstudio_means_it(scene, tmp_path):
-    (camera,) = read_path(stored(tmp_path, viewer(keyframe())), scene, Remarks())
-    # 90 degrees from top to bottom: the focal length is half the height. y and z change signs.
-    assert (camera.fx, camera.fy) == pytest.approx((15, 15))
-    expected = torch.tensor([[1.0, 0, 0, 1.0], [0, -1, 0, 0.5], [0, 0, -1, 2.0]])
-    torch.testing.assert_close(camera.c2w, expected)  # (3, 0, 8) of the data set
-
-
 def test_a_transforms_file_gives_intrinsics_or_leaves_them_to_the_test_camera(scene, tmp_path):
     pose = [[1.0, 0, 0, 3], [0, 1, 0, 0], [0, 0, 1, 8], [0, 0, 0, 1]]
     given = {"fl_x": 30.0, "fl_y": 31.0, "cx": 9.0, "cy": 14.0}
@@ -156,7 +148,7 @@ STILL = keyframe(camera_to_world=(torch.cat(POSE, 1) * torch.tensor([1, -1, -1, 
 @pytest.mark.parametrize(
     ("record", "fy", "said"),
     [
-        (viewer(MOVED), 15, "those of a model, moved back as"),
+        (viewer(MOVED), 15, "those of a model, moved back as"),  # 90 degrees from top to bottom
         (viewer(STILL), 15, "those of the data set"),
         ({"loop": True, "path": [in_the_cube()]}, 12, "not read: slice$"),
         ([listed()], 21, "^$"),
@@ -179,8 +171,10 @@ def test_poses_in_coordinates_of_other_programs_come_back(scene, tmp_path, recor
 def test_a_model_is_told_or_asked_for(scene, tmp_path):
     file, model = stored(tmp_path, viewer(MOVED)), tmp_path / "model.json"
     model.write_text(json.dumps(SAVED))
-    asked = follow(scene, str(file)).notes[0]
-    assert asked.endswith("or trajectory.transforms=FILE")
+    asked = follow(scene, str(file))
+    assert asked.notes[0].endswith("or trajectory.transforms=FILE")
+    centre = (torch.tensor(in_a_model())[:3, 3] - scene.origin) / 4  # poses as they are
+    torch.testing.assert_close(asked.steps[0].camera.c2w[:, 3], centre)
     told = follow(scene, str(file), transforms=str(model))
     assert told.reads == (file, model)
     assert "moved back as" in told.notes[0]
