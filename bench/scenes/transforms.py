@@ -79,9 +79,9 @@ def load(
     2 * split_every ... by name are the test split, the others train.
 
     `aabb_scale` is the side of the box relative to that of instant-ngp, x * 0.33 + 0.5, whose
-    numbers `scale` and `offset` replace; by default the value in the file, or 1; where that is
-    larger, the box is that of the visual hull of the training masks. In all of space, it is not
-    needed.
+    numbers `scale` and `offset` replace; by default the value in the file, or 1. Where that is
+    larger, the box is that of the visual hull of the training masks; so it is, within the box of
+    the cameras, where the file has none of the three. In all of space, it is not needed.
 
     Intrinsics of a frame take precedence over those of the file. Lens distortion is undone, and
     pictures are cropped to what the lens saw. Frames without a picture are logged and left out.
