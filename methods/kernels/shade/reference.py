@@ -2,11 +2,7 @@
 
 from torch import Tensor
 
-from methods.kernels.spherical import spherical_harmonics
-
-
-def harmonics(directions: Tensor) -> Tensor:
-    return spherical_harmonics(directions)
+from methods.kernels.spherical import spherical_harmonics as harmonics
 
 
 def shade(coefficients: Tensor, directions: Tensor) -> Tensor:
