@@ -53,11 +53,9 @@ class NerfField(NetworkField):
             if number == SKIP:
                 hidden = torch.cat((encoded.to(hidden.dtype), hidden), dim=1)
             hidden = layer(hidden).relu_()
-        raw = self.opacity(hidden)[:, 0].to(positions.dtype)
-        return DENSITY * density_of(raw), hidden
+        return DENSITY * density_of(self.opacity(hidden)[:, 0].to(positions.dtype)), hidden
 
-    def encode_directions(self, directions: Tensor) -> Tensor:
-        return encode_directions(directions)
+    encode_directions = staticmethod(encode_directions)
 
     def colours_together(self, geometry: Tensor, encoded: Tensor) -> Tensor:
         # No activation separates the bottleneck and the layer that sees the direction: one product
