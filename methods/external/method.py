@@ -64,11 +64,9 @@ class External:
     @property
     def _typed(self) -> list[str]:
         """The words of the command; files are those beside the YAML, or in the current folder."""
-        words = _words("method.command", self.command)
-        places = [[str(Path(folder) / word) for folder in self.folders] for word in words]
         return [
-            next(filter(os.path.isfile, of_word), word)
-            for word, of_word in zip(words, places, strict=True)
+            next(filter(os.path.isfile, (str(Path(at) / word) for at in self.folders)), word)
+            for word in _words("method.command", self.command)
         ]
 
     @cached_property
@@ -131,10 +129,8 @@ class External:
         try:
             words = _words("method.lock", self.lock)
             done = subprocess.run(words, capture_output=True, text=True, check=True)
-        except OSError as error:
-            raise SteerbenchError(f"method.lock: {self.lock}: {error.strerror}") from error
-        except subprocess.CalledProcessError as error:
-            why = error.stderr.strip()[-200:]
+        except (OSError, subprocess.CalledProcessError) as error:
+            why = error.strerror if isinstance(error, OSError) else error.stderr.strip()[-200:]
             raise SteerbenchError(f"method.lock: {self.lock}: {why}") from error
         return {"lock": done.stdout}
 
@@ -164,7 +160,6 @@ class External:
                 self._load({**job, "state": None}, log)
             return
         folder = log.stage_dir("external", self._key(job))
-        stored = {**job, "state": str(folder / "state")}
         finished = folder / "trained.json"
         with missing(finished, log) as untrained:
             if untrained:
@@ -177,7 +172,7 @@ class External:
                 log.info(f"{self.name}: found in {folder}")
                 self.train_s = read_record(finished)["train_s"]
         if "load" in can:
-            self._load(stored, log)
+            self._load({**job, "state": str(folder / "state")}, log)
 
     def _load(self, job: Mapping[str, object], log: Log) -> None:
         told, _ = self._worker.ask("load", self.start_s, job)
