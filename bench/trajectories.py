@@ -123,10 +123,9 @@ def jump(
 ) -> Trajectory:
     """The smooth path, cut into pieces of `every` frames, in a fixed order that none follows on."""
     steps, part = _smooth_steps(scene, split, degrees, limit)
-    if not 1 <= every < len(steps):
-        allowed = f"1 to {len(steps) - 1}, fewer than the {len(steps)} frames of the path"
-        got = f"{every}; trajectory.limit=0 takes all cameras"
-        raise unexpected("trajectory.every", allowed, got)
+    allowed = f"1 to {len(steps) - 1}, fewer than the {len(steps)} frames of the path"
+    got = f"{every}; trajectory.limit=0 takes all cameras"
+    _check(1 <= every < len(steps), "every", allowed, got)
     jumps: list[Step] = []
     for piece in _shuffled(-(-len(steps) // every)):
         first, *others = steps[piece * every : (piece + 1) * every]
@@ -254,8 +253,7 @@ def spline(
     whole_number(keys, "trajectory.keys", 2)
     through = follow(scene, path) if path else from_split(scene, split, keys)
     first, *others = through.steps
-    cameras = [step.camera for step in through.steps]
-    pieces = leading(cameras, viewing_target(scene), degrees)
+    pieces = leading([step.camera for step in through.steps], viewing_target(scene), degrees)
     steps = [first]
     for key, piece in zip(others, pieces, strict=True):
         steps += [*(Step(camera, truth=None) for camera in piece[:-1]), replace(key, cut=False)]
