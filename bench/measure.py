@@ -188,8 +188,7 @@ def _measurement(
     method, scoring, sizes = take.method, take.scoring, take.method.sizes()
     peak_bytes, source = take.peak(in_turns)
     records, means = take.timed(len(take.clock.frames) - protocol.rounds * len(take.rows))
-    costs = map(_costs, records)
-    rows_of_frames = [row | cost for row, cost in zip(take.rows, costs, strict=True)]
+    rows_of_frames = [row | _costs(timed) for row, timed in zip(take.rows, records, strict=True)]
     frames = _frame_table(rows_of_frames, scoring.names)
     of_phases = ((phase, frames[frames["phase"] == phase]) for phase in (STEADY, COLD))
     whole: dict[str, float] = {}
