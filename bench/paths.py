@@ -211,8 +211,7 @@ def write_path(
     one of NerfBaselines if that is asked for, or the viewer has no words for a lens."""
     moved = [data_camera(scene, camera) for camera in cameras]
     form = _nerfbaselines if nerfbaselines or not all(map(_plain, cameras)) else _viewers
-    record = form(moved, fps)
-    path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    path.write_text(json.dumps(form(moved, fps), indent=1) + "\n", encoding="utf-8")
 
 
 def _plain(camera: Camera) -> bool:

@@ -53,8 +53,7 @@ def read_points(file: Path) -> np.ndarray:
 
 def _lines(file: Path) -> Iterator[tuple[str, str]]:
     """The lines of a text but comments, and where they are."""
-    lines = read_text(file).split("\n")
-    for number, line in enumerate(map(str.strip, lines), start=1):
+    for number, line in enumerate(map(str.strip, read_text(file).split("\n")), start=1):
         if not line.startswith("#"):
             yield f"{file}: line {number}", line
 
