@@ -86,8 +86,7 @@ def render(model: SceneModel, camera: Camera, samples: int) -> Frame:
         band = Band(camera.c2w[:, 3], camera.c2w[:, :3], x[None], y[top:bottom, None])
         for picture, seen in zip((rgb, alpha, depth), model.trace(band, spans), strict=True):
             picture[top:bottom] = seen.mean(2)
-    empty = alpha < EMPTY_ALPHA
-    depth = (depth / alpha.clamp(min=EMPTY_ALPHA)).masked_fill(empty, math.inf)
+    depth = (depth / alpha.clamp(min=EMPTY_ALPHA)).masked_fill(alpha < EMPTY_ALPHA, math.inf)
     return Frame(rgb, depth, alpha)
 
 

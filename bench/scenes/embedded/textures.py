@@ -102,8 +102,7 @@ def noise(points: Tensor) -> Tensor:
     # Trilinear at smoothstep coordinates, which avoids creases at the borders of cells.
     place = (cell + part * part * (3 - 2 * part)) / (table.shape[-1] - 1)
     place = (place - place.floor()) * 2 - 1  # [-1, 1] spans the table from first to last vertex
-    sampled = grid_sample(table[None, None], place[None, None, None], align_corners=True)
-    return sampled.reshape(-1)
+    return grid_sample(table[None, None], place[None, None, None], align_corners=True).reshape(-1)
 
 
 @cache
@@ -115,8 +114,7 @@ def lattice() -> Tensor:
 
 def pick(condition: Tensor, first: Colour, second: Colour) -> Tensor:
     """`first` where `condition` [N], else `second`: [N, 3]."""
-    palette = torch.tensor((second, first))
-    return palette[condition.long()]
+    return torch.tensor((second, first))[condition.long()]
 
 
 def mix(share: Tensor, first: Colour, second: Colour) -> Tensor:
