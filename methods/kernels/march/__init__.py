@@ -77,8 +77,7 @@ def march(
     limit = longest_ray(step) if limit is None else limit
     expect(limit >= 1, "limit", "1 or more", limit)
     segments = Segments(rays, step, window, jitter, start, limit)
-    kernel = implementation(__name__, backend, rays.origins.device)
-    return kernel.march(segments, occupancy)
+    return implementation(__name__, backend, rays.origins.device).march(segments, occupancy)
 
 
 def longest_ray(step: float) -> int:
