@@ -209,9 +209,8 @@ def _given(
 def _ray(sigma: Tensor, delta: Tensor, values: Tensor, t: Tensor, dtype: torch.dtype) -> Given:
     """Samples of a single ray."""
     samples = {"sigma": sigma, "values": values, "t": t, "delta": delta}
-    counts = torch.tensor([len(sigma)])
     rounded = {name: x.to(dtype) for name, x in samples.items()}
-    return rounded | {"counts": counts, "carry": None, "stop": 0.0}
+    return rounded | {"counts": torch.tensor([len(sigma)]), "carry": None, "stop": 0.0}
 
 
 def _extreme_error(

@@ -100,8 +100,7 @@ def cases() -> list[Case]:
         ("random, packed", LARGE, _random(VIEW), True),
     ):
         make, items = partial(_given, positions, grid, packed), VIEW if grid is LARGE else None
-        precision = "bf16" if packed else "fp32"
-        found += ENCODE.cases(name, make, precision=precision, items=items)
+        found += ENCODE.cases(name, make, precision="bf16" if packed else "fp32", items=items)
     return [*found, *_extremes()]
 
 
