@@ -161,8 +161,7 @@ def _harmonics(field: Field, voxels: Voxels, degree: int, directions: int) -> Te
     """Coefficients [V, C, 3], fitted by least squares to the logits of the colours at the centres
     of the voxels, in `directions` evenly spread directions."""
     towards = fibonacci_sphere(directions).to(voxels.coordinates.device)
-    harmonics = spherical_harmonics(towards)
-    basis = harmonics[:, : (degree + 1) ** 2].double()
+    basis = spherical_harmonics(towards)[:, : (degree + 1) ** 2].double()
     solve = torch.linalg.pinv(basis).float()  # [C, D], the same for all voxels
     encoded = field.encode_directions(towards)
     found = []

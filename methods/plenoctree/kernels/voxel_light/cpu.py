@@ -67,8 +67,7 @@ def shade_voxels(
     harmonics: Tensor, voxel: Tensor, ray: Tensor, directions: Tensor, grad_buffer: Tensor | None
 ) -> Tensor:
     check_float32(harmonics, directions)
-    basis = basis_of(directions)
-    return _ShadeVoxels.apply(harmonics, voxel, ray, basis, grad_buffer)
+    return _ShadeVoxels.apply(harmonics, voxel, ray, basis_of(directions), grad_buffer)
 
 
 class _ShadeVoxels(torch.autograd.Function):

@@ -36,5 +36,4 @@ def shade_voxels(
 ) -> Tensor:
     if grad_buffer is not None:
         harmonics.register_hook(grad_buffer.add_)
-    towards = directions[ray.long()]
-    return shade(harmonics[voxel.long()], towards, backend="reference").sigmoid()
+    return shade(harmonics[voxel.long()], directions[ray.long()], backend="reference").sigmoid()
