@@ -136,10 +136,9 @@ def render_rays(
     parts = []
     for first in range(0, max(len(rays.origins), 1), size):
         chunk = slice(first, first + size)
-        window = None if how.window is None else how.window[chunk]
-        chunk_how = replace(how, window=window)
-        some = rays.take(chunk)
-        some = Rays(some.origins.contiguous(), some.directions)  # once; kernels want them so
+        chunk_how = replace(how, window=None if how.window is None else how.window[chunk])
+        # Contiguous, as kernels want them; once.
+        some = Rays(rays.origins[chunk].contiguous(), rays.directions[chunk])
         parts.append(_render_chunk(field, some, occupancy, probe, chunk_how).columns)
     return Pixels(*map(cat, zip(*parts, strict=True)))
 
