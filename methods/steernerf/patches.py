@@ -123,8 +123,7 @@ class Patches:
         top, left = (self._random(size - side + 1) for size in (view.low.height, view.low.width))
         cut = view.crop((slice(top, top + side), slice(left, left + side)))
         truth = self._truth(example, top, left, cut.full)
-        points = [cloud.shown_in(cut.full) for cloud in example.buffer]
-        return Patch(example, cut, truth, points)
+        return Patch(example, cut, truth, [cloud.shown_in(cut.full) for cloud in example.buffer])
 
     def _truth(self, example: Example, top: int, left: int, full: Camera) -> Tensor:
         """The true picture [H, W, 3] of the patch. Beyond the border of a picture whose sides are
@@ -155,14 +154,12 @@ class Patches:
             occupancy = self.pipeline.occupancy
             how = self.rendering.sampling(occupancy.contracted)
             pixels, _ = render_batch(field, rays, occupancy, how, jitter=jitter)
-            ends = accumulate(map(len, chosen))
             rendered = (  # in the order of `_to_render`
                 (some, pixels.take(slice(end - len(some), end)))
-                for some, end in zip(chosen, ends, strict=True)
+                for some, end in zip(chosen, accumulate(map(len, chosen)), strict=True)
             )
             observations = [self._observation(patch, rendered) for patch in patches]
-        truth = torch.stack([patch.truth for patch in patches])
-        return Batch(observations, truth, pixels.alpha)
+        return Batch(observations, torch.stack([patch.truth for patch in patches]), pixels.alpha)
 
     def _to_render(self, patch: Patch) -> Iterator[tuple[Camera, Tensor]]:
         """Cameras, and which of their pixels [h w] are rendered: of the present frame, those that

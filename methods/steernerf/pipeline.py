@@ -93,10 +93,8 @@ class Pipeline:
         how, reduction = rendering.sampling(self.occupancy.contracted), rendering.range
         if preceding and reduction.mode == "paper":
             with probe.stage("depth_reprojection"):
-                expected = reduction.depth == "expected"
-                cloud = preceding[0].expected() if expected else preceding[0]
-                near_far = cloud.interval(view.low, reduction.epsilon)
-                how = replace(how, window=near_far.view(-1, 2))
+                cloud = preceding[0].expected() if reduction.depth == "expected" else preceding[0]
+                how = replace(how, window=cloud.interval(view.low, reduction.epsilon).view(-1, 2))
         with probe.stage("field"):
             where = self.occupancy if rendering.skip.empty else self._cube
             render = everywhere(self.field, where, probe, how)
@@ -118,8 +116,7 @@ class Pipeline:
         drawn = view.crop(part)
         pixels, every = (seen.full.width * seen.full.height for seen in (drawn, view))
         probe.count("drawn_pixels", pixels, every)
-        points = [cloud.shown_in(drawn.full) for cloud in preceding]
-        return Observation(frame, points, part)
+        return Observation(frame, [cloud.shown_in(drawn.full) for cloud in preceding], part)
 
     @cached_property
     def _cube(self) -> Occupancy:

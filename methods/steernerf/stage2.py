@@ -63,8 +63,7 @@ def train_stage2(
     key of its weights, and the seconds and the peak memory of stage 2 up to them."""
     model, joint, steps = stage2.model, stage2.joint, budget.renderer_steps
     key = {**setup.key(scene, budget), **stage2.key(budget)}
-    folder = log.stage_dir("steernerf", key)
-    finished = folder / "steernerf.safetensors"
+    finished = log.stage_dir("steernerf", key) / "steernerf.safetensors"
     count = 0 if finished.exists() else joint.distilled(steps)
     # These show the field of stage 1, which is changed from here on.
     meter = MemoryMeter(str(setup.device))

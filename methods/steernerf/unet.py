@@ -97,8 +97,7 @@ class UNet(nn.Module):
         by less than a grey level, but such a line across a white background costs 0.01 of LPIPS."""
         rgb = shown.frame.values[..., :3].permute(2, 0, 1)[None]
         size = [self.scale * side for side in rgb.shape[2:]]
-        corners = not self.aligned
-        base = functional.interpolate(rgb, size, mode="bilinear", align_corners=corners)
+        base = functional.interpolate(rgb, size, mode="bilinear", align_corners=not self.aligned)
         picture, inside, drawn = base[0].permute(1, 2, 0).contiguous(), [], []
         for one, side in zip(shown.part, rgb.shape[2:], strict=True):
             begin, end, _ = one.indices(side)
