@@ -79,8 +79,7 @@ class CornerModel(nn.Module):
         few = f"at most the {CHANNELS} channels of a corner: choose fewer levels or features"
         expect(field.grid.channels <= CHANNELS, "grid", few, field.grid.channels)
         coordinates = occupied_voxels(teacher.occupancy, resolution)
-        decoder = Decoder(generator).to(field.device)
-        model = cls(coordinates, resolution, decoder, field.backend)
+        model = cls(coordinates, resolution, Decoder(generator).to(field.device), field.backend)
         positions = model.vertices / resolution
         features = encode(positions, field.table, field.grid, backend=field.backend)
         model.table[:, : features.shape[1]] = features / features.std().clamp(min=1e-8)

@@ -128,8 +128,7 @@ class PixelTraining(loop.Training, ABC):
         pixels, samples = self._render(rays, jitter, background)
         each = (pixels.values - target).square().mean(dim=1)
         loss = each.mean()
-        entropy = opacity_entropy(pixels.alpha)
-        (loss + self.options.opacity_entropy * entropy).backward()
+        (loss + self.options.opacity_entropy * opacity_entropy(pixels.alpha)).backward()
         if self.errors is not None:
             self.errors.learn(numbers, each.detach())
 

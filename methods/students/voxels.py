@@ -49,6 +49,5 @@ def largest_weights(
     for first in range(0, most, CHUNK_RAYS):
         some, _ = batches.draw(min(CHUNK_RAYS, most - first), generator)
         crossings = walk(some, voxels, backend=backend)
-        weight = weigh(some, crossings)
-        largest.scatter_reduce_(0, crossings.voxel.long(), weight, "amax")
+        largest.scatter_reduce_(0, crossings.voxel.long(), weigh(some, crossings), "amax")
     return largest

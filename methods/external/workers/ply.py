@@ -44,8 +44,7 @@ class Ply:
         far = corners.abs().max() > ply.FAR * (high - low).max()
         self.origin = low if far else torch.zeros_like(low)  # float32 has few digits far from it
         scene = Scene("", {}, self.background, everywhere, 1.0, digest="", origin=self.origin)
-        gaussians = ply.read(Path(self.files[0]), scene, self.notes.append)
-        self.gaussians = gaussians.to(self.device)
+        self.gaussians = ply.read(Path(self.files[0]), scene, self.notes.append).to(self.device)
 
     @torch.no_grad()
     def render(self, camera: Camera) -> dict[str, torch.Tensor]:
