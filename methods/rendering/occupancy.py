@@ -91,7 +91,6 @@ class DensityGrid:
         self.occupancy = Occupancy(cells, contracted)
 
     def restore(self, density: Tensor) -> None:
-        """Restore the density of a checkpoint."""
         self.density.copy_(density)
         self._threshold()
 
