@@ -86,28 +86,22 @@ def pooled(found: Sequence[Measured]) -> list[Measured]:
         groups.setdefault(each.line.group, {})[each.line.settings] = each
     lines = dict.fromkeys(each.line.settings for each in found)
     common = [line for line in lines if all(line in group for group in groups.values())]
-    pace = dict.fromkeys(groups, 1.0)
     if common:
-        times = {name: group[common[-1]].ms for name, group in groups.items()}
-        usual = statistics.median_low(times.values())
-        pace = {name: usual / ms for name, ms in times.items()}
+        usual = statistics.median_low(group[common[-1]].ms for group in groups.values())
+        for group in groups.values():
+            pace = usual / group[common[-1]].ms
+            for line, x in group.items():
+                ms, fastest, slowest = pace * x.ms, pace * x.fastest, pace * x.slowest
+                group[line] = replace(x, ms=ms, fastest=fastest, slowest=slowest)
     once = {}
     for line in lines:
-        several = [
-            _paced(group[line], pace[name]) for name, group in groups.items() if line in group
-        ]
+        several = [group[line] for group in groups.values() if line in group]
         middle = statistics.median_low(each.ms for each in several)
         usual_one = next(each for each in several if each.ms == middle)
         ends = min(x.fastest for x in several), max(x.slowest for x in several)
         once[line] = replace(usual_one, fastest=ends[0], slowest=ends[1])
     first = next(iter(once.values())).figure("psnr")
     return [replace(each, lost=first - each.figure("psnr")) for each in once.values()]
-
-
-def _paced(each: Measured, pace: float) -> Measured:
-    times = each.ms, each.fastest, each.slowest
-    ms, fastest, slowest = (pace * time for time in times)
-    return replace(each, ms=ms, fastest=fastest, slowest=slowest)
 
 
 def by_method(found: Iterable[Measured]) -> dict[str, list[Measured]]:
