@@ -224,15 +224,8 @@ def check_settings(
             raise unknown("setting", f"{prefix}{name}", [f"{prefix}{other}" for other in names])
         if isinstance(value, dict) and "_target_" in value:
             check_settings(target_of(value), value, f"{prefix}{name}.")
-        elif not fits(value, hints.get(name, Any)):
-            literal = get_origin(hints[name]) is Literal
-            wanted = " or ".join(map(str, get_args(hints[name]))) if literal else ""
-            wanted = wanted or _as_written(hints[name])
+        elif not fits(value, hint := hints.get(name, Any)):
+            wanted = re.sub(r"\b[a-z_]\w*\.", "", inspect.formatannotation(hint))  # no modules
+            if get_origin(hint) is Literal:
+                wanted = " or ".join(map(str, get_args(hint)))
             raise unexpected(f"{prefix}{name}", wanted, repr(value))
-
-
-def _as_written(annotation: Any) -> str:
-    """A type as its signature has it."""
-    if isinstance(annotation, str):
-        return annotation
-    return re.sub(r"\b[a-z_]\w*\.", "", inspect.formatannotation(annotation))  # without modules
