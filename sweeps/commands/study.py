@@ -17,7 +17,7 @@ from reports.publish import publish
 from reports.runs import load_runs
 from reports.studies import VIEWS, Measured, by_method
 from reports.tables import Table
-from sweeps.execute import Ended, divided, launcher_of, run_jobs
+from sweeps.execute import divided, launcher_of, run_jobs
 from sweeps.studies import StudyJob, jobs_of, subjects
 from sweeps.terminal import say, show
 
@@ -34,7 +34,9 @@ def main(options: argparse.Namespace) -> int:
     jobs = jobs_of(study, found, given)
     outputs = Path(jobs[0].config.outputs)
     ended = run_jobs(jobs, launcher_of([*options.config_dir, *of_hydra], outputs))
-    lines = list(_measured(jobs, ended))
+    done = [(job.line, end.run) for job, end in zip(jobs, ended, strict=True) if end.run]
+    runs = load_runs(jobs[0].store, (key for _, key in done))
+    lines = [Measured.of(line, run) for (line, _), run in zip(done, runs, strict=True)]
     if not lines:
         return 1
     parts = VIEWS[study](lines)
@@ -48,13 +50,6 @@ def main(options: argparse.Namespace) -> int:
     page = publish(_page(options, parts), folder, [line.run for line in lines])
     print(f"report: {page}", file=sys.stderr)
     return int(any(each.failed for each in ended))
-
-
-def _measured(jobs: Sequence[StudyJob], ended: Sequence[Ended]) -> Iterator[Measured]:
-    there = [(job.line, end.run) for job, end in zip(jobs, ended, strict=True) if end.run]
-    runs = {run.key: run for run in load_runs(jobs[0].store, (key for _, key in there))}
-    for line, key in there:
-        yield Measured.of(line, runs[key])
 
 
 def _page(options: argparse.Namespace, parts: Sequence[Part]) -> list[Part]:
