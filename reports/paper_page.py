@@ -12,7 +12,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from reports import figures
-from reports.claims import NOT_MEASURED, Comparison, claim_table, finding_table
+from reports.claims import NOT_MEASURED, claim_table, finding_table
 from reports.images import Part, Picture, frame_section, kept_frames
 from reports.paper_tables import Measured, PaperTable, comparisons, measured_where, section
 from reports.publish import publish
@@ -33,9 +33,12 @@ def write_paper_page(
     left_out = "\n".join(f"- missing: {name}: {why}" for name, why in missing.items())
     sources = "\n".join(f"{run.key}  {run.record['command']}" for run in runs)
     compared = [each for table in tables for each in comparisons(table, measured)]
-    if all(each.here is NOT_MEASURED for each in compared):
-        compared = []
-    every: list[Part] = [f"## {PAGE['comparisons']}", claim_table(compared)] if compared else []
+    findings, every = list[Part](), list[Part]()
+    if any(each.here is not NOT_MEASURED for each in compared):
+        sampled = sum(each.here.proves and each.here.half > 0 for each in compared)
+        verdicts = PAGE["verdicts"].format(sampled=sampled, count=len(compared)).strip()
+        findings += [f"## {PAGE['conclusions']}", finding_table(compared), verdicts]
+        every += [f"## {PAGE['comparisons']}", claim_table(compared)]
     of_paper = any(table.number is not None for table in tables)
     shown = PAGE if of_paper else _of_own(tables)
     title = PAGE["title"] if of_paper else ", ".join(table.title for table in tables)
@@ -45,7 +48,7 @@ def write_paper_page(
     said = {name: value for name, value in facts if " / " not in value}  # once for all tables
     parts: list[Part] = [
         f"# {title}",
-        *_conclusions(compared),
+        *findings,
         *([f"## Scenes that are left out\n\n{left_out}"] if left_out else []),
         "## The tables",
         *reading,
@@ -66,14 +69,6 @@ def _of_own(tables: Sequence[PaperTable]) -> Mapping[str, Any]:
     lines = {line.label: (name, key) for name, key, line in every}
     plots = [{**plot, "lines": lines} for plot in PAGE["plots"] if "metric" in plot]
     return {"plots": plots, "images": [{"title": "Pictures", "lines": lines}]}
-
-
-def _conclusions(found: Sequence[Comparison]) -> Iterator[Part]:
-    """The main findings of the paper beside what was measured here, and how to read verdicts."""
-    sampled = sum(each.here.proves and each.here.half > 0 for each in found)
-    if found:
-        yield from (f"## {PAGE['conclusions']}", finding_table(found))
-        yield PAGE["verdicts"].format(sampled=sampled, count=len(found)).strip()
 
 
 def _plot(
