@@ -58,11 +58,6 @@ class Launcher:
     config: DictConfig
     words: Sequence[str]
 
-    @property
-    def in_process(self) -> bool:
-        """Whether the work is done by this process, one piece after the other."""
-        return self.config.hydra.runtime.choices["hydra/launcher"] == "basic"
-
     def run(self, work: Callable[[W], R], on: Sequence[W]) -> list[R]:
         """The results of `work` on each of the things in `on`.
 
@@ -236,7 +231,8 @@ def run_jobs(jobs: Sequence[Job], launcher: Launcher) -> list[Ended]:
         return scenes.index(job.settings["scene"]), seeds.index(job.settings["seed"])
 
     distinct.sort(key=place)
-    ahead, ended = launcher.in_process and room(jobs) > 1, dict[str, Ended]()
+    in_process = launcher.config.hydra.runtime.choices["hydra/launcher"] == "basic"
+    ahead, ended = in_process and room(jobs) > 1, dict[str, Ended]()
     of_scenes = [list(some) for _, some in groupby(distinct, lambda job: place(job)[0])]
     for some in of_scenes if ahead else [distinct]:
         groups, found = _groups(some, look_up=ahead)
