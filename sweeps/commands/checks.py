@@ -138,12 +138,10 @@ def _of_experiment(first: Row, *others: Row) -> tuple[str, ...]:
     if first["order"] is not None:
         span = f"{_setting(first['order_from'])} to {_setting(first['order_to'])}"
         order = f"{first['order']:.2f} ({span})"
-    figures = zip(*map(_of_trial, (first, *others[-1:])), strict=True)
-    return (first["subject"], first["knob"], *map(" to ".join, figures), order)
-
-
-def _of_trial(row: Row) -> tuple[str, str, str]:
-    return _setting(row["setting"]), f"{row['error']:.1e}", decimal(row["ms"], 2)
+    ends = (first, *others[-1:])
+    figures = [(_setting(x["setting"]), f"{x['error']:.1e}", decimal(x["ms"], 2)) for x in ends]
+    joined = map(" to ".join, zip(*figures, strict=True))
+    return (first["subject"], first["knob"], *joined, order)
 
 
 def _setting(value: float | str) -> str:
