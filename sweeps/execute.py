@@ -70,7 +70,11 @@ class Launcher:
             loader = GlobalHydra.instance().config_loader()
         config = self.config.copy()
         own_folder(config)
-        join_cluster(config)
+        ray = OmegaConf.select(config, "hydra.launcher.ray.init")
+        # Ray's launcher would ask for memory of its own, which a cluster at an address refuses.
+        if ray and ray.get("address"):
+            with open_dict(ray):
+                ray.setdefault("object_store_memory", None)
         try:
             launcher = Plugins.instance().instantiate_launcher(
                 hydra_context=HydraContext(config_loader=loader, callbacks=Callbacks()),
@@ -102,17 +106,6 @@ def own_folder(config: DictConfig) -> None:
     with flag_override(config, ["readonly", "struct"], False):
         config.hydra.sweep.dir = str(folder)
         config.hydra.overrides.hydra.append(setting("hydra.sweep.dir", str(folder)))
-
-
-def join_cluster(config: DictConfig) -> None:
-    """Let Ray's launcher join the cluster at the address in `config`, if there is one.
-
-    It would ask for memory of its own, which a cluster that exists already refuses.
-    """
-    init = OmegaConf.select(config, "hydra.launcher.ray.init")
-    if init and init.get("address"):
-        with open_dict(init):
-            init.setdefault("object_store_memory", None)
 
 
 def divided(words: Sequence[str]) -> tuple[list[str], list[str]]:
