@@ -88,7 +88,7 @@ class Viewer:
     """
 
     def __init__(self, wanted: Sequence[Sequence[str]], host: str, port: int) -> None:
-        viser()  # before any training
+        viser = optional("viser", "viewer", "view")  # before any training
         configs = [composed(words) for words in wanted]
         outputs = Path(configs[0].outputs)
         self.wanted, self.log, self.folder = wanted, ConsoleLog(outputs), outputs / "view"
@@ -98,7 +98,7 @@ class Viewer:
         self.turns, self.browsers = Turns(), dict[Hashable, Browser]()
         self._asked: list[tuple[int, str, Sequence[str]]] = []
         self._turned: list[Mapping[str, Sequence[str]]] = [{} for _ in wanted]
-        self.server = _serve(host, port)
+        self.server = _serve(viser, host, port)
         cameras = self.scene.splits["train"].cameras
         up = -torch.stack([camera.c2w[:, 1] for camera in cameras]).sum(dim=0)
         self.server.scene.set_up_direction(functional.normalize(up, dim=0).double().numpy())
@@ -254,15 +254,10 @@ class Viewer:
         return drawn[names.index(shown)].rgb if shown in names else first
 
 
-def viser() -> Any:
-    """The library that serves the page; raises Unavailable if it is not installed."""
-    return optional("viser", "viewer", "view")
-
-
-def _serve(host: str, port: int) -> ViserServer:
+def _serve(viser: Any, host: str, port: int) -> ViserServer:
     try:
         with redirect_stdout(StringIO()):  # viser would print its address in a box
-            server = viser().ViserServer(host=host, port=port, label="steerbench", verbose=False)
+            server = viser.ViserServer(host=host, port=port, label="steerbench", verbose=False)
     except OSError as error:
         raise SteerbenchError(f"cannot serve {host}:{port}: {error}") from error
     server.gui.configure_theme(show_logo=False, show_share_button=False)
