@@ -52,7 +52,6 @@ class Measured:
 
     @classmethod
     def of(cls, line: StudyLine, run: Run) -> Measured:
-        """What `run`, the run of `line`, says."""
         values = run.values
         ms = values["frame_ms"]
         fastest, slowest = (values.get(f"frame_ms.{end}", ms) for end in ("fastest", "slowest"))

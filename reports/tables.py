@@ -99,7 +99,6 @@ QUALITY = {
         **{f"warp_{k}_own": (f"warping error, {k} apart, own depth", "↓", 5) for k in (1, 7)},
     }.items()
 }
-"""The quality metrics."""
 
 
 def megabytes(size: float | None) -> str:
@@ -108,7 +107,6 @@ def megabytes(size: float | None) -> str:
 
 
 def share(part: float, whole: float) -> str:
-    """`part` as a percentage of `whole`."""
     return f"{decimal(100 * part / whole, 1)} %" if whole else NOT_AVAILABLE
 
 

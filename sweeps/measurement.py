@@ -99,7 +99,6 @@ class Job:
 
     @cached_property
     def key(self) -> str:
-        """Equal for equal jobs."""
         return job_key(self.settings, self.turns)
 
     @property

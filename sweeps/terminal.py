@@ -49,7 +49,6 @@ def show(table: Table, figures: pd.DataFrame | None = None, form: str | None = N
 
 
 def show_run(run: Run, heading: str) -> None:
-    """Print the tables of one run below a heading."""
     tables, out = run_tables(run.rows), console()
     out.print(f"{heading}: run {run.key}", style="bold", markup=False)
     if out.is_terminal:

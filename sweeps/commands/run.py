@@ -73,7 +73,6 @@ def _finish(ended: Sequence[tuple[Job, Ended]], form: str | None) -> None:
 
 
 def _show(runs: Sequence[Run], failed: Mapping[str, str], form: str | None) -> None:
-    """Print the tables of `runs`, in the `form` that is asked for."""
     from reports.comparison import columns_of, comparison
     from reports.lines import as_lines
     from sweeps.terminal import show
