@@ -112,6 +112,7 @@ class CornerModel(nn.Module):
         return self.decoder.state_dict(prefix="decoder.") | own
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Restore what `tensors` returned."""
         self.decoder.load_state_dict(checkpoint.part(tensors, "decoder."))
         device = self.table.device
         self._place(tensors["coordinates"].to(device))

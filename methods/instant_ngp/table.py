@@ -27,6 +27,7 @@ class SuitedGrid(HashGrid):
     """A hash grid whose table is as long as a scene needs it; `log2_table` is not used."""
 
     def of(self, scene: Scene) -> HashGrid:
+        """The grid for `scene`."""
         log2_table = SHORT if detail(scene.splits["train"]) < FINE else LONG
         return HashGrid(**{**asdict(self), "log2_table": log2_table})
 

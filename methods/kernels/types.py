@@ -184,6 +184,7 @@ class Pixels:
         return cls(*(torch.zeros(shape, device=device) for shape in shapes))
 
     def take(self, index: Tensor | slice) -> Pixels:
+        """The rays at `index`."""
         if isinstance(index, slice):
             return Pixels(*(x[index] for x in self.columns))
         return Pixels(*(x.index_select(0, index) for x in self.columns))
@@ -199,6 +200,7 @@ class Pixels:
 
     @property
     def columns(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Values, depth sums and opacities."""
         return self.values, self.depth_sum, self.alpha
 
     def over(self, background: Tensor) -> Pixels:

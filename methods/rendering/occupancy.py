@@ -91,6 +91,7 @@ class DensityGrid:
         self.occupancy = Occupancy(cells, contracted)
 
     def restore(self, density: Tensor) -> None:
+        """Restore the density of a checkpoint."""
         self.density.copy_(density)
         self._threshold()
 

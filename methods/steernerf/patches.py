@@ -85,6 +85,7 @@ class Patches:
         self._side = min(options.patch, -(-shortest // pipeline.model.scale))
 
     def draw(self, count: int) -> Batch:
+        """Draw `count` patches."""
         return self.render([self.cut(self.example()) for _ in range(count)])
 
     def example(self) -> Example:

@@ -28,6 +28,7 @@ class Muon(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
+        """Update the weights by their gradients."""
         for group in self.param_groups:
             for weight in group["params"]:
                 if weight.grad is None:

@@ -44,6 +44,7 @@ class AdamState:
         return {"first": self.first, "second": self.second, "steps": self.steps}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Restore what `tensors` returned."""
         device = self.first.device
         self.first, self.second, self.steps = (tensors[x].to(device) for x in self.tensors())
 
