@@ -138,13 +138,13 @@ def _values(rows: pd.DataFrame, prefix: str = "") -> dict[str, float]:
 def _quality(rows: pd.DataFrame, suffix: str) -> Table:
     columns = (rows[name] for name in ("metric", "value", "lo", "hi", "n"))
     figures = {metric: of for metric, *of in zip(*columns, strict=True)}
-    lines = []
+    scored, lines = figures["psnr"][-1], []
     for metric, shown in QUALITY.items():
-        if metric in figures:
+        if scored and metric in figures:
             value, low, high, _ = figures[metric]
             interval = " – ".join(map(shown.write, (low, high))) if math.isfinite(low) else ""
             lines.append((shown.heading, shown.write(value), interval))
-    title = f"Quality{suffix}, mean of {figures['psnr'][-1]} frames"
+    title = f"Quality{suffix}, mean of {scored} frames"
     return Table(title, ("metric", "mean", "95 % interval"), tuple(lines))
 
 

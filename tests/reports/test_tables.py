@@ -39,6 +39,8 @@ def test_a_run_has_its_quality_time_and_memory(rows):
     }
     untold = tables.run_tables(rows[~rows["metric"].str.startswith("stage_ms.")])
     assert cells(untold[1])["frame"] == ("200.00", "")
+    first, *_ = tables.run_tables(rows.assign(n=0))
+    assert first.title == "Time of a frame"
 
 
 def test_work_stands_beside_what_skipping_nothing_takes(rows):
