@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from bench.errors import SteerbenchError
 from bench.memory import MemoryMeter
 from bench.provenance import digest, libraries
 from bench.types import Budget, Log, Scene
@@ -79,6 +80,9 @@ def train_stage2(
 
     with meter:
         loop.train(training, finished, "training the 2D renderer", log)
+    if not renderer.alive():
+        why = f"the 2D renderer draws nothing but its base: its units died in training ({finished})"
+        raise SteerbenchError(f"{why}. {training.advice}")
     trained.field.requires_grad_(False).gradients = None
     renderer.requires_grad_(False)
     return pipeline, key, training.seconds, training.peak_bytes

@@ -69,6 +69,14 @@ class UNet(nn.Module):
         drawn = zip(observations, corrections, strict=True)
         return _stacked([self._picture(shown, correction) for shown, correction in drawn])
 
+    @torch.no_grad()
+    def alive(self) -> bool:
+        """Whether its corrections depend on what it is shown; they do not if all units of a layer
+        died in training."""
+        weight = self.network.first.weight
+        noise = torch.rand(1, weight.shape[1], 32, 32, generator=torch.Generator().manual_seed(0))
+        return bool(self.network(noise.to(weight)).std((2, 3)).any())
+
     def _input(self, shown: Observation) -> Tensor:
         """What the network is shown, [H', W', K (L + 1)]: the RGB of all frames, newest first, then
         their other features. What is missing after a cold start is zero."""

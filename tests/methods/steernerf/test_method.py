@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from bench.console import ConsoleLog
+from bench.errors import SteerbenchError
 from bench.types import Budget, NullProbe
 from methods.engines import Engine
 from methods.engines.openvino_engine import OpenVino
@@ -139,3 +140,9 @@ def test_settings_that_do_not_fit_are_refused():
     new_method(frames=1, range=RANGED)
     with pytest.raises(ValueError, match=r"range.mode: expected off without .* got paper"):
         new_method(frames=0, range=RANGED)
+
+
+def test_a_training_that_ends_with_a_dead_network_fails(ball_scene, log, monkeypatch):
+    monkeypatch.setattr(UNet, "alive", lambda renderer: False)
+    with pytest.raises(SteerbenchError, match=r"its units died in training .* smaller learning"):
+        new_method().fit(ball_scene, BUDGET, log)

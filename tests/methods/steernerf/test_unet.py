@@ -187,3 +187,10 @@ def test_only_the_part_without_its_border_is_corrected():
     drawn[: 32 - RIM, 32 + RIM : 64 - RIM] = True
     assert torch.equal(added.amax(2) > 0.2, drawn)
     assert added[drawn].min() > 0.2
+
+
+def test_a_network_whose_units_died_is_told_from_one_that_draws():
+    renderer = unet(4, 1, 4, width=4)
+    assert renderer.alive()
+    torch.nn.init.constant_(renderer.network.leave.bias, -1e9)
+    assert not renderer.alive()
