@@ -104,18 +104,22 @@ def _keys(names: Sequence[str]) -> list[str]:
     return [str(path.relative_to(shared)) for path in paths]
 
 
+def below(folder: Path, pattern: str, endings: Sequence[str] = ()) -> list[Path]:
+    """What is in a folder by a `pattern`, with one of the `endings` if there are any, 10 after 9:
+    unlike what Path finds, without what is hidden, and through links."""
+    names = sorted(glob(pattern, root_dir=folder, recursive=True), key=natural)  # noqa: PTH207
+    return [folder / x for x in names if not endings or Path(x).suffix.lower() in endings]
+
+
 def listed(folder: Path) -> list[Path]:
     """The pictures in a folder, if it has none in those below it, 10 after 9; raises if there are
     none, or two names differ in their ending."""
     if not folder.is_dir():
         raise not_there(folder, "a folder")
-    for pattern in ("*", "**/*"):  # unlike those of Path, without what is hidden, and through links
-        below = sorted(glob(pattern, root_dir=folder, recursive=True), key=natural)  # noqa: PTH207
-        files = [folder / name for name in below if Path(name).suffix.lower() in SUFFIXES]
-        if files:
-            break
-    else:
-        raise unexpected(folder, f"pictures ({', '.join(SUFFIXES)})", some(below) or "none")
+    files = below(folder, "*", SUFFIXES) or below(folder, "**/*", SUFFIXES)
+    if not files:
+        others = [path.relative_to(folder).as_posix() for path in below(folder, "**/*")]
+        raise unexpected(folder, f"pictures ({', '.join(SUFFIXES)})", some(others) or "none")
     if wrong := [path for path in files if not str(path).isprintable()]:
         raise unexpected(folder, "names in UTF-8 that can be printed", repr(wrong[0].name))
     stems = [path.relative_to(folder).with_suffix("").as_posix() for path in files]
@@ -138,7 +142,7 @@ def reported_times(file: Path, pairs: Sequence[Pair]) -> list[float]:
     ending, and others are ignored; without, there is one for each picture, in their order. Raises
     SteerbenchError if the file cannot be read, or a time is missing or not above 0.
     """
-    table = read_table(file)
+    table = read_table(file, skipinitialspace=True)
     if "frame_ms" not in table:
         raise unexpected(file, "a column frame_ms", ", ".join(map(str, table)) or "none")
     if "name" in table:

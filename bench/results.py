@@ -223,7 +223,7 @@ def read_table(path: Path, **how: Any) -> pd.DataFrame:
     if not path.is_file():
         raise not_there(path)
     try:
-        return pd.read_csv(path, dtype={"name": "str"}, skipinitialspace=True, **how)
+        return pd.read_csv(path, dtype={"name": "str"}, **how)
     except (OSError, ValueError) as error:
         raise unexpected(path, "a table", " ".join(str(error).split())) from error
 

@@ -121,10 +121,10 @@ def _numbered(work: Callable[[W], R], on: Sequence[W], config: Any) -> R | Excep
     try:
         return work(on[HydraConfig.get().job.num])
     except Exception as error:
-        return portable(error)
+        return picklable(error)
 
 
-def portable(error: Exception) -> Exception:
+def picklable(error: Exception) -> Exception:
     """`error`, or only its message if another process could not read it."""
     try:
         pickle.loads(pickle.dumps(error))
@@ -148,7 +148,7 @@ class Ended:
         return self.error is not None and not isinstance(self.error, Unavailable)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Ended, (self.run, self.measured, self.error and portable(self.error))
+        return Ended, (self.run, self.measured, self.error and picklable(self.error))
 
 
 def attempt(group: Group, total: int, folder: Path, begun: float) -> dict[str, Ended]:
@@ -320,4 +320,4 @@ def _train(config: DictConfig) -> float:
     try:
         return trained(config, log, progress=quiet).train_s
     except Exception as error:
-        raise portable(error) from None
+        raise picklable(error) from None

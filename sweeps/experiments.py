@@ -32,10 +32,13 @@ def axes(method: str) -> dict[str, Axis]:
     found = {}
     for name in choices("experiment"):
         declared = experiment(name)
-        table, of_method = declared.get("table") or {}, {"override /method": method}
-        ways = ((x, of) for x, of in grid(declared).items() if all(map(str.isdecimal, of)))
-        setting, values = next(((x, of) for x, of in ways if x != SEED), ("", []))
-        if "axis" in table and of_method in (declared.get("defaults") or ()) and setting:
-            symbol, sizes = table["axis"], tuple(sorted(map(int, values)))
-            found[symbol] = Axis(table.get("label", f"{symbol} = {{}}"), setting, sizes)
+        table, methods = declared.get("table") or {}, declared.get("defaults") or ()
+        if "axis" not in table or {"override /method": method} not in methods:
+            continue
+        for setting, values in grid(declared).items():
+            if setting != SEED and all(map(str.isdecimal, values)):
+                symbol, sizes = table["axis"], tuple(sorted(map(int, values)))
+                label = table.get("label", f"{symbol} = {{}}")
+                found[symbol] = Axis(label, setting, sizes)
+                break
     return found

@@ -119,8 +119,7 @@ def read_views(root: Path, images: str, folder: Path, masks: Path | None, log: L
         log.info(f"{place}: pictures are paired in the order of names: {first}")
     else:
         report(place, names, files, str(folder), log, False)
-    there = {file for file in place.rglob("*") if bare(file.name) != file.name}
-    if rest := sorted(there - {*files}):
+    if rest := sorted({*pictures_below(place)} - {*files}):
         log.info(f"{folder}: left out as not in it: {len(rest)} pictures, {rest[0]} is the first")
     views: list[tuple[str, View | None]] = []
     for entry, name, file in zip(entries, map(tidy, names), files, strict=True):
@@ -134,6 +133,10 @@ def read_views(root: Path, images: str, folder: Path, masks: Path | None, log: L
     return views
 
 
+def pictures_below(folder: Path) -> list[Path]:
+    return [file for file in folder.rglob("*") if bare(file.name) != file.name]
+
+
 def in_order(full: Path, names: Sequence[str], folder: Path) -> list[Path | None]:
     """The pictures in `folder` in the order of `names`, as LLFF's images_8 are paired with images.
 
@@ -141,8 +144,7 @@ def in_order(full: Path, names: Sequence[str], folder: Path) -> list[Path | None
     not register. Nothing if there are more or fewer, or letters and numbers sort names differently.
     """
     there, every = (
-        sorted(str(file.relative_to(of)) for file in of.rglob("*") if bare(file.name) != file.name)
-        for of in (folder, full)
+        sorted(str(file.relative_to(of)) for file in pictures_below(of)) for of in (folder, full)
     )
     every = every if {*names} <= {*every} else sorted(names)
     sure = all(sorted(of, key=lambda name: natural(bare(name))) == of for of in (there, every))

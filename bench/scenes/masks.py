@@ -51,11 +51,9 @@ class Masks(Pictures):
             return None
         view = picture.view
         levels = decode(picture.mask)[..., :3]
-        lossy = picture.mask.view.path.suffix.lower() in (
-            ".jpg",
-            ".jpeg",
-        )  # its black is nearly black
-        masked = (levels > (levels.max() // 2 if lossy else 0)).any(-1) == view.hides
+        lossy = picture.mask.view.path.suffix.lower() in (".jpg", ".jpeg")
+        black = levels.max() // 2 if lossy else 0  # that of a JPEG is nearly black
+        masked = (levels > black).any(-1) == view.hides
         if view.lens:
             masked = undistort(255 * masked.byte()[..., None], view.camera, view.lens)[..., 0] > 0
         return functional.max_pool2d(masked.float()[None], picture.downscale)[0] == 0

@@ -263,9 +263,8 @@ class External:
                 self._expect(got == list(shape), f"{name} {list(shape)}", f"{name} {got}")
         rgb = torch.from_numpy(arrays["rgb"])
         rgb = rgb / 255 if rgb.dtype == torch.uint8 else rgb.float()
-        if not math.isfinite(
-            total := float(rgb.sum())
-        ):  # which reads the picture once, and writes no other
+        total = float(rgb.sum())  # which reads the picture once, and writes no other
+        if not math.isfinite(total):
             broken = int((~rgb.isfinite()).any(dim=2).sum())
             self._expect(not broken, "finite numbers", f"{broken} pixels that are NaN or infinite")
         mean = total / rgb.numel()

@@ -74,7 +74,7 @@ def score(
     reported = given.reported_times(Path(times), pairs) if times else []
     facts |= {"device": REPORTED} if times else {}
     example = f"{pairs[0].picture.relative_to(folder)} is scored against {pairs[0].name}"
-    others = sum(path.suffix.lower() in given.SUFFIXES for path in folder.rglob("*")) - len(pairs)
+    others = len(given.below(folder, "**/*", given.SUFFIXES)) - len(pairs)
     left = f"; {others} others below {folder} are not scored" if others else ""
     log.info(f"{len(pairs)} pictures, matched by {match}: {example}{left}")
     lpips, missing = protocol.load_lpips(weights, log)
