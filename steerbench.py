@@ -6,7 +6,7 @@
     run.rows  # a DataFrame; in a notebook the run shows its tables
 
 Settings are strings with the same meaning as in `steerbench run`. Errors are `SteerbenchError`s
-with a message for the user.
+with a message for the user. Environment, `sys.argv`, random numbers and threads are left as found.
 
 | name | what it is for |
 |---|---|
@@ -33,6 +33,7 @@ import pandas as pd
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
+from bench.isolation import put_back
 from bench.results import existing_store
 from bench.types import Budget, Camera, Frame, Method, NullProbe, Probe, Scene, Split
 from reports.comparison import columns_of
@@ -73,6 +74,7 @@ __all__ = [
 ]
 
 
+@put_back()
 def run(*settings: str) -> Run:
     """Measure what `settings` describe, unless the store has it already.
 
@@ -98,6 +100,7 @@ class Sweep(NamedTuple):
     table: pd.DataFrame
 
 
+@put_back()
 def sweep(*settings: str) -> Sweep:
     """Measure every combination of `settings`, of which any may have several values: "seed=0,1,2".
 
@@ -118,6 +121,7 @@ def load(key: str, outputs: str | Path = "outputs") -> Run:
     return load_runs(store, [store.whole_key(key)])[0]
 
 
+@put_back()
 def fit(*settings: str) -> Method:
     """Train the method that `settings` describe on its scene, or load its stored stages.
 
@@ -127,6 +131,7 @@ def fit(*settings: str) -> Method:
     return configured.trained(config, ConsoleLog(Path(config.outputs)))
 
 
+@put_back()
 def load_scene(*settings: str) -> Scene:
     """Load the scene of `settings`: "scene=blender", "scene.path=DIR"."""
     return configured.scene_of(composed(settings))

@@ -52,6 +52,7 @@ class Channel:
     def __init__(self, connection):
         self._connection = connection
         self.until = None
+        self.began_ns = 0  # when the last message that was received began to arrive
 
     def send(self, message, arrays=None, **fields):
         """Send a `message` with its `fields`, and `arrays` by name."""
@@ -70,6 +71,7 @@ class Channel:
         no message.
         """
         (length,) = LENGTH.unpack(self._read(LENGTH.size, "between two messages"))
+        self.began_ns = time.perf_counter_ns()
         if length > MOST_HEADER:
             raise ValueError(f"a header of {length} bytes")
         text = self._read(length).tobytes()

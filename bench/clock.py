@@ -5,12 +5,16 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from numbers import Integral
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from bench.errors import SteerbenchError, unexpected
 from bench.types import DEVICE
+
+MOST = 2**63  # from here on a number is none that was measured
 
 OTHER = "other"  # the stage that gets the time of a frame outside any stage
 
@@ -22,8 +26,9 @@ class FrameRecord:
     stages_ns: dict[str, int]  # of each stage and `other`; "outer/inner" is no part of "outer"
     done: dict[str, int]  # units of work by counter
     dense: dict[str, int]  # the work of a method that skips nothing, of counters that report it
-    wall_ns: int | None = None  # by the clock here, until another process told the stages' times
+    wall_ns: int | None = None  # by the clock here, if another process told the stages' times
     peak_bytes: int | None = None  # of the memory of that process, if it told
+    transfer_ns: int = 0  # of the wall time, while the picture arrived
 
     @property
     def total_ns(self) -> int:
@@ -62,9 +67,11 @@ class StageClock:
         try:
             yield
             self._charge()
-            done = {name: int(units) for name, units in self._done.items()}
+            done = {name: counted(name, int(units)) for name, units in self._done.items()}
             record = FrameRecord(dict(self._ns), done, dict(self._dense))
-            self.frames.append(replace(record, **self._told))
+            if self._told:
+                record = replace(record, wall_ns=record.total_ns, **self._told)
+            self.frames.append(record)
         finally:
             self._open = None
 
@@ -87,16 +94,37 @@ class StageClock:
             self._open.pop()
 
     def count(self, name: str, done: int | Tensor, dense: int | None = None) -> None:
-        self._done[name] += done
+        self._done[name] += done if isinstance(done, Tensor) else counted(name, done)
         if dense is not None:
-            self._dense[name] += dense
+            self._dense[name] += counted(f"{name}.dense", dense)
 
-    def report(self, ns: int, stages_ns: Mapping[str, int], peak_bytes: int | None = None) -> None:
+    def report(
+        self,
+        ns: int,
+        stages_ns: Mapping[str, int],
+        peak_bytes: int | None = None,
+        transfer_ns: int = 0,
+    ) -> None:
         """Take the times of another process's clock; see `bench.types.Probe`."""
         self._charge()
+        wall_ns = sum(self._ns.values())
+        counted("transfer_ns", transfer_ns)
+        for name, part in stages_ns.items():
+            counted(f"ns of the stage {name}", part)
+        if not counted("ns", ns):
+            raise unexpected("ns", "the time of a frame, 1 or more", ns)
+        if peak_bytes is not None:
+            counted("peak_bytes", peak_bytes)
+        if self._told:
+            raise SteerbenchError("the time of a frame was reported twice: expected it once")
+        if ns > wall_ns:
+            passed = f"at most the {wall_ns} ns by the clock here since the frame began"
+            raise unexpected("ns", passed, ns)
         stages = {name: of for name, of in stages_ns.items() if name != OTHER and self._stages}
         stages[OTHER] = ns - sum(stages.values())
-        self._told.update(stages_ns=stages, wall_ns=sum(self._ns.values()), peak_bytes=peak_bytes)
+        if stages[OTHER] < 0:
+            raise unexpected("ns of the stages", f"at most {ns} in all", stages_ns)
+        self._told.update(stages_ns=stages, peak_bytes=peak_bytes, transfer_ns=transfer_ns)
 
     def _begin(self) -> None:
         self._ns: defaultdict[str, int] = defaultdict(int, {OTHER: 0})
@@ -113,6 +141,15 @@ class StageClock:
         now = self._now()
         self._ns["/".join(self._open or ()) or OTHER] += now - self._last
         self._last = now
+
+
+def counted(what: str, number: object) -> int:
+    """`number` as a plain int; SteerbenchError unless it is whole, 0 or more, and below 2^63."""
+    whole = isinstance(number, Integral) and not isinstance(number, bool)
+    if whole and 0 <= number < MOST:  # type: ignore[operator]
+        return int(number)  # type: ignore[call-overload]
+    got = "one beyond" if whole and abs(number) >= MOST else repr(number)  # type: ignore[arg-type]
+    raise unexpected(what, "a whole number from 0 on, below 2^63", got)
 
 
 def times_ms(

@@ -19,19 +19,24 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from bench.clock import FrameRecord, StageClock
+from bench.clock import FrameRecord, StageClock, counted
 from bench.errors import unexpected
+from bench.isolation import Guard, Isolated, fit, lent, moved, sees_scored
 from bench.memory import MemoryMeter, give_back
 from bench.metrics import Lpips, psnr_of_mse
 from bench.neighbours import Neighbours, Watch
 from bench.protocol import EvaluationProtocol
 from bench.results import COLD, STEADY, Measurement
 from bench.rows import phase_rows, row_table, single
-from bench.scoring import ERROR_RANGE, PICTURES, Scoring, check_frame
+from bench.scoring import ERROR_RANGE, PICTURES, Scoring, taken
 from bench.study import study_of
 from bench.trajectories import Trajectory, spread
-from bench.types import Budget, Log, Method, Scene
+from bench.types import Budget, Log, Method, NullProbe, Scene
 from bench.waits import CodeLine, device_waits
+
+FEW, NOTABLE_MS = 0.2, 3.0
+"""Times that a renderer reports are doubted below this share of the wall time, and only if so many
+milliseconds a frame are missing."""
 
 
 @dataclass(frozen=True)
@@ -66,42 +71,53 @@ def _named(method: Method, several: bool) -> Iterator[None]:
         raise
 
 
-def train(methods: Sequence[Method], task: Task, log: Log) -> None:
-    """Fit `methods` to the scene of `task`.
+def train(methods: Sequence[Method], task: Task, log: Log) -> Guard:
+    """Fit `methods` to the scene of `task`; returns what watches its pictures from then on.
 
-    Raises SteerbenchError if the scene does not fit the protocol; of several methods, MethodFailed
-    for whatever one of them raises.
+    Raises SteerbenchError if the scene does not fit the protocol, or a method changed its pictures;
+    of several methods, MethodFailed for whatever one of them raises.
     """
     task.protocol.check(task.scene, task.trajectory)
     if task.protocol.compared:
         _check_steady(methods, task.trajectory)
-    for split in task.scene.splits.values():
-        list(split.images)  # decode now, so damaged files raise here, not during training or timing
-        list(split.masks)
+    guard = Guard(task.scene, log)  # decodes now, so that damaged files raise before any training
     for method in methods:
         with _named(method, len(methods) > 1):
-            method.fit(task.scene, task.budget, log)
+            counted(f"{method.name}: memory", method.memory)
+            fit(method, task.scene, task.budget, task.seed, log)
+            if len(methods) > 1:  # or nobody knows later which one it was
+                guard.check([method])
+    return guard
 
 
-def measure(methods: Sequence[Method], task: Task, log: Log) -> list[Measurement]:
+def measure(
+    methods: Sequence[Method], task: Task, log: Log, guard: Guard | None = None
+) -> list[Measurement]:
     """Render the trajectory of `task` with trained `methods` under the clock, and score it.
 
     Several methods render each frame one after the other, so that their times come from the same
     minutes. The first round through the trajectory is scored; with `protocol.rounds`, times and
     work come from that further round whose mean time of the steady frames is the lower median.
-    Peak memory of the process is that of all methods together. Raises SteerbenchError if a method
-    rendered values that are not finite; of several methods, MethodFailed for whatever one of them
-    raises.
+    Peak memory of the process is that of all methods together. Frames that are not scored show the
+    scene from cameras a hair away, so that no method is timed on frames that it has kept. `guard`
+    is what `train` returned. Raises SteerbenchError if a method rendered what is no frame, or
+    changed pictures of the scene; of several methods, MethodFailed for whatever one of them raises.
     """
     lpips, missing = task.protocol.load_lpips(task.weights_dir, log)
-    takes = [_Take(method, task, lpips) for method in methods]
+    guard = guard or Guard(task.scene, log)
+    takes = [_Take(method, task, lpips, len(methods) > 1, log) for method in methods]
     neighbours = _render(takes, task, log)
     if neighbours.notable:
         log.info(f"{neighbours} while frames were timed: times are longer than they need be")
     measurements = []
     for take in takes:
-        with _named(take.method, len(takes) > 1):
-            measurements.append(_measurement(take, task, missing, neighbours, len(takes)))
+        with take.called():
+            _repeat(take, task)
+            measurement = _measurement(take, task, missing, neighbours, len(takes))
+        for doubt in take.doubts:
+            log.info(f"{take.method.name}: {doubt}")
+        measurements.append(measurement)
+    guard.check(methods)
     return measurements
 
 
@@ -118,8 +134,12 @@ def _check_steady(methods: Sequence[Method], trajectory: Trajectory) -> None:
 class _Take:
     """A method being measured: its clock, memory meter, scoring, and a row per rendered frame."""
 
-    def __init__(self, method: Method, task: Task, lpips: Mapping[str, Lpips]) -> None:
-        self.method, device = method, method.settings()["device"]
+    def __init__(
+        self, method: Method, task: Task, lpips: Mapping[str, Lpips], several: bool, log: Log
+    ) -> None:
+        self.method, self.several = method, several
+        self._isolated = Isolated(method, task.seed, log)
+        device = method.settings()["device"]
         self.clock = StageClock(device, stages=task.protocol.stages)
         self.meter = MemoryMeter(device)
         scored = [n for n, step in enumerate(task.trajectory.steps) if step.truth is not None]
@@ -131,6 +151,20 @@ class _Take:
         # and largest difference of any channel.
         self.apart: list[tuple[float, float]] = []
         self.waits: list[Counter[CodeLine]] = []  # of steady frames, if the protocol counts them
+        self.middle: Tensor | None = None  # the picture in the middle of the path
+        self.doubts: list[str] = []  # what a reader of its figures has to know
+
+    @contextmanager
+    def called(self) -> Iterator[None]:
+        """The context of all calls of the method."""
+        with _named(self.method, self.several), self._isolated.call():
+            yield
+
+    @contextmanager
+    def timed_frame(self) -> Iterator[None]:
+        """The context of a call of `render`: what is done about the call is not timed."""
+        with self.called(), self.clock.frame():
+            yield
 
     def metered(self, *, warm: bool = False) -> AbstractContextManager[object]:
         """The meter, around a frame whose memory counts; around others, nothing.
@@ -185,39 +219,42 @@ def _measurement(
 ) -> Measurement:
     """What was measured of one of `in_turns` methods."""
     scene, trajectory, protocol, budget = task.scene, task.trajectory, task.protocol, task.budget
-    method, scoring, sizes = take.method, take.scoring, take.method.sizes()
+    method, scoring = take.method, take.scoring
     peak_bytes, source = take.peak(in_turns)
     records, means = take.timed(len(take.clock.frames) - protocol.rounds * len(take.rows))
     rows_of_frames = [row | _costs(timed) for row, timed in zip(take.rows, records, strict=True)]
     frames = _frame_table(rows_of_frames, scoring.names)
-    of_phases = ((phase, frames[frames["phase"] == phase]) for phase in (STEADY, COLD))
+    summary: list[dict[str, Any]] = []
+    for phase in (STEADY, COLD):
+        of_phase = frames[frames["phase"] == phase]
+        if len(of_phase):
+            summary += [row | {"phase": phase} for row in phase_rows(of_phase)]
     whole: dict[str, float] = {}
     if protocol.rounds > 1:
         whole |= {"frame_ms.fastest": min(means), "frame_ms.slowest": max(means)}
     if take.apart:  # the PSNR from the MSE over all frames, inf if they are equal
         mse, worst = zip(*take.apart, strict=True)
         whole |= {"psnr_to_first": psnr_of_mse(statistics.fmean(mse)), "worst_to_first": max(worst)}
-    whole |= {f"size_bytes.{part}": size for part, size in sizes.items()}
-    whole |= {"size_bytes.total": sum(sizes.values())} if sizes else {}
-    whole |= {"peak_bytes": peak_bytes, "train_s": method.train_s}
-    whole |= {"train_peak_bytes": getattr(method, "train_peak_bytes", math.nan)}
-    summary = [
-        *(row | {"phase": phase} for phase, of in of_phases if len(of) for row in phase_rows(of)),
-        *(single(name, value) for name, value in whole.items()),
-    ]
-    known = [row["metric"] for row in summary if row["n"]]
+    whole |= _sizes(method) | {"peak_bytes": peak_bytes} | _costs_of_training(method)
+    summary += [single(name, value) for name, value in whole.items()]
+    facts = method.settings()
+    if doubt := _doubted_times(records):
+        take.doubts.append(doubt)
+        facts = {**facts, "device": f"{facts['device']}, doubtful times"}
+    seen = ", seen by the method" if sees_scored(method) else ""
     rows = row_table(
         summary,
         method=method.name,
         scene=scene.name,
-        split=trajectory.split,
+        split=trajectory.split + seen,
         trajectory=trajectory.name,
         resolution=trajectory.resolution,
         protocol=protocol.name,
         budget=budget.name,
         seed=task.seed,
-        **method.settings(),
+        **facts,
     )
+    known = [row["metric"] for row in summary if row["n"]]
     record: dict[str, Any] = {
         "protocol": asdict(protocol),
         "budget": asdict(budget),
@@ -227,10 +264,47 @@ def _measurement(
         "neighbours": neighbours._asdict(),
         "peak_bytes": source,
         "times": take.times,
+        "doubts": take.doubts,
         "waits": _waits(take.waits),
         "error_map": f"absolute error, mean over the channels, black 0 to yellow {ERROR_RANGE}",
     }
     return Measurement(rows, frames, scoring.images, record)
+
+
+def _sizes(method: Method) -> dict[str, float]:
+    """The bytes of each component of `method`, and of all; none if it tells none."""
+    sizes = method.sizes()
+    found: dict[str, float] = {}
+    for part, size in sizes.items():
+        found[f"size_bytes.{part}"] = counted(f"{method.name}: size of {part}", size)
+    return found | {"size_bytes.total": sum(found.values())} if found else {}
+
+
+def _costs_of_training(method: Method) -> dict[str, float]:
+    """Seconds and peak memory of the training, and the seconds of compiling if that was needed."""
+    found: dict[str, float] = {}
+    found["train_s"] = method.train_s
+    found["train_peak_bytes"] = getattr(method, "train_peak_bytes", math.nan)
+    for name, value in found.items():
+        if not (math.isnan(value) or 0 <= value < math.inf):
+            raise unexpected(f"{method.name}: {name}", "0 or more, or NaN: not known", value)
+    if seconds := getattr(method, "compile_s", 0.0):
+        found["compile_s"] = seconds
+    return found
+
+
+def _doubted_times(records: Sequence[FrameRecord]) -> str:
+    """Why reported times may be of another unit, or leave work out; empty if nothing says so."""
+    told_ns = sum(record.total_ns for record in records)
+    here_ns = sum((record.wall_ns or 0) - record.transfer_ns for record in records)
+    apart_ms = (here_ns - told_ns) / len(records) / 1e6
+    if told_ns >= FEW * here_ns or apart_ms < NOTABLE_MS:
+        return ""
+    told_ms, here_ms = (ns / len(records) / 1e6 for ns in (told_ns, here_ns))
+    return (
+        f"it reports {told_ms:.3g} ms a frame, by the clock here {here_ms:.3g} ms passed, without "
+        "the transfer of pictures: does it report nanoseconds, and all of its work?"
+    )
 
 
 def _waits(of_frames: Sequence[Counter[CodeLine]]) -> list[dict[str, Any]]:
@@ -253,12 +327,9 @@ def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
             settled = number > 0 or len(warmup) == 1  # in the first, kernels may be compiled
             if settled:
                 give_back()  # what compiling has freed
-            with (
-                _named(take.method, len(takes) > 1),
-                take.metered(warm=True) if settled else nullcontext(),
-                take.clock.frame(),
-            ):
-                take.method.render(steps[number].camera, take.clock)
+            camera = moved(steps[number].camera, hairs=-1)
+            with take.metered(warm=True) if settled else nullcontext(), take.timed_frame():
+                take.method.render(camera, take.clock)
             progress.advance(note="warming up")
         watch = Watch()
         for number in range(rounds):
@@ -268,8 +339,7 @@ def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
             for index in range(len(steps)):
                 first: Tensor | None = None
                 for take in takes:
-                    with _named(take.method, len(takes) > 1):
-                        picture = _draw(take, task, index, first, scored=number == 0)
+                    picture = _draw(take, task, index, first, hairs=number)
                     first = picture if first is None else first
                     scores = [row["psnr"] for row in take.rows if "psnr" in row]
                     progress.advance(note=f"{np.mean(scores):.2f} dB" if scores else "")
@@ -278,25 +348,54 @@ def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
 
 def _reset(takes: Sequence[_Take]) -> None:
     for take in takes:
-        with _named(take.method, len(takes) > 1):
+        with take.called():
             take.method.reset()
 
 
-def _draw(take: _Take, task: Task, index: int, first: Tensor | None, *, scored: bool) -> Tensor:
-    """Render the frame `index` with a method and return its picture; in the round that is `scored`
-    also score it, and compare it with the picture of the `first` method, if there is one.
+def _repeat(take: _Take, task: Task) -> None:
+    """Render the frame in the middle of the path again, alone: of a method without memory it has to
+    be the same as in the path."""
+    if take.method.memory or take.middle is None:
+        return
+    index = len(task.trajectory.steps) // 2
+    camera = task.trajectory.steps[index].camera
+    again = []
+    for _ in range(2):
+        take.method.reset()
+        with torch.no_grad():
+            frame = take.method.render(lent(camera), NullProbe())
+        again.append(taken(frame, camera, take.method.name, index).rgb.cpu())
+    if _differ(*again):
+        take.doubts.append("it renders one view in several ways: its pictures are random")
+    elif _differ(again[0], take.middle):
+        take.doubts.append("its pictures depend on the frames before, though its `memory` is 0")
 
-    The method is not told of cuts, because a user who steers a camera does not announce a jump.
+
+def _differ(one: Tensor, other: Tensor) -> bool:
+    """Whether two pictures differ by more than a level of 8 bits somewhere."""
+    return bool((one - other).abs().max() > 1 / 255)
+
+
+def _draw(take: _Take, task: Task, index: int, first: Tensor | None, *, hairs: int) -> Tensor:
+    """Render the frame `index` with a method and return its picture.
+
+    In the round whose camera is where it should be, 0 `hairs` away, it is also scored, and compared
+    with the picture of the `first` method, if there is one. The method is not told of cuts, because
+    a user who steers a camera does not announce a jump.
     """
     method, step, protocol = take.method, task.trajectory.steps[index], task.protocol
-    before = task.trajectory.preceding[index]
-    counted = device_waits() if scored and protocol.waits else nullcontext()
-    with counted as waits, take.metered(), take.clock.frame():
-        frame = method.render(step.camera, take.clock)
-    check_frame(frame, step.camera, method.name, index)
-    if not scored:
+    camera = moved(step.camera, hairs) if hairs else lent(step.camera)
+    counted = device_waits() if protocol.waits and not hairs else nullcontext()
+    with counted as waits, take.metered(), take.timed_frame():
+        frame = method.render(camera, take.clock)
+    with _named(method, take.several):
+        frame = taken(frame, step.camera, method.name, index)
+    if hairs:
         return frame.rgb
-    phase = COLD if before < method.memory else STEADY
+    if index == len(task.trajectory.steps) // 2:
+        take.middle = frame.rgb.cpu()
+    cold = task.trajectory.preceding[index] < method.memory
+    phase = COLD if cold else STEADY
     if phase == STEADY and waits is not None:
         take.waits.append(waits)
     figures: dict[str, Any] = {"frame": index, "phase": phase}
@@ -304,7 +403,8 @@ def _draw(take: _Take, task: Task, index: int, first: Tensor | None, *, scored: 
     mask: Tensor | None = None
     if step.truth is not None:
         split = task.scene.splits[task.trajectory.split]
-        figures["name"], truth = split.names[step.truth], split.images[step.truth]
+        figures["name"] = split.names[step.truth]
+        truth = split.images[step.truth]
         mask = split.mask(step.truth)
     elif protocol.flicker == "exact" and task.scene.exact is not None:
         truth = task.scene.exact(step.camera)

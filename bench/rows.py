@@ -16,7 +16,7 @@ UNITS = {
     **dict.fromkeys(("psnr", "cc_psnr", "psnr_to_first", "tpsnr"), "dB"),
     **dict.fromkeys(("frame_ms", "wall_ms", "stage_ms"), "ms"),
     **dict.fromkeys(("size_bytes", "peak_bytes", "train_peak_bytes"), "B"),
-    **{"fps": "1/s", "work": "1/frame", "train_s": "s"},
+    **{"fps": "1/s", "work": "1/frame", "train_s": "s", "compile_s": "s"},
 }
 """Units of metrics, by name up to the first dot; other metrics have no unit."""
 

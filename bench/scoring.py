@@ -9,23 +9,62 @@ import torch
 from torch import Tensor
 
 from bench import metrics, video_metrics
+from bench.errors import unexpected
 from bench.protocol import EvaluationProtocol
-from bench.types import Camera, Frame, SteerbenchError, check_shape, composite
+from bench.types import Camera, Frame, SteerbenchError, composite
 
 PICTURES = 3  # default number of scored frames whose pictures are kept
 ERROR_RANGE = 0.1  # mean absolute error of the brightest colour of an error map
 
 
-def check_frame(frame: Frame, camera: Camera, method: str, index: int) -> None:
-    """Raise SteerbenchError if a pixel is not finite, ValueError if the size is not `camera`'s."""
-    check_shape("rgb", frame.rgb, camera.height, camera.width, 3)
-    broken = int((~torch.isfinite(frame.rgb)).any(dim=-1).sum())
+OUTSIDE = 0.01
+"""How far the numbers of a picture may lie outside [0, 1] in the mean: a network overshoots at
+edges by far less, a picture in other units, or of another range, by far more."""
+
+
+def taken(frame: Frame, camera: Camera, method: str, index: int) -> Frame:
+    """A copy of what a method rendered as frame `index`, which nothing that still runs can change.
+
+    Raises SteerbenchError, which names `method`, if a part has another size than `camera`, is no
+    tensor of floating-point numbers, is not finite, or has another range than it must have.
+    """
+    where = f"{method}: frame {index}"
+    size = camera.height, camera.width
+    rgb = _copied(frame.rgb, f"{where}: rgb", (*size, 3))
+    depth = _copied(frame.depth, f"{where}: depth", size)
+    alpha = _copied(frame.alpha, f"{where}: alpha", size)
+    broken = int((~rgb.isfinite()).any(dim=-1).sum())
     if broken:
         raise SteerbenchError(
             f"{method} rendered {broken} of {camera.height * camera.width} pixels of frame {index} "
             "as NaN or infinite: the training is broken; train again with a lower learning rate or "
             "another seed"
         )
+    if depth.isnan().any() or depth.isneginf().any():
+        raise unexpected(f"{where}: depth", "z-depths, +inf where nothing is", "NaN or -inf")
+    _check_range(rgb, f"{where}: rgb")
+    _check_range(alpha, f"{where}: alpha")
+    return Frame(rgb, depth, alpha)
+
+
+def _copied(tensor: object, where: str, shape: tuple[int, ...]) -> Tensor:
+    if not isinstance(tensor, Tensor):
+        raise unexpected(where, "a torch tensor", type(tensor).__name__)
+    if tensor.shape != shape:
+        raise unexpected(where, f"shape {list(shape)}", list(tensor.shape))
+    if not tensor.is_floating_point():
+        how = "floating-point numbers (colours and opacities from 0 to 1: divide bytes by 255)"
+        raise unexpected(where, how, str(tensor.dtype))
+    return tensor.detach().clone()
+
+
+def _check_range(tensor: Tensor, where: str) -> None:
+    values = tensor.float()
+    outside = (values - values.clamp(0, 1)).abs().mean().item()
+    if not outside <= OUTSIDE:  # also of NaN
+        low, high = values.min().item(), values.max().item()
+        got = f"{low:.3g} to {high:.3g}, {outside:.3g} beyond in the mean; divide 0..255 by 255"
+        raise unexpected(where, "numbers from 0 to 1", got)
 
 
 class Shot(NamedTuple):

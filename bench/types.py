@@ -139,6 +139,7 @@ class Scene:
     exact: Callable[[Camera], Tensor] | None = None
     surface: Callable[[Camera], Tensor] | None = None
     maps: Mapping[str, Tensor] = field(default_factory=dict)
+    files: tuple[Path, ...] = ()  # that it was read from
 
     @property
     def cells(self) -> Tensor:
@@ -201,16 +202,30 @@ class Probe(Protocol):
         A count on a GPU, given as a tensor of one number, is read at the end of the frame.
         """
 
-    def report(self, ns: int, stages_ns: Mapping[str, int], peak_bytes: int | None = None) -> None:
+    def report(
+        self,
+        ns: int,
+        stages_ns: Mapping[str, int],
+        peak_bytes: int | None = None,
+        transfer_ns: int = 0,
+    ) -> None:
         """Take the time of this frame, in all and of its stages, from the clock of another process,
-        whose picture has just arrived, and the peak of that process's memory, if known."""
+        whose picture has just arrived, and the peak of that process's memory, if known.
+
+        `transfer_ns` is how long the picture took to arrive. Raises SteerbenchError if less time
+        than `ns` has passed here since the frame began.
+        """
 
 
 class Method(Protocol):
     """A radiance-field renderer.
 
     `train_s` are the seconds of training, summed over all processes that continued it; `fit` sets
-    them even if it only loads, and may so set `train_peak_bytes`, the peak of memory meanwhile.
+    them even if it only loads. It may also set `train_peak_bytes`, the peak of memory meanwhile, and
+    `compile_s`, the seconds of compiling before the training, which are not among those of it.
+
+    If `sees_scored` is true, `fit` is given all splits and the exact pictures, which rows say;
+    otherwise the training split alone.
     """
 
     name: str  # as shown in result rows
@@ -243,5 +258,11 @@ class NullProbe:
     def count(self, name: str, done: int | Tensor, dense: int | None = None) -> None:
         pass
 
-    def report(self, ns: int, stages_ns: Mapping[str, int], peak_bytes: int | None = None) -> None:
+    def report(
+        self,
+        ns: int,
+        stages_ns: Mapping[str, int],
+        peak_bytes: int | None = None,
+        transfer_ns: int = 0,
+    ) -> None:
         pass

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from bench.cameras import scale_camera
 from bench.clock import OTHER, StageClock
+from bench.isolation import lent
 from bench.metrics import quantise
-from bench.scoring import check_frame
+from bench.scoring import taken
 from bench.types import Camera, Method
 
 COARSE = 2  # while a camera moves, a slow method renders so many times fewer pixels a side
@@ -101,8 +102,8 @@ class Painter:
         for method in self.methods:
             clock = StageClock(method.settings()["device"])
             with clock.frame():
-                frame = method.render(camera, clock)
-            check_frame(frame, camera, method.name, 0)
+                frame = method.render(lent(camera), clock)
+            frame = taken(frame, camera, method.name, 0)
             (record,) = clock.frames
             times = {name: ns / 1e6 for name, ns in record.stages_ns.items() if name != OTHER or ns}
             stages = dict(sorted(times.items(), key=lambda item: -item[1]))

@@ -7,12 +7,12 @@ import inspect
 import os
 import re
 import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 import torch
 from hydra.errors import InstantiationException
@@ -22,6 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable, unexpected, unknown
+from bench.isolation import fit
 from bench.protocol import EvaluationProtocol
 from bench.records import fits
 from bench.scenes.assemble import hold_out
@@ -109,7 +110,7 @@ def trained(
     scene = scene or scene_of(config)
     turn = device_lock(settings.device, log, training_threads(config))
     with turn if settings.exclusive else nullcontext():
-        method.fit(scene, budget, progress or log)
+        fit(method, scene, budget, settings.seed, progress or log)
     return method
 
 
@@ -132,7 +133,14 @@ def scene_of(config: DictConfig) -> Scene:
     If its trajectory renders held-out training pictures, these, one in eight, are removed from the
     training split, so that a model is never scored on pictures that it was trained on.
     """
-    return _scene(*_contents(config))
+    scene = _current(_scene, config).value
+    assert isinstance(scene, Scene)
+    return scene
+
+
+def forget_scene() -> None:
+    """Read the next scene from its files, whatever a method has made of one that is known."""
+    _scene.cache_clear()
 
 
 def trajectory_of(config: DictConfig, scene: Scene, log: Log) -> Trajectory:
@@ -144,7 +152,7 @@ def trajectory_of(config: DictConfig, scene: Scene, log: Log) -> Trajectory:
 
 
 def scene_digest(config: DictConfig) -> str:
-    return _digest(*_contents(config))
+    return str(_current(_digest, config).value)
 
 
 def scene_folder(config: DictConfig) -> str | None:
@@ -158,18 +166,54 @@ def _contents(config: DictConfig) -> tuple[str, Path, bool]:
     return OmegaConf.to_yaml(config.scene, resolve=True), Path(config.outputs), held_out
 
 
+class _Read(NamedTuple):
+    """What was made of files, and how these were then."""
+
+    value: Scene | str
+    files: Sequence[Path]
+    stamps: Mapping[str, tuple[int, ...]]
+
+
 @cache
-def _digest(node: str, root: Path, held_out: bool) -> str:
+def _digest(node: str, root: Path, held_out: bool) -> _Read:
     """Cached, because it takes loading the whole scene."""
-    return _scene(node, root, held_out).digest
+    read = _scene(node, root, held_out)
+    assert isinstance(read.value, Scene)
+    return read._replace(value=read.value.digest)
 
 
 @lru_cache(maxsize=1)
-def _scene(node: str, root: Path, held_out: bool) -> Scene:
+def _scene(node: str, root: Path, held_out: bool) -> _Read:
     """Cached for the next job of a sweep."""
     config = OmegaConf.create({"scene": OmegaConf.create(node)})
     scene = build(config, "scene", log=ConsoleLog(root))
-    return hold_out(scene, VALIDATION, 8) if held_out else scene
+    if held_out:
+        scene = hold_out(scene, VALIDATION, 8)
+    return _Read(scene, scene.files, _stamps(scene.files))
+
+
+def _current(read: Any, config: DictConfig) -> _Read:
+    """What the cached function `read` has of a scene; read again if a file has changed since."""
+    contents = _contents(config)
+    found: _Read = read(*contents)
+    if found.stamps != _stamps(found.files):
+        read.cache_clear()
+        _scene.cache_clear()
+        found = read(*contents)
+    return found
+
+
+def _stamps(files: Iterable[Path]) -> dict[str, tuple[int, ...]]:
+    """Times, size and number of each file, and of all files beside it: pictures may be added, lists
+    of names changed."""
+    stamps: dict[str, tuple[int, ...]] = {}
+    for folder in {file.parent for file in files if file.parent.is_dir()}:
+        for entry in os.scandir(folder):
+            stamps[entry.path] = ()
+            if entry.is_file():
+                now = entry.stat()
+                stamps[entry.path] = now.st_mtime_ns, now.st_ctime_ns, now.st_size, now.st_ino
+    return stamps
 
 
 def build(config: DictConfig, group: str, *args: Any, **extra: Any) -> Any:

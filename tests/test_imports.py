@@ -17,7 +17,7 @@ MAY_IMPORT = {
 }
 REACHES = {
     "sweeps/commands/checks.py": ("methods.checks", "methods.kernels.", "methods.trial."),
-    "sweeps/commands/compile.py": "methods.checks",
+    "sweeps/commands/compile.py": ("methods.checks", "methods.kernels."),
     "sweeps/commands/list.py": "methods.kernels.",
 }
 """What measures and lists parts of methods reaches them directly; methods only through

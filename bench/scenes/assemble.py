@@ -81,7 +81,8 @@ def assemble(
     corners = box.lower.tolist(), box.upper.tolist()
     named = (background, corners) if space == "box" else (background, corners, space)
     digest = hashlib.sha256(repr(named).encode())
-    for path in camera_files:
+    files = list(camera_files)
+    for path in files:
         digest.update(hashlib.sha256(path.read_bytes()).digest())
     outer = box if space == "box" else box.middle_of()
     splits = {}
@@ -92,7 +93,10 @@ def assemble(
             others = [camera.cx, camera.cy, *camera.c2w.flatten().tolist()]
             _check_float32(picture.view.name, [camera.fx, camera.fy], others)
             digest.update(f"{split} {camera.width} {camera.height} {picture.sha256}".encode())
-            digest.update(picture.mask.sha256.encode() if picture.mask else b"")
+            files.append(picture.view.path)
+            if picture.mask:
+                digest.update(picture.mask.sha256.encode())
+                files.append(picture.mask.view.path)
             cameras.append(camera)
             names.append(picture.view.name)
         masked = any(picture.mask for picture in of_split.described)
@@ -107,6 +111,7 @@ def assemble(
         digest=digest.hexdigest(),
         origin=outer.origin,
         space=space,
+        files=tuple(files),
     )
 
 

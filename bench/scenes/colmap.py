@@ -76,6 +76,8 @@ def load(
     else:
         box = points_box(folder)
     files = sorted(folder.glob(f"*{_kind(folder)}"))
+    if lists:
+        files.append(lists[0])
     return assemble(
         root.name, pictures, box, background=background, space=space, camera_files=files
     )

@@ -100,8 +100,9 @@ def load(
         box = capture_box(path, record, aabb_scale)
     if space == "box" and aabb_scale is None and (record.get("aabb_scale", 1) > 1 or not cube):
         box = tight(box, pictures["train"])
+    files = {path, lists[0]} if lists else {path}
     scene = assemble(
-        root.name, pictures, box, background=background, space=space, camera_files=[path]
+        root.name, pictures, box, background=background, space=space, camera_files=sorted(files)
     )
     return replace(scene, maps=program_maps(path, record))
 

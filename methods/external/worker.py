@@ -97,6 +97,11 @@ class Worker:
         self.expect(header["message"] == message, message, "the same message", header)
         return header, arrays
 
+    @property
+    def answered_ns(self) -> int:
+        """When the last answer began to arrive, by `time.perf_counter_ns`."""
+        return self._channel.began_ns
+
     def expect(self, holds: bool, message: str, expected: str, got: object) -> None:
         """Raise the SteerbenchError about an answer to `message` unless something `holds`."""
         if not holds:

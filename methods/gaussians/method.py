@@ -15,6 +15,7 @@ from methods.gaussians import ply
 from methods.gaussians.model import Gaussians, rounded, stored_bytes
 from methods.gaussians.training import Fitting, GaussianTraining, on_surfaces, spacing
 from methods.instant_ngp.stage1 import OnField, train_field
+from methods.kernels.compilation import compile_kernels
 from methods.kernels.settings import Count, Degree, Steps, Stop
 from methods.rendering.frame import FeatureFrame
 from methods.training import checkpoint, loop
@@ -53,6 +54,7 @@ class GaussianSplatting(OnField):
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """Train field and Gaussians, load what was trained before, or read the `checkpoint`."""
+        self.compile_s = compile_kernels(type(self), self.setup.backend, log)
         if self.reads:
             gaussians = ply.read(self.reads[0], scene, log.info).to(self.setup.device)
         else:

@@ -9,6 +9,7 @@ from bench.study import Study, turned
 from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.instant_ngp.stage1 import OnField, train_field
+from methods.kernels.compilation import compile_kernels
 from methods.kernels.settings import Stop
 from methods.rendering.frame import everywhere, render_frame
 
@@ -36,6 +37,7 @@ class InstantNgp(OnField):
     )
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
+        self.compile_s = compile_kernels(type(self), self.setup.backend, log)
         with torch_threads(budget.threads):
             self.trained = train_field(self.setup, scene, budget, log)
         self.train_s = self.trained.train_s

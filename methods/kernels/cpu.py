@@ -119,6 +119,12 @@ class _Kept(FunctionCache):
             super().save_overload(*compiled)
 
 
+def is_kept(function: Any) -> bool:
+    """Whether there is machine code of `function`, and of the others of its module."""
+    kept = getattr(function, "_cache", None)
+    return isinstance(kept, _Kept) and kept._folder.exists()
+
+
 def jit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """As `numba.njit` with these `options`. The machine code is kept for other processes, until a
     file changes that it may come from: that of the function, or one that this file imports."""

@@ -13,6 +13,7 @@ from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.engines import Engine
 from methods.instant_ngp.stage1 import OnField, train_field
+from methods.kernels.compilation import compile_kernels
 from methods.kernels.settings import Steps
 from methods.kernels.types import expect
 from methods.steernerf.buffer import Buffer
@@ -93,6 +94,7 @@ class SteerNerf(OnField):
         """Train both stages, or load their results if they were trained before; build the network
         of the 2D renderer with the engine, which computes it from now on."""
         budget = replace(budget, renderer_steps=self.steps or budget.renderer_steps)
+        self.compile_s = compile_kernels(type(self), self.setup.backend, log)
         with torch_threads(budget.threads):
             self.trained = train_field(self.setup, scene, budget, log)
             given = self.trained, self.setup, self.stage2, scene, budget, log

@@ -17,6 +17,7 @@ from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
 from methods.instant_ngp.training import PixelOptions
+from methods.kernels.compilation import compile_kernels
 from methods.kernels.settings import Checked, Steps, Stop
 from methods.kernels.types import Occupancy
 from methods.rendering.frame import Render, render_frame
@@ -77,6 +78,7 @@ class Student(Checked, ABC):
         if self.contracted and not self.contracts:
             straight = "a scene of space=box: its rays cross voxels in straight lines"
             raise unexpected(f"method={self.kind}", straight, f"space=all of {scene.name}")
+        self.compile_s = compile_kernels(type(self), self.teacher.backend, log)
         with torch_threads(budget.threads):
             teacher = train_field(self.teacher, scene, budget, log)
             settings = asdict(self)

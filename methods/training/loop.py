@@ -105,7 +105,7 @@ def _drive(training: Training, finished: Path, label: str, log: Log) -> None:
     began, saved = time.monotonic() - training.seconds, time.monotonic()
     means: dict[str, float] = {}
     with log.progress(label, training.steps) as progress:
-        progress.advance(training.step, note="compiling kernels")  # on their first use ever
+        progress.advance(training.step)
         while training.step < training.steps:
             errors = training.advance()
             means |= {k: 0.99 * means.get(k, mse) + 0.01 * mse for k, mse in errors.items()}

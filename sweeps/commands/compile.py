@@ -4,16 +4,15 @@ A kernel is compiled by computing its cases, which covers all types of inputs.
 """
 
 import argparse
-import importlib
 import os
 import sys
 from collections.abc import Sequence
 from concurrent.futures import as_completed
 from pathlib import Path
 
-from bench.case import failed
 from bench.console import ConsoleLog
 from methods import checks
+from methods.kernels.compilation import wrong_of
 from sweeps.overrides import composed, target_of
 from sweeps.processes import processes
 
@@ -39,11 +38,3 @@ def needed(methods: Sequence[str]) -> list[str]:
     for method in methods:
         target_of(composed([f"method={method}"]).method)
     return [name for name in checks.modules("cases") if name.rpartition(".")[0] in sys.modules]
-
-
-def wrong_of(module: str) -> list[str]:
-    """Compute each quick case of `module` with compiled kernels; return the names of wrong ones."""
-    quick = [case for case in importlib.import_module(module).cases() if case.quick]
-    cells = [(case, cell) for case in quick for cell in case.tolerances if cell[0] == "cpu"]
-    rows = [case.check(cell, "cpu") for case, cell in cells]
-    return [f"{row['subject']}: {row['case']}" for row in rows if failed(row)]

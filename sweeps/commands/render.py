@@ -16,10 +16,11 @@ from PIL import Image
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, explained, optional
+from bench.isolation import lent
 from bench.metrics import as_bytes, quantise
 from bench.paths import write_path
 from bench.results import existing_store
-from bench.scoring import check_frame
+from bench.scoring import taken
 from bench.trajectories import MIXED
 from bench.types import BACKGROUNDS, Camera, Method, NullProbe, Scene
 from sweeps.configured import build, scene_of, trained, trajectory_of
@@ -86,8 +87,7 @@ def seen(path: Path | None, words: Sequence[str], configs: Sequence[DictConfig])
 @torch.no_grad()
 def _drawn(method: Method, camera: Camera, index: int) -> np.ndarray:
     """Render the next frame of `method` as uint8 [H, W, 3]."""
-    frame = method.render(camera, NullProbe())
-    check_frame(frame, camera, method.name, index)
+    frame = taken(method.render(lent(camera), NullProbe()), camera, method.name, index)
     return as_bytes(quantise(frame.rgb.cpu()))
 
 

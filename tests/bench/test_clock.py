@@ -1,6 +1,7 @@
 """Every nanosecond of a frame is charged once."""
 
 import itertools
+import math
 from collections.abc import Iterable
 
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bench.clock import FrameRecord, StageClock
+from bench.errors import SteerbenchError
 
 
 def clock_reading(times: Iterable[int]) -> StageClock:
@@ -63,18 +65,52 @@ def test_stages_and_other_add_up_to_the_frame_whatever_the_nesting(tree, steps):
 @pytest.mark.parametrize(
     ("stages", "kept"), [(True, {"march": 30, "other": 20}), (False, {"other": 50})]
 )
-def test_a_time_of_another_clock_replaces_the_stages_and_leaves_that_until_then(stages, kept):
-    readings = iter([100, 103, 110, 190, 191])
+def test_a_time_of_another_clock_replaces_the_stages_beside_what_passed_here(stages, kept):
+    readings = iter([100, 160, 170, 190, 191])
     clock = StageClock("worker's cuda", clock=lambda: next(readings), stages=stages)
     with clock.frame():  # 100
-        clock.report(50, {"march": 30, "other": 5}, peak_bytes=7)  # 103
+        clock.report(50, {"march": 30, "other": 5}, peak_bytes=7, transfer_ns=4)  # 160
         clock.count("rays", 2)
+    # 170
     with clock.frame():  # 190 to 191
         pass
     assert clock.frames == [
-        FrameRecord(kept, {"rays": 2}, {}, wall_ns=3, peak_bytes=7),
+        FrameRecord(kept, {"rays": 2}, {}, wall_ns=70, peak_bytes=7, transfer_ns=4),
         FrameRecord({"other": 1}, {}, {}),
     ]
+
+
+@pytest.mark.parametrize(
+    ("told", "why"),
+    [
+        ((61, {}), "at most the 60 ns by the clock here"),
+        ((10**400, {}), "below 2"),
+        ((-10, {}), "got -10"),
+        ((0, {}), "1 or more"),
+        ((1.5, {}), r"got 1\.5"),
+        ((True, {}), "got True"),
+        ((50, {"march": 51}), "at most 50 in all"),
+        ((50, {"march": 60, "other": -10}), "got -10"),
+        ((50, {}, -1), "peak_bytes"),
+    ],
+)
+def test_a_time_that_cannot_have_passed_is_refused(told, why):
+    readings = iter([100, 160])
+    clock = StageClock("cpu", clock=lambda: next(readings))
+    with pytest.raises(SteerbenchError, match=why), clock.frame():
+        clock.report(*told)
+    assert not clock.frames
+
+
+def test_a_frame_has_one_reported_time_and_counters_from_0_on():
+    clock = clock_reading(itertools.count())
+    with clock.frame():
+        clock.report(1, {})
+        with pytest.raises(SteerbenchError, match="twice"):
+            clock.report(1, {})
+    for wrong in (-1, 2.5, math.nan, 2**63, torch.tensor(-1)):
+        with pytest.raises(SteerbenchError, match="rays: expected a whole number"), clock.frame():
+            clock.count("rays", wrong)
 
 
 def test_counters_add_up_within_a_frame_and_start_at_0_in_the_next():

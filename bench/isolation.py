@@ -1,0 +1,287 @@
+"""What a method is given, and what it may leave behind: nothing that others are measured on.
+
+A method runs in the process that measures it, with others before and after it. It gets copies of
+cameras, and the training pictures alone unless it asks for more. The global state of Python and
+torch is put back after each call; the method has random numbers of its own.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import random
+import signal
+import sys
+import warnings
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from bench.threads import in_parallel
+from bench.types import Budget, Camera, Log, Method, Scene, SteerbenchError
+
+TRAINING = "train"
+"""The split that every method learns from."""
+
+HAIR = 1e-3
+"""Scene units by which a camera is moved so that no frame that was kept is that of its pose."""
+
+
+def lent(camera: Camera) -> Camera:
+    """`camera` with a pose of its own, which may be written to."""
+    return replace(camera, c2w=camera.c2w.clone())
+
+
+def moved(camera: Camera, hairs: int) -> Camera:
+    """`camera`, so many `HAIR`s away along each axis: it sees the same, at the same cost."""
+    pose = camera.c2w.clone()
+    pose[:, 3] += hairs * HAIR
+    return replace(camera, c2w=pose)
+
+
+def sees_scored(method: Method) -> bool:
+    """Whether the method asks for all splits and for the exact pictures, not only for training
+    pictures: its attribute `sees_scored`."""
+    return bool(getattr(method, "sees_scored", False))
+
+
+def given(scene: Scene, method: Method) -> Scene:
+    """The part of `scene` that `method` is given to learn from, with small tensors of its own.
+
+    Pictures and masks are shared, because they are large: see `Guard`.
+    """
+    all_of_it = sees_scored(method)
+    splits = {}
+    for name, split in scene.splits.items():
+        if all_of_it or name == TRAINING:
+            splits[name] = replace(split, cameras=list(map(lent, split.cameras)))
+    return replace(
+        scene,
+        splits=splits,
+        background=scene.background.clone(),
+        bounds=scene.bounds.clone(),
+        origin=scene.origin.clone(),
+        maps={name: matrix.clone() for name, matrix in scene.maps.items()},
+        exact=scene.exact if all_of_it else None,
+        surface=scene.surface if all_of_it else None,
+    )
+
+
+class Guard:
+    """Finds out whether pictures or masks of a scene were written to, by their checksums."""
+
+    def __init__(self, scene: Scene, log: Log) -> None:
+        self._scene, self._log = scene, log
+        self._sums = self._summed()
+
+    def check(self, methods: Sequence[Method]) -> None:
+        """Raise SteerbenchError, with the names of the methods that had the pictures, if one was
+        changed: all that is measured on this scene from here on would be wrong."""
+        if self._summed() != self._sums:
+            names = " or ".join(method.name for method in methods)
+            raise SteerbenchError(
+                f"{names} changed pictures of {self._scene.name} in place, on which others are "
+                "trained and scored: expected a method that works on copies (image.clone())"
+            )
+
+    def _summed(self) -> list[int]:
+        tensors: list[torch.Tensor] = []
+        for split in self._scene.splits.values():
+            tensors += split.images
+            tensors += (mask for mask in split.masks if mask is not None)
+        return in_parallel(_checksum, tensors, "check pictures", self._log)
+
+
+def _checksum(tensor: torch.Tensor) -> int:
+    return zlib.crc32(tensor.contiguous().numpy().data)
+
+
+State = tuple[Callable[[], Any], Callable[[Any], object]]
+"""What reads a part of the global state of this process, and what sets it again."""
+
+
+def _folder() -> str:
+    """The working folder; empty if it was removed."""
+    try:
+        return str(Path.cwd())
+    except FileNotFoundError:
+        return ""
+
+
+def _enter_folder(folder: str) -> None:
+    if folder:
+        os.chdir(folder)
+
+
+def _environment() -> dict[str, str]:
+    return dict(os.environ)
+
+
+def _set_environment(variables: Mapping[str, str]) -> None:
+    os.environ.clear()
+    os.environ.update(variables)
+
+
+def _handlers() -> dict[int, Any]:
+    return {number: signal.getsignal(number) for number in signal.valid_signals()}
+
+
+def _set_handlers(handlers: Mapping[int, Any]) -> None:
+    for number, handler in handlers.items():
+        if signal.getsignal(number) != handler:
+            signal.signal(number, handler)
+
+
+def _warnings() -> tuple[list[Any], Any]:
+    return list(warnings.filters), warnings.showwarning
+
+
+def _set_warnings(state: tuple[list[Any], Any]) -> None:
+    filters, show = state
+    warnings.resetwarnings()  # which also makes Python forget what it knew of the filters
+    warnings.filters[:] = filters  # type: ignore[index]
+    warnings.showwarning = show
+
+
+def _device() -> torch.device | None:
+    """The default device; None for the usual one, which costs nothing."""
+    device = torch.get_default_device()
+    return None if device.type == "cpu" else device
+
+
+def _flushes_denormals() -> bool:
+    return sys.float_info.min / 2 == 0.0
+
+
+def _streams() -> list[Any]:
+    return [sys.stdout, sys.stderr]
+
+
+def _set_streams(streams: Sequence[Any]) -> None:
+    sys.stdout, sys.stderr = streams
+
+
+def _words() -> list[list[str]]:
+    return [list(sys.argv), list(sys.path)]
+
+
+def _set_words(words: Sequence[Sequence[str]]) -> None:
+    sys.argv[:], sys.path[:] = words
+
+
+def _set_collecting(enabled: bool) -> None:
+    change = gc.enable if enabled else gc.disable
+    change()
+
+
+def _set_cores(cores: set[int]) -> None:
+    os.sched_setaffinity(0, cores)
+
+
+STATE: Mapping[str, State] = {
+    "torch's number of threads": (torch.get_num_threads, torch.set_num_threads),
+    "torch's default type": (torch.get_default_dtype, torch.set_default_dtype),
+    "torch's default device": (_device, torch.set_default_device),
+    "torch's recording of gradients": (torch.is_grad_enabled, torch.set_grad_enabled),
+    "torch's precision of products": (
+        torch.get_float32_matmul_precision,
+        torch.set_float32_matmul_precision,
+    ),
+    "torch's deterministic mode": (
+        torch.get_deterministic_debug_mode,
+        torch.set_deterministic_debug_mode,
+    ),
+    "the flushing of denormal numbers": (_flushes_denormals, torch.set_flush_denormal),
+    "numpy's handling of errors": (np.geterr, lambda kinds: np.seterr(**kinds)),
+    "the working folder": (_folder, _enter_folder),
+    "the environment": (_environment, _set_environment),
+    "sys.argv or sys.path": (_words, _set_words),
+    "standard output": (_streams, _set_streams),
+    "handlers of signals": (_handlers, _set_handlers),
+    "filters of warnings": (_warnings, _set_warnings),
+    "the collection of garbage": (gc.isenabled, _set_collecting),
+    "the cores of this process": (lambda: os.sched_getaffinity(0), _set_cores),
+    "the limit of recursion": (sys.getrecursionlimit, sys.setrecursionlimit),
+}
+"""The global state that is put back, but for random numbers."""
+
+OF_IMPORTS = ("the environment", "filters of warnings")
+"""What libraries change when they are first imported, whatever the method: not worth a line."""
+
+RANDOM: Sequence[State] = (
+    (torch.get_rng_state, torch.set_rng_state),
+    (np.random.get_state, np.random.set_state),
+    (random.getstate, random.setstate),
+)
+
+
+def _drawn() -> list[Any]:
+    """The state of all global random numbers."""
+    return [read() for read, _ in RANDOM]
+
+
+def _draw_from(states: Sequence[Any]) -> None:
+    for (_, put), state in zip(RANDOM, states, strict=True):
+        put(state)
+
+
+@contextmanager
+def put_back(tell: Callable[[str], object] = lambda part: None) -> Iterator[None]:
+    """Put the global state of this process back as it was when the body ends; `tell` gets each part
+    of `STATE` that the body changed."""
+    before = {part: read() for part, (read, _) in STATE.items()}
+    random_numbers = _drawn()
+    try:
+        yield
+    finally:
+        _draw_from(random_numbers)
+        for part, (read, put) in STATE.items():
+            if read() != before[part]:
+                put(before[part])
+                tell(part)
+
+
+class Isolated:
+    """The calls of one method: what they leave of the global state is put back, and said once.
+
+    Their random numbers are a sequence of their own, which begins at `seed`: those of a method do
+    not depend on what is measured beside it.
+    """
+
+    def __init__(self, method: Method, seed: int, log: Log) -> None:
+        self._method, self._seed, self._log = method, seed, log
+        self._random: list[Any] | None = None
+        self._told: set[str] = set()
+
+    @contextmanager
+    def call(self) -> Iterator[None]:
+        with put_back(self._tell):
+            self._continue()
+            yield
+            self._random = _drawn()
+
+    def _continue(self) -> None:
+        """Go on with the method's own random numbers, or begin them."""
+        if self._random is not None:
+            _draw_from(self._random)
+            return
+        torch.manual_seed(self._seed)
+        np.random.seed(self._seed % 2**32)
+        random.seed(self._seed)
+
+    def _tell(self, part: str) -> None:
+        if part not in self._told and part not in OF_IMPORTS:
+            self._told.add(part)
+            self._log.info(f"{self._method.name} changed {part}, which was put back")
+
+
+def fit(method: Method, scene: Scene, budget: Budget, seed: int, log: Log) -> None:
+    """Let `method` learn from what it is given of `scene`."""
+    with Isolated(method, seed, log).call():
+        method.fit(given(scene, method), budget, log)
