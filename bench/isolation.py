@@ -128,13 +128,20 @@ def _set_environment(variables: Mapping[str, str]) -> None:
     os.environ.update(variables)
 
 
+SIGNALS = [
+    getattr(signal, f"SIG{name}")
+    for name in ("INT", "TERM", "HUP", "ALRM", "USR1", "USR2", "CHLD", "PIPE")
+]
+"""Those that programs handle; the handlers of all would take longer to look up than a frame."""
+
+
 def _handlers() -> dict[int, Any]:
-    return {number: signal.getsignal(number) for number in signal.valid_signals()}
+    return {number: signal.getsignal(number) for number in SIGNALS}
 
 
 def _set_handlers(handlers: Mapping[int, Any]) -> None:
     for number, handler in handlers.items():
-        if signal.getsignal(number) != handler:
+        if handler is not None and signal.getsignal(number) != handler:  # None: not Python's
             signal.signal(number, handler)
 
 
