@@ -7,14 +7,13 @@ torch is put back after each call; the method has random numbers of its own.
 
 from __future__ import annotations
 
-import gc
 import os
 import random
 import signal
 import sys
 import warnings
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -60,7 +59,8 @@ def given(scene: Scene, method: Method) -> Scene:
     splits = {}
     for name, split in scene.splits.items():
         if all_of_it or name == TRAINING:
-            splits[name] = replace(split, cameras=list(map(lent, split.cameras)))
+            cameras = [lent(camera) for camera in split.cameras]
+            splits[name] = replace(split, cameras=cameras, names=list(split.names))
     return replace(
         scene,
         splits=splits,
@@ -102,8 +102,31 @@ def _checksum(tensor: torch.Tensor) -> int:
     return zlib.crc32(tensor.contiguous().numpy().data)
 
 
-State = tuple[Callable[[], Any], Callable[[Any], object]]
-"""What reads a part of the global state of this process, and what sets it again."""
+SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM, signal.SIGUSR1
+"""Those that programs handle; to look up the handlers of all takes longer than a small frame."""
+
+OF_IMPORTS = ("the environment", "filters of warnings")
+"""Parts that libraries change when they are first imported; no line is said of these."""
+
+
+def _state() -> dict[str, Any]:
+    """The global state that is put back, but for random numbers, by what it is called."""
+    device = torch.get_default_device()
+    return {
+        "torch's number of threads": torch.get_num_threads(),
+        "torch's default type": torch.get_default_dtype(),
+        "torch's default device": None if device.type == "cpu" else device,  # None costs nothing
+        "torch's recording of gradients": torch.is_grad_enabled(),
+        "torch's precision of products": torch.get_float32_matmul_precision(),
+        "torch's deterministic mode": torch.get_deterministic_debug_mode(),
+        "the flushing of denormal numbers": sys.float_info.min / 2 == 0.0,
+        "the working folder": _folder(),
+        "the environment": dict(os.environ),
+        "sys.argv": list(sys.argv),
+        "handlers of signals": [signal.getsignal(number) for number in SIGNALS],
+        "filters of warnings": (list(warnings.filters), warnings.showwarning),
+        "the cores of this process": os.sched_getaffinity(0),
+    }
 
 
 def _folder() -> str:
@@ -114,142 +137,72 @@ def _folder() -> str:
         return ""
 
 
-def _enter_folder(folder: str) -> None:
-    if folder:
-        os.chdir(folder)
-
-
-def _environment() -> dict[str, str]:
-    return dict(os.environ)
-
-
-def _set_environment(variables: Mapping[str, str]) -> None:
+def _set_environment(variables: dict[str, str]) -> None:
     os.environ.clear()
     os.environ.update(variables)
 
 
-SIGNALS = [
-    getattr(signal, f"SIG{name}")
-    for name in ("INT", "TERM", "HUP", "ALRM", "USR1", "USR2", "CHLD", "PIPE")
-]
-"""Those that programs handle; the handlers of all would take longer to look up than a frame."""
+def _set_words(words: list[str]) -> None:
+    sys.argv[:] = words
 
 
-def _handlers() -> dict[int, Any]:
-    return {number: signal.getsignal(number) for number in SIGNALS}
-
-
-def _set_handlers(handlers: Mapping[int, Any]) -> None:
-    for number, handler in handlers.items():
-        if handler is not None and signal.getsignal(number) != handler:  # None: not Python's
+def _set_handlers(handlers: list[Any]) -> None:
+    for number, handler in zip(SIGNALS, handlers, strict=True):
+        if handler is not None:  # None: it is not Python's
             signal.signal(number, handler)
 
 
-def _warnings() -> tuple[list[Any], Any]:
-    return list(warnings.filters), warnings.showwarning
-
-
 def _set_warnings(state: tuple[list[Any], Any]) -> None:
-    filters, show = state
     warnings.resetwarnings()  # which also makes Python forget what it knew of the filters
-    warnings.filters[:] = filters  # type: ignore[index]
-    warnings.showwarning = show
-
-
-def _device() -> torch.device | None:
-    """The default device; None for the usual one, which costs nothing."""
-    device = torch.get_default_device()
-    return None if device.type == "cpu" else device
-
-
-def _flushes_denormals() -> bool:
-    return sys.float_info.min / 2 == 0.0
-
-
-def _streams() -> list[Any]:
-    return [sys.stdout, sys.stderr]
-
-
-def _set_streams(streams: Sequence[Any]) -> None:
-    sys.stdout, sys.stderr = streams
-
-
-def _words() -> list[list[str]]:
-    return [list(sys.argv), list(sys.path)]
-
-
-def _set_words(words: Sequence[Sequence[str]]) -> None:
-    sys.argv[:], sys.path[:] = words
-
-
-def _set_collecting(enabled: bool) -> None:
-    change = gc.enable if enabled else gc.disable
-    change()
+    warnings.filters[:], warnings.showwarning = state  # type: ignore[index]
 
 
 def _set_cores(cores: set[int]) -> None:
     os.sched_setaffinity(0, cores)
 
 
-STATE: Mapping[str, State] = {
-    "torch's number of threads": (torch.get_num_threads, torch.set_num_threads),
-    "torch's default type": (torch.get_default_dtype, torch.set_default_dtype),
-    "torch's default device": (_device, torch.set_default_device),
-    "torch's recording of gradients": (torch.is_grad_enabled, torch.set_grad_enabled),
-    "torch's precision of products": (
-        torch.get_float32_matmul_precision,
-        torch.set_float32_matmul_precision,
-    ),
-    "torch's deterministic mode": (
-        torch.get_deterministic_debug_mode,
-        torch.set_deterministic_debug_mode,
-    ),
-    "the flushing of denormal numbers": (_flushes_denormals, torch.set_flush_denormal),
-    "numpy's handling of errors": (np.geterr, lambda kinds: np.seterr(**kinds)),
-    "the working folder": (_folder, _enter_folder),
-    "the environment": (_environment, _set_environment),
-    "sys.argv or sys.path": (_words, _set_words),
-    "standard output": (_streams, _set_streams),
-    "handlers of signals": (_handlers, _set_handlers),
-    "filters of warnings": (_warnings, _set_warnings),
-    "the collection of garbage": (gc.isenabled, _set_collecting),
-    "the cores of this process": (lambda: os.sched_getaffinity(0), _set_cores),
-    "the limit of recursion": (sys.getrecursionlimit, sys.setrecursionlimit),
-}
-"""The global state that is put back, but for random numbers."""
-
-OF_IMPORTS = ("the environment", "filters of warnings")
-"""What libraries change when they are first imported, whatever the method: not worth a line."""
-
-RANDOM: Sequence[State] = (
-    (torch.get_rng_state, torch.set_rng_state),
-    (np.random.get_state, np.random.set_state),
-    (random.getstate, random.setstate),
+SETTERS: tuple[Callable[[Any], object], ...] = (
+    torch.set_num_threads,
+    torch.set_default_dtype,
+    torch.set_default_device,
+    torch.set_grad_enabled,
+    torch.set_float32_matmul_precision,
+    torch.set_deterministic_debug_mode,
+    torch.set_flush_denormal,
+    os.chdir,
+    _set_environment,
+    _set_words,
+    _set_handlers,
+    _set_warnings,
+    _set_cores,
 )
+"""What sets the parts of `_state` again, in their order."""
 
 
-def _drawn() -> list[Any]:
+def _drawn() -> tuple[Any, ...]:
     """The state of all global random numbers."""
-    return [read() for read, _ in RANDOM]
+    return torch.get_rng_state(), np.random.get_state(), random.getstate()
 
 
-def _draw_from(states: Sequence[Any]) -> None:
-    for (_, put), state in zip(RANDOM, states, strict=True):
-        put(state)
+def _draw_from(drawn: tuple[Any, ...]) -> None:
+    torch.set_rng_state(drawn[0])
+    np.random.set_state(drawn[1])
+    random.setstate(drawn[2])
 
 
 @contextmanager
 def put_back(tell: Callable[[str], object] = lambda part: None) -> Iterator[None]:
     """Put the global state of this process back as it was when the body ends; `tell` gets each part
-    of `STATE` that the body changed."""
-    before = {part: read() for part, (read, _) in STATE.items()}
-    random_numbers = _drawn()
+    but random numbers that the body changed."""
+    before = _state()
+    drawn = _drawn()
     try:
         yield
     finally:
-        _draw_from(random_numbers)
-        for part, (read, put) in STATE.items():
-            if read() != before[part]:
+        _draw_from(drawn)
+        now = _state()
+        for part, put in zip(before, SETTERS, strict=True):
+            if now[part] != before[part]:
                 put(before[part])
                 tell(part)
 
@@ -263,7 +216,7 @@ class Isolated:
 
     def __init__(self, method: Method, seed: int, log: Log) -> None:
         self._method, self._seed, self._log = method, seed, log
-        self._random: list[Any] | None = None
+        self._random: tuple[Any, ...] | None = None
         self._told: set[str] = set()
 
     @contextmanager

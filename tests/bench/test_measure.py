@@ -1,5 +1,6 @@
 """A measurement reports what really happened, and nothing it could not find out."""
 
+import itertools
 import math
 import weakref
 from dataclasses import replace
@@ -32,8 +33,8 @@ def run(tiny_scene, quiet_log):
     def measured(*methods, **changes):
         task = Task(tiny_scene, from_split(tiny_scene), PROTOCOL, BUDGET, seed=5)
         task = replace(task, **changes)
-        train(methods, task, quiet_log)
-        found = measure(methods, task, quiet_log)
+        guard = train(methods, task, quiet_log)
+        found = measure(methods, task, quiet_log, guard)
         return found if len(methods) > 1 else found[0]
 
     return measured
@@ -51,7 +52,8 @@ def value(rows, metric: str) -> float:
 def test_the_rows_have_every_column_but_what_the_store_adds(run, offset_method, device):
     rows = run(offset_method).rows
     assert set(rows.columns) == set(COLUMNS) - {"run", "commit"}
-    what = {"method": "offset", "scene": "tiny", "split": "test", "trajectory": "test"}
+    seen = "test, seen by the method"
+    what = {"method": "offset", "scene": "tiny", "split": seen, "trajectory": "test"}
     how = {"resolution": "40x32", "protocol": "quick", "budget": "tiny", "seed": 5}
     by = {"device": device, "backend": "reference", "field_precision": "fp32"}
     by |= {"engine": "none", "precision": "none"}
@@ -106,8 +108,11 @@ def test_the_stages_of_a_frame_add_up_and_the_rate_has_the_interval_of_the_time(
 def test_warm_up_frames_come_first_and_a_method_forgets_them(run, offset_method):
     measured = run(offset_method)
     sequence = [f"r_{i}" for i in range(6)]
-    assert offset_method.calls == ["fit", "reset", "r_0", "r_5", "reset", *sequence]
+    again = ["reset", "r_3"]
+    assert offset_method.calls[:5] == ["fit", "reset", "r_0", "r_5", "reset"]
+    assert offset_method.calls[5:] == [*sequence, *again, *again]
     assert len(measured.frames) == 6
+    assert measured.record["doubts"] == []
 
 
 def test_frames_with_too_little_to_look_back_on_are_cold(run, offset_method, tiny_scene):
@@ -280,7 +285,7 @@ def test_frames_are_let_go_once_they_are_scored(run, offset_method):
 
     offset_method.render = watched
     run(offset_method)
-    assert len(alive) == 8
+    assert len(alive) == 10
     assert most <= 1
 
 
@@ -295,7 +300,8 @@ def test_methods_in_turns_draw_frames_as_if_alone(run, offset_method):
 
         method.render = watched
     both = run(offset_method, other)
-    assert drawn == ["one", "other"] * (PROTOCOL.warmup + 6)
+    in_turns = ["one", "other"] * (PROTOCOL.warmup + 6)
+    assert drawn == [*in_turns, "one", "one", "other", "other"]
     for method, measured in zip((offset_method, other), both, strict=True):
         assert measured.frames["psnr"].tolist() == run(method).frames["psnr"].tolist()
     assert value(both[0].rows, "psnr") > value(both[1].rows, "psnr")
@@ -315,6 +321,159 @@ def test_of_several_methods_the_one_that_failed_is_named(where, run, offset_meth
     assert caught.value.__cause__ is error
     with pytest.raises(RuntimeError, match="no"):
         run(other)
+
+
+# What passes for a measurement
+
+
+def rendering(method, change):
+    """`method`, with `change` made to the frames that it renders; it gets frame and camera, too."""
+
+    def render(camera, probe):
+        frame = type(method).render(method, camera, probe)
+        return change(frame, camera) or frame
+
+    method.render = render
+    return method
+
+
+def test_a_camera_that_a_method_writes_to_is_its_own(run, offset_method, tiny_scene):
+    poses = [camera.c2w.clone() for camera in tiny_scene.splits["test"].cameras]
+
+    def turn(frame, camera):
+        camera.c2w[:, 1:3] *= -1  # from OpenCV's axes to OpenGL's
+
+    run(rendering(offset_method, turn))
+    assert all(map(torch.equal, poses, (x.c2w for x in tiny_scene.splits["test"].cameras)))
+
+
+@pytest.mark.parametrize("when", ["fit", "render"])
+def test_a_method_that_changes_the_pictures_that_it_is_scored_on_is_refused(
+    when, run, offset_method, tiny_scene, monkeypatch
+):
+    usual = getattr(offset_method, when)
+
+    def spoiling(*given):
+        tiny_scene.splits["test"].images[3].fill_(7)
+        return usual(*given)
+
+    monkeypatch.setattr(offset_method, when, spoiling)
+    with pytest.raises(SteerbenchError, match="offset changed pictures of tiny in place"):
+        run(offset_method)
+
+
+def test_of_several_methods_the_one_that_changed_pictures_while_it_learnt_is_named(
+    run, offset_method, tiny_scene, monkeypatch
+):
+    def spoiling(scene, budget, log):
+        scene.splits["test"].images[3].bitwise_not_()
+
+    monkeypatch.setattr(offset_method, "fit", spoiling)
+    with pytest.raises(MethodFailed) as caught:
+        run(OffsetMethod("cpu", 0.0), offset_method)
+    assert caught.value.method is offset_method
+
+
+def test_a_frame_is_what_it_was_when_it_was_returned(run, offset_method):
+    """What still writes into it afterwards changes no score and no kept picture."""
+    last: list[torch.Tensor] = []
+
+    def late(frame, camera):
+        for earlier in last:
+            earlier.fill_(0)
+        last[:] = [frame.rgb]
+
+    usual = run(OffsetMethod("cpu", 8 / 255))
+    found = run(rendering(offset_method, late))
+    assert found.frames["psnr"].tolist() == usual.frames["psnr"].tolist()
+    assert all(map(np.array_equal, found.pictures.values(), usual.pictures.values()))
+
+
+def test_no_frame_is_timed_that_a_method_may_have_kept(run, offset_method):
+    """In warm-up and in timed rounds no pose is that of a frame before; scored ones are exact."""
+    seen: list[bytes] = []
+
+    def note(frame, camera):
+        seen.append(camera.c2w.numpy().tobytes())
+
+    in_rounds = replace(PROTOCOL, rounds=3)
+    run(rendering(offset_method, note), protocol=in_rounds)
+    timed, again = seen[: 2 + 3 * 6], seen[2 + 3 * 6 :]
+    assert len(set(timed)) == len(timed)
+    assert set(again) == {seen[2 + 3]}
+
+
+def test_a_method_without_memory_that_is_random_or_looks_back_is_doubted(run, quiet_log):
+    def noisy(frame, camera):
+        frame.rgb.sub_(torch.rand(()) / 10)
+
+    calls = itertools.count()
+
+    def looking_back(frame, camera):
+        frame.rgb.sub_(0.02 if next(calls) < 8 else 0.0)  # until the path has ended
+
+    random = run(rendering(OffsetMethod("cpu", 0.0), noisy))
+    assert random.record["doubts"] == [
+        "it renders one view in several ways: its pictures are random"
+    ]
+    back = run(rendering(OffsetMethod("cpu", 0.0), looking_back))
+    assert "depend on the frames before" in back.record["doubts"][0]
+    remembering = OffsetMethod("cpu", 0.0)
+    remembering.memory = 1
+    assert run(rendering(remembering, noisy)).record["doubts"] == []
+
+
+@pytest.mark.parametrize(
+    ("share", "transfer", "doubted"), [(0.9, 0.0, False), (0.1, 0.0, True), (0.1, 0.85, False)]
+)
+def test_reported_times_far_below_what_passed_here_are_doubted_in_every_row(
+    share, transfer, doubted
+):
+    passed = 100_000_000
+    of = {"wall_ns": passed, "transfer_ns": int(transfer * passed)}
+    records = [FrameRecord({"other": int(share * passed)}, {}, {}, **of)] * 2
+    assert bool(bench.measure._doubted_times(records)) == doubted
+    # As large a share of a short frame is the rounding of clocks.
+    short = FrameRecord({"other": 100_000}, {}, {}, wall_ns=2_000_000)
+    assert not bench.measure._doubted_times([short])
+    assert not bench.measure._doubted_times([frame(1.0)])  # which nobody reported
+
+
+def test_a_reported_time_that_is_doubted_is_of_no_other_device(run, offset_method, monkeypatch):
+    monkeypatch.setattr(bench.measure, "_doubted_times", lambda records: "ticks?")
+    found = run(offset_method)
+    assert set(found.rows["device"]) == {f"{offset_method.settings()['device']}, doubtful times"}
+    assert found.record["doubts"] == ["ticks?"]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("sizes", lambda: {"table": -1}),
+        ("sizes", lambda: {"table": 1.5}),
+        ("train_s", -1.0),
+        ("train_s", math.inf),
+        ("train_peak_bytes", -1),
+        ("memory", -1),
+        ("memory", 0.5),
+    ],
+)
+def test_costs_that_cannot_be_are_refused_by_name(name, value, run, offset_method):
+    offset_method.fit = lambda *given: (
+        type(offset_method).fit(offset_method, *given) or setattr(offset_method, name, value)
+    )
+    if name == "memory":
+        offset_method.memory = value
+    with pytest.raises(SteerbenchError, match="offset: "):
+        run(offset_method)
+
+
+def test_the_seconds_of_compiling_are_a_figure_of_their_own(run, offset_method):
+    assert "compile_s" not in set(run(offset_method).rows["metric"])
+    offset_method.compile_s = 3.5
+    rows = run(offset_method).rows
+    assert (value(rows, "compile_s"), value(rows, "train_s")) == (3.5, 12.5)
+    assert row(rows, "compile_s")["unit"] == "s"
 
 
 # In rounds, compared with the first
@@ -343,7 +502,8 @@ def in_turns(run, tiny_scene):
 def test_methods_take_turns_in_every_round_and_are_held_against_the_first(in_turns):
     (first, second), calls = in_turns()
     round_ = ["reset", *(f"r_{number}" for number in range(6))]
-    assert calls == [call for call in ("fit", "reset", *3 * round_) for _ in (first, second)]
+    rounds = [call for call in ("fit", "reset", *3 * round_) for _ in (first, second)]
+    assert calls == [*rounds, *4 * ("reset", "r_3")]
     assert value(first.rows, "psnr_to_first") == math.inf
     assert value(first.rows, "worst_to_first") == 0
     apart, worst = (value(second.rows, f"{x}_to_first") for x in ("psnr", "worst"))
