@@ -272,7 +272,7 @@ class External:
             depth = torch.from_numpy(arrays["depth"]).float() / self._scene.unit_length
         alpha = torch.ones(()).expand(size)
         if "alpha" in arrays:
-            alpha = torch.from_numpy(arrays["alpha"])
+            alpha = torch.from_numpy(arrays["alpha"]).float()
         return Frame(rgb.float(), depth, alpha)
 
     def _expect(self, holds: bool, expected: str, got: object) -> None:

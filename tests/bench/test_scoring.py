@@ -6,9 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from bench.errors import SteerbenchError
 from bench.metrics import flicker, quantise
-from bench.scoring import Scoring
-from bench.types import composite
+from bench.scoring import Scoring, taken
+from bench.types import Camera, Frame, composite
 from tests.conftest import QUICK
 
 WHITE = torch.ones(3)
@@ -58,3 +59,52 @@ def test_the_last_of_so_many_frames_is_scored_with_lpips_and_too_few_frames_say_
     assert found == [pytest.approx(value, nan_ok=True) for value in (math.nan, 0.5, math.nan, 0.5)]
     few = "protocol.lpips_every is 2, and the path has 1 frames to score"
     assert said == [few, few, *[None] * 6]
+
+
+# Frames that a method returned
+
+
+PLAIN = Frame(torch.full((4, 6, 3), 0.5), torch.full((4, 6), math.inf), torch.ones(4, 6))
+CAMERA = Camera(torch.eye(4)[:3], 5.0, 5.0, 3.0, 2.0, width=6, height=4)
+
+
+def test_a_frame_is_taken_as_a_copy():
+    given = replace(PLAIN, rgb=PLAIN.rgb.half().requires_grad_())
+    found = taken(given, CAMERA, "mine", 7)
+    assert torch.equal(found.rgb, given.rgb)
+    assert not found.rgb.requires_grad
+    parts = zip(*((frame.rgb, frame.depth, frame.alpha) for frame in (found, given)), strict=True)
+    assert all(one.data_ptr() != other.data_ptr() for one, other in parts)
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "why"),
+    [
+        ("rgb", torch.full((4, 6, 3), 128, dtype=torch.uint8), "divide bytes by 255.*uint8"),
+        ("rgb", torch.ones(4, 6, 3, dtype=torch.bool), "floating-point numbers.*bool"),
+        ("rgb", torch.ones(4, 6, 3, dtype=torch.int64), "floating-point numbers.*int64"),
+        ("rgb", torch.ones(4, 6, 3).numpy(), "a torch tensor, got ndarray"),
+        ("rgb", torch.ones(6, 4, 3), r"shape \[4, 6, 3\]"),
+        ("rgb", torch.full((4, 6, 3), 3.0), "divide 0..255 by 255"),  # a dark one of 0..255
+        ("rgb", torch.full((4, 6, 3), 1.2), "numbers from 0 to 1"),
+        ("rgb", torch.full((4, 6, 3), -0.01), "numbers from 0 to 1"),
+        ("depth", torch.ones(4, 6, 1), r"shape \[4, 6\]"),
+        ("depth", torch.full((4, 6), math.nan), "z-depths"),
+        ("depth", torch.full((4, 6), -math.inf), "z-depths"),
+        ("depth", torch.ones(4, 6, dtype=torch.int32), "floating-point numbers"),
+        ("alpha", torch.full((4, 6), math.nan), "from 0 to 1"),
+        ("alpha", torch.full((4, 6), 255.0), "from 0 to 1"),
+        ("alpha", None, "a torch tensor"),
+    ],
+)
+def test_what_is_no_frame_is_refused_with_the_method_and_the_part(part, value, why):
+    with pytest.raises(SteerbenchError, match=f"mine: frame 7: {part}: expected .*{why}"):
+        taken(replace(PLAIN, **{part: value}), CAMERA, "mine", 7)
+
+
+def test_a_frame_may_overshoot_a_little():
+    """As networks do at edges, and renderers where rounding makes 1.0000001 of an opacity."""
+    rgb = torch.full((4, 6, 3), 1.03)
+    rgb[0, 0] = -0.5
+    frame = Frame(rgb, PLAIN.depth, PLAIN.alpha + 1e-6)
+    assert torch.equal(taken(frame, CAMERA, "mine", 0).rgb, rgb)

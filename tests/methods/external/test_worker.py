@@ -7,8 +7,9 @@ import select
 import psutil
 import pytest
 
+from bench.clock import StageClock
 from bench.errors import Unavailable
-from bench.types import Budget, Log, NullProbe, Scene, SteerbenchError
+from bench.types import Budget, Log, Scene, SteerbenchError
 from methods.external.method import External
 from methods.external.worker import Worker
 
@@ -54,13 +55,26 @@ FAULTS = {
         r"answered 'render' with rgb \[3, 2, 3\], expected rgb \[32, 40, 3\]",
     ),
     "no picture": ("render", 'channel.send("render", ns=1)', "rgb none, expected"),
-    "bytes as floats": ("render", PICTURE % (127.0, 1), "mean of 127, expected rgb in"),
-    "not a number": ("render", PICTURE % ("np.nan", 1), "1280 pixels that are NaN or infinite"),
-    "negative time": ("render", PICTURE % ("0.5", -1), "ns -1, expected ns above 0"),
+    "negative time": ("render", PICTURE % ("0.5", -1), "a wrong ns: .* got -1"),
+    "the time since 1970": (
+        "render",
+        PICTURE % ("0.5", 10**18),
+        "a wrong ns: expected at most the .* ns by the clock here",
+    ),
+    "no stages": (
+        "render",
+        'channel.send("render", {"rgb": np.ones(size)}, ns=1, stages=[1])',
+        "expected stages and counters by name",
+    ),
+    "a counter that falls": (
+        "render",
+        'channel.send("render", {"rgb": np.ones(size)}, ns=1, counters={"rays": -1})',
+        "a wrong rays: .* got -1",
+    ),
     "more in its stages than in the frame": (
         "render",
         'channel.send("render", {"rgb": np.ones(size)}, ns=1, stages={"march": 2})',
-        "{'march': 2}, expected stages within 1",
+        "a wrong ns of the stages: expected at most 1 in all",
     ),
     "half a picture": (
         "render",
@@ -86,7 +100,9 @@ def talking(place: str, lines: str) -> str:
 
 def render(method: External, scene: Scene, log: Log) -> None:
     method.fit(scene, BUDGET, log)
-    method.render(scene.splits["test"].cameras[0], NullProbe())
+    clock = StageClock("cpu")
+    with clock.frame():
+        method.render(scene.splits["test"].cameras[0], clock)
 
 
 @pytest.fixture
