@@ -1,6 +1,8 @@
 """`import steerbench`: the names that are documented, and the tour that shows them."""
 
 import json
+import os
+import random
 import re
 import subprocess
 import sys
@@ -8,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 import steerbench
@@ -43,6 +46,40 @@ def test_a_run_is_measured_once_and_a_method_renders_what_it_measured(tmp_path, 
     kept = np.asarray(Image.open(run.pictures / "0000-rendered.png"))
     shown = (255 * frame.rgb.clamp(0, 1)).round().byte().numpy()
     assert np.array_equal(shown, kept)
+
+
+def state() -> list:
+    """What a user's own program may rely on."""
+    numbers = torch.get_rng_state().tolist(), np.random.get_state()[1].tolist(), random.getstate()
+    return [list(sys.argv), dict(os.environ), torch.get_num_threads(), *numbers]
+
+
+def test_the_users_process_is_left_as_it_was_found(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["notebook", "cell"])
+    torch.manual_seed(7)
+    before, outputs = state(), f"outputs={tmp_path}"
+    steerbench.run(*QUICK, "threads=2", outputs)
+    steerbench.sweep(*QUICK, "threads=2", "seed=0,1", outputs)
+    steerbench.fit(*QUICK, "threads=2", outputs)
+    assert state() == before
+
+
+def test_a_scene_that_changed_on_disk_is_read_again(tmp_path):
+    words = [*QUICK, f"outputs={tmp_path}"]
+    first = steerbench.load_scene(*words)
+    assert steerbench.load_scene(*words) is first
+    (file,) = tmp_path.glob("scenes/*/test/r_1.png")
+    Image.new("RGBA", (24, 24), "red").save(file)
+    scene = ["scene=blender", f"scene.path={file.parents[1]}"]
+    other = steerbench.load_scene(*scene)
+    assert other.splits["test"].images[1][0, 0].tolist() == [255, 0, 0, 255]
+    Image.new("RGBA", (24, 24), "blue").save(file)
+    changed = steerbench.load_scene(*scene)
+    assert changed.splits["test"].images[1][0, 0].tolist() == [0, 0, 255, 255]
+    assert changed.digest != other.digest
+    file.rename(file.with_name("r_9.png"))
+    with pytest.raises(steerbench.SteerbenchError, match="r_1"):
+        steerbench.load_scene(*scene)
 
 
 def test_choices_come_with_what_they_are():
