@@ -31,7 +31,7 @@ from bench.rows import phase_rows, row_table, single
 from bench.scoring import ERROR_RANGE, PICTURES, Scoring, taken
 from bench.study import study_of
 from bench.trajectories import Trajectory, spread
-from bench.types import Budget, Log, Method, NullProbe, Scene
+from bench.types import Budget, Frame, Log, Method, NullProbe, Scene
 from bench.waits import CodeLine, device_waits
 
 FEW, NOTABLE_MS = 0.2, 3.0
@@ -142,10 +142,13 @@ class _Take:
         device = method.settings()["device"]
         self.clock = StageClock(device, stages=task.protocol.stages)
         self.meter = MemoryMeter(device)
-        scored = [n for n, step in enumerate(task.trajectory.steps) if step.truth is not None]
-        shown = {scored[n] for n in spread(len(scored), task.pictures)}
-        scene = task.scene
-        self.scoring = Scoring(task.protocol, lpips, scene.background, shown, scene.surface)
+        self.scoring = Scoring(
+            task.protocol,
+            lpips,
+            task.scene.background,
+            _shown(task),
+            task.scene.surface,
+        )
         self.rows: list[dict[str, Any]] = []  # of the first round
         # Of its steady frames with a ground truth, how far they are from the first method's: MSE,
         # and largest difference of any channel.
@@ -165,6 +168,11 @@ class _Take:
         """The context of a call of `render`: what is done about the call is not timed."""
         with self.called(), self.clock.frame():
             yield
+
+    def mean_psnr(self) -> str:
+        """The mean PSNR of the frames scored so far; empty without any."""
+        scores = [row["psnr"] for row in self.rows if "psnr" in row]
+        return f"{np.mean(scores):.2f} dB" if scores else ""
 
     def metered(self, *, warm: bool = False) -> AbstractContextManager[object]:
         """The meter, around a frame whose memory counts; around others, nothing.
@@ -214,12 +222,22 @@ class _Take:
         return rounds[means.index(statistics.median_low(means))], means
 
 
+def _shown(task: Task) -> set[int]:
+    """The frames whose pictures are kept: some of those with a ground truth, evenly spread."""
+    scored = [n for n, step in enumerate(task.trajectory.steps) if step.truth is not None]
+    return {scored[n] for n in spread(len(scored), task.pictures)}
+
+
 def _measurement(
     take: _Take, task: Task, missing: Mapping[str, str], neighbours: Neighbours, in_turns: int
 ) -> Measurement:
     """What was measured of one of `in_turns` methods."""
-    scene, trajectory, protocol, budget = task.scene, task.trajectory, task.protocol, task.budget
-    method, scoring = take.method, take.scoring
+    scene = task.scene
+    trajectory = task.trajectory
+    protocol = task.protocol
+    budget = task.budget
+    method = take.method
+    scoring = take.scoring
     peak_bytes, source = take.peak(in_turns)
     records, means = take.timed(len(take.clock.frames) - protocol.rounds * len(take.rows))
     rows_of_frames = [row | _costs(timed) for row, timed in zip(take.rows, records, strict=True)]
@@ -285,22 +303,27 @@ def _costs_of_training(method: Method) -> dict[str, float]:
     found: dict[str, float] = {}
     found["train_s"] = method.train_s
     found["train_peak_bytes"] = getattr(method, "train_peak_bytes", math.nan)
-    for name, value in found.items():
-        if not (math.isnan(value) or 0 <= value < math.inf):
-            raise unexpected(f"{method.name}: {name}", "0 or more, or NaN: not known", value)
-    if seconds := getattr(method, "compile_s", 0.0):
+    seconds = getattr(method, "compile_s", 0.0)
+    if seconds:
         found["compile_s"] = seconds
+    for name, value in found.items():
+        known = not math.isnan(value)
+        if known and not 0 <= value < math.inf:
+            raise unexpected(f"{method.name}: {name}", "0 or more, or NaN: not known", value)
     return found
 
 
 def _doubted_times(records: Sequence[FrameRecord]) -> str:
     """Why reported times may be of another unit, or leave work out; empty if nothing says so."""
-    told_ns = sum(record.total_ns for record in records)
-    here_ns = sum((record.wall_ns or 0) - record.transfer_ns for record in records)
-    apart_ms = (here_ns - told_ns) / len(records) / 1e6
-    if told_ns >= FEW * here_ns or apart_ms < NOTABLE_MS:
+    told_ns = 0
+    here_ns = 0
+    for record in records:
+        told_ns += record.total_ns
+        here_ns += (record.wall_ns or 0) - record.transfer_ns
+    told_ms = told_ns / len(records) / 1e6
+    here_ms = here_ns / len(records) / 1e6
+    if told_ms >= FEW * here_ms or here_ms - told_ms < NOTABLE_MS:
         return ""
-    told_ms, here_ms = (ns / len(records) / 1e6 for ns in (told_ns, here_ns))
     return (
         f"it reports {told_ms:.3g} ms a frame, by the clock here {here_ms:.3g} ms passed, without "
         "the transfer of pictures: does it report nanoseconds, and all of its work?"
@@ -318,7 +341,8 @@ def _waits(of_frames: Sequence[Counter[CodeLine]]) -> list[dict[str, Any]]:
 def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
     """Warm up, then render the sequence in order, as many rounds as the protocol has; what other
     processes used while it was timed."""
-    steps, rounds = task.trajectory.steps, task.protocol.rounds
+    steps = task.trajectory.steps
+    rounds = task.protocol.rounds
     warmup = spread(len(steps), task.protocol.warmup)
     frames = len(takes) * (len(warmup) + rounds * len(steps))
     with torch.no_grad(), log.progress("rendering", frames) as progress:
@@ -327,8 +351,9 @@ def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
             settled = number > 0 or len(warmup) == 1  # in the first, kernels may be compiled
             if settled:
                 give_back()  # what compiling has freed
+            metered = take.metered(warm=True) if settled else nullcontext()
             camera = moved(steps[number].camera, hairs=-1)
-            with take.metered(warm=True) if settled else nullcontext(), take.timed_frame():
+            with metered, take.timed_frame():
                 take.method.render(camera, take.clock)
             progress.advance(note="warming up")
         watch = Watch()
@@ -341,8 +366,7 @@ def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
                 for take in takes:
                     picture = _draw(take, task, index, first, hairs=number)
                     first = picture if first is None else first
-                    scores = [row["psnr"] for row in take.rows if "psnr" in row]
-                    progress.advance(note=f"{np.mean(scores):.2f} dB" if scores else "")
+                    progress.advance(note=take.mean_psnr())
         return watch.seen()
 
 
@@ -383,22 +407,35 @@ def _draw(take: _Take, task: Task, index: int, first: Tensor | None, *, hairs: i
     with the picture of the `first` method, if there is one. The method is not told of cuts, because
     a user who steers a camera does not announce a jump.
     """
-    method, step, protocol = take.method, task.trajectory.steps[index], task.protocol
+    method = take.method
+    step = task.trajectory.steps[index]
     camera = moved(step.camera, hairs) if hairs else lent(step.camera)
-    counted = device_waits() if protocol.waits and not hairs else nullcontext()
-    with counted as waits, take.metered(), take.timed_frame():
+    counting = task.protocol.waits and not hairs
+    counted_waits = device_waits() if counting else nullcontext()
+    with counted_waits as waits, take.metered(), take.timed_frame():
         frame = method.render(camera, take.clock)
     with _named(method, take.several):
         frame = taken(frame, step.camera, method.name, index)
     if hairs:
         return frame.rgb
+    cold = task.trajectory.preceding[index] < method.memory
+    if waits is not None and not cold:
+        take.waits.append(waits)
+    _score(take, task, index, frame, first, COLD if cold else STEADY)
+    return frame.rgb
+
+
+def _score(
+    take: _Take, task: Task, index: int, frame: Frame, first: Tensor | None, phase: str
+) -> None:
+    """Score the frame `index` of a method and, if the protocol compares, hold it against the
+    picture of the `first` method, if there is one."""
+    step = task.trajectory.steps[index]
+    protocol = task.protocol
     if index == len(task.trajectory.steps) // 2:
         take.middle = frame.rgb.cpu()
-    cold = task.trajectory.preceding[index] < method.memory
-    phase = COLD if cold else STEADY
-    if phase == STEADY and waits is not None:
-        take.waits.append(waits)
     figures: dict[str, Any] = {"frame": index, "phase": phase}
+    scored = step.truth is not None
     truth: Tensor | None = None
     mask: Tensor | None = None
     if step.truth is not None:
@@ -408,23 +445,22 @@ def _draw(take: _Take, task: Task, index: int, first: Tensor | None, *, hairs: i
         mask = split.mask(step.truth)
     elif protocol.flicker == "exact" and task.scene.exact is not None:
         truth = task.scene.exact(step.camera)
-    if protocol.compared and phase == STEADY and step.truth is not None:
-        first = frame.rgb if first is None else first
-        shown, other = (protocol.rounded(rgb).cpu().double() for rgb in (frame.rgb, first))
+    if protocol.compared and phase == STEADY and scored:
+        shown = protocol.rounded(frame.rgb).cpu().double()
+        other = shown if first is None else protocol.rounded(first).cpu().double()
         apart = shown - other
         take.apart.append((apart.square().mean().item(), apart.abs().max().item()))
     scores = take.scoring.score(
         index,
         frame.rgb,
         truth,
-        scored=step.truth is not None,
+        scored=scored,
         cut=step.cut,
         camera=step.camera,
         depth=frame.depth,
         mask=mask,
     )
     take.rows.append(figures | scores)
-    return frame.rgb
 
 
 def _costs(record: FrameRecord) -> dict[str, float]:

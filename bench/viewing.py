@@ -105,9 +105,13 @@ class Painter:
                 frame = method.render(lent(camera), clock)
             frame = taken(frame, camera, method.name, 0)
             (record,) = clock.frames
-            times = {name: ns / 1e6 for name, ns in record.stages_ns.items() if name != OTHER or ns}
+            times: dict[str, float] = {}
+            for name, ns in record.stages_ns.items():
+                if ns or name != OTHER:
+                    times[name] = ns / 1e6
             stages = dict(sorted(times.items(), key=lambda item: -item[1]))
-            drawn.append(Drawn(quantise(frame.rgb.cpu()), record.total_ns / 1e6, stages))
+            rgb = quantise(frame.rgb.cpu())
+            drawn.append(Drawn(rgb, record.total_ns / 1e6, stages))
         self._full_ms[camera.width * camera.height] = sum(picture.ms for picture in drawn)
         return drawn
 

@@ -106,7 +106,8 @@ def trained(
     settings = checked_settings(config)
     use_threads(settings)
     torch.manual_seed(settings.seed)
-    method, budget = (build(config, name) for name in ("method", "budget"))
+    method = build(config, "method")
+    budget = build(config, "budget")
     scene = scene or scene_of(config)
     turn = device_lock(settings.device, log, training_threads(config))
     with turn if settings.exclusive else nullcontext():
@@ -207,12 +208,18 @@ def _stamps(files: Iterable[Path]) -> dict[str, tuple[int, ...]]:
     """Times, size and number of each file, and of all files beside it: pictures may be added, lists
     of names changed."""
     stamps: dict[str, tuple[int, ...]] = {}
-    for folder in {file.parent for file in files if file.parent.is_dir()}:
+    folders = {file.parent for file in files}
+    for folder in filter(Path.is_dir, folders):
         for entry in os.scandir(folder):
             stamps[entry.path] = ()
             if entry.is_file():
                 now = entry.stat()
-                stamps[entry.path] = now.st_mtime_ns, now.st_ctime_ns, now.st_size, now.st_ino
+                stamps[entry.path] = (
+                    now.st_mtime_ns,
+                    now.st_ctime_ns,
+                    now.st_size,
+                    now.st_ino,
+                )
     return stamps
 
 

@@ -244,12 +244,14 @@ class External:
 
     def render(self, camera: Camera, probe: Probe) -> Frame:
         """Let it render one frame; the times are its own."""
-        told, arrays = self._worker.ask("render", self.frame_s, self._described(camera))
+        described = self._described(camera)
+        told, arrays = self._worker.ask("render", self.frame_s, described)
         frame = self._frame(arrays, (camera.height, camera.width))
         transfer_ns = time.perf_counter_ns() - self._worker.answered_ns
-        stages, counters = (told.get(name, {}) for name in ("stages", "counters"))
-        by_name = isinstance(stages, dict) and isinstance(counters, dict)
-        self._expect(by_name, "stages and counters by name", told)
+        stages = told.get("stages", {})
+        counters = told.get("counters", {})
+        for of in (stages, counters):
+            self._expect(isinstance(of, dict), "stages and counters by name", told)
         try:
             probe.report(told.get("ns", 0), stages, told.get("peak_bytes"), transfer_ns)
             for name, done in counters.items():
@@ -260,16 +262,18 @@ class External:
 
     def _frame(self, arrays: Mapping[str, np.ndarray], size: tuple[int, int]) -> Frame:
         """What has arrived as a frame; its values are checked where they are used."""
-        for name, shape in (("rgb", (*size, 3)), ("depth", size), ("alpha", size)):
-            if name in arrays or name == "rgb":
-                got = list(arrays[name].shape) if name in arrays else "none"
-                self._expect(got == list(shape), f"{name} {list(shape)}", f"{name} {got}")
+        shapes = {"rgb": [*size, 3], "depth": [*size], "alpha": [*size]}
+        self._expect("rgb" in arrays, f"rgb {shapes['rgb']}", "rgb none")
+        for name in shapes.keys() & arrays.keys():
+            got = list(arrays[name].shape)
+            self._expect(got == shapes[name], f"{name} {shapes[name]}", f"{name} {got}")
         rgb = torch.from_numpy(arrays["rgb"])
         if rgb.dtype == torch.uint8:
             rgb = rgb / 255
         depth = torch.tensor(math.inf).expand(size)
         if "depth" in arrays:
-            depth = torch.from_numpy(arrays["depth"]).float() / self._scene.unit_length
+            in_units_of_data = torch.from_numpy(arrays["depth"])
+            depth = in_units_of_data.float() / self._scene.unit_length
         alpha = torch.ones(()).expand(size)
         if "alpha" in arrays:
             alpha = torch.from_numpy(arrays["alpha"]).float()

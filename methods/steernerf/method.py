@@ -97,17 +97,28 @@ class SteerNerf(OnField):
         self.compile_s = compile_kernels(type(self), self.setup.backend, log)
         with torch_threads(budget.threads):
             self.trained = train_field(self.setup, scene, budget, log)
-            given = self.trained, self.setup, self.stage2, scene, budget, log
-            self.pipeline, trained, seconds, peak = train_stage2(*given)
+            self.pipeline, trained, seconds, peak = train_stage2(
+                self.trained,
+                self.setup,
+                self.stage2,
+                scene,
+                budget,
+                log,
+            )
         self.train_s = self.trained.train_s + seconds
         self.train_peak_bytes = max(self.trained.train_peak_bytes, peak)
-        renderer, views = self.pipeline.renderer, (self.engine.samples, self.setup.seed)
+        renderer = self.pipeline.renderer
+        views = self.engine.samples, self.setup.seed
 
         def samples() -> list[Tensor]:
             return recorded_inputs(self.pipeline, scene, self.stage2.joint, *views, log)
 
         def folder() -> Path:
-            key = {"trained": trained, "engine": self.engine.key(), "recorded": digest(type(self))}
+            key = {
+                "trained": trained,
+                "engine": self.engine.key(),
+                "recorded": digest(type(self)),
+            }
             return log.stage_dir("network", key)
 
         renderer.engine = self.built = self.engine.build(renderer.network, samples, folder, log)

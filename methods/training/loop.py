@@ -102,21 +102,26 @@ def _drive(training: Training, finished: Path, label: str, log: Log) -> None:
     if unfinished.exists():
         load(training, unfinished)
         log.info(f"going on from step {training.step} of {unfinished}")
-    began, saved = time.monotonic() - training.seconds, time.monotonic()
+    saved = time.monotonic()
+    began = saved - training.seconds
     means: dict[str, float] = {}
     with log.progress(label, training.steps) as progress:
         progress.advance(training.step)
         while training.step < training.steps:
-            errors = training.advance()
-            means |= {k: 0.99 * means.get(k, mse) + 0.01 * mse for k, mse in errors.items()}
-            shown = {k: -10 * math.log10(max(mse, 1e-10)) for k, mse in means.items()}
-            progress.advance(note=", ".join(f"{k} {db:.1f} dB".strip() for k, db in shown.items()))
+            for name, mse in training.advance().items():
+                means[name] = 0.99 * means.get(name, mse) + 0.01 * mse
+            progress.advance(note=", ".join(map(_decibels, means.items())))
             training.seconds = time.monotonic() - began
             if time.monotonic() - saved > CHECKPOINT_S:
                 save(training, unfinished)
                 saved = time.monotonic()
     save(training, finished, done=True)
     unfinished.unlink(missing_ok=True)
+
+
+def _decibels(error: tuple[str, float]) -> str:
+    name, mse = error
+    return f"{name} {-10 * math.log10(max(mse, 1e-10)):.1f} dB".strip()
 
 
 def save(training: Training, path: Path, done: bool = False) -> None:
