@@ -15,6 +15,7 @@ What else the class may have, as `serve` explains, is optional. The messages tha
 are in docs/external.md of steerbench.
 """
 
+import hashlib
 import json
 import math
 import os
@@ -29,6 +30,8 @@ import time
 import traceback
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from urllib.parse import urlparse
+from urllib.request import url2pathname
 
 import numpy as np
 
@@ -206,7 +209,9 @@ def serve(kind):
     peak_bytes(): its peak memory, None: unknown; without it, that of this process or its GPU
     name, device, precision, memory: attributes for rows; `memory`: preceding frames that are used
     knobs: a dict of settings that need no new training, each with a list of values to try
-    files: those that the pictures depend on, beside the modules that are loaded
+    files: those that the pictures depend on, beside the modules that are loaded once it is made
+    late: whether modules that are loaded afterwards need no key, because versions of packages stand
+        for them; otherwise they are refused
     notes: lines to show to the user once it has loaded
     """
     if VARIABLE not in os.environ:
@@ -257,7 +262,10 @@ def _converse(channel, kind):
             of_torch = {k: x.detach().cpu() for k, x in arrays.items() if hasattr(x, "detach")}
             arrays.update({k: x.numpy() for k, x in of_torch.items()})
         elif message == "sizes":
-            answer = {"sizes": renderer.sizes() if hasattr(renderer, "sizes") else stored}
+            sizes = renderer.sizes() if hasattr(renderer, "sizes") else stored
+            answer = {"sizes": sizes}
+            if not getattr(renderer, "late", False):
+                answer["files"] = _files()
         else:
             raise ValueError(f"steerbench asked for {message!r}, which this worker does not know")
         channel.send(message, arrays, **answer)
@@ -289,11 +297,27 @@ def _files():
 
 
 def _packages():
-    """The version of every package of this environment, and of Python."""
+    """The version of every package of this environment, and of Python; of one that was installed
+    so that it can be edited, also a digest of its files."""
     from importlib import metadata  # takes 0.1 s, while steerbench waits
 
-    found = {each.metadata["Name"]: each.version for each in metadata.distributions()}
-    return {"python": sys.version.split()[0], **{str(k): str(v) for k, v in found.items()}}
+    found = {"python": sys.version.split()[0]}
+    for package in metadata.distributions():
+        found[str(package.metadata["Name"])] = str(package.version) + _edited(package)
+    return found
+
+
+def _edited(package):
+    """A digest of the Python files of a package that `pip install -e` installed, else empty."""
+    with suppress(OSError, ValueError, KeyError):
+        origin = json.loads(package.read_text("direct_url.json") or "{}")
+        if origin.get("dir_info", {}).get("editable"):
+            digest = hashlib.sha256()
+            folder = Path(url2pathname(urlparse(origin["url"]).path))
+            for path in sorted(folder.rglob("*.py")):
+                digest.update(path.read_bytes())
+            return " " + digest.hexdigest()
+    return ""
 
 
 def _now():

@@ -10,19 +10,37 @@ import hashlib
 import importlib.util
 import os
 import platform
+import re
 import subprocess
 import sys
+import sysconfig
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from bench.errors import SteerbenchError
+from bench.errors import SteerbenchError, unexpected
 
 ROOT = Path(__file__).resolve().parent.parent
 OURS = ("bench", "methods")
+STDLIB = Path(sysconfig.get_paths()["stdlib"])
+INSTALLED = {"site-packages", "dist-packages"}
+LEFT_OUT = re.compile(r"/(\.|__pycache__/)")  # hidden files and folders, and what Python compiles
 CHECKS = ("cases.py", "experiments.py")  # the checks of their folder, which affect no results
+
+TUNING = re.compile(
+    "(ATEN|CUBLAS|CUDA|CUDNN|DNNL|GOMP|KMP|MALLOC|MKL|NUMBA|NVIDIA|OMP|ONEDNN|OPENBLAS|OV|PYTORCH"
+    r"|TORCH|TRITON)_(?!\w*(CACHE|DIR|HOME|PATH))|LD_PRELOAD$|THP_MEM_ALLOC_ENABLE$"
+)
+"""Variables that change how fast libraries compute, or what; not those that name their folders."""
+
+OF_TIMES = (
+    *("CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"),
+    *("OMP_PROC_BIND", "OMP_PLACES", "KMP_AFFINITY", "GOMP_SPINCOUNT", "THP_MEM_ALLOC_ENABLE"),
+)
+"""Those that change times alone, or results by what a key holds anyway: GPUs, threads."""
 
 CPU_MARKS = ("cpu family", "model", "CPU implementer", "CPU part")
 """Fields of /proc/cpuinfo that tell apart processors which share a name but compute differently."""
@@ -47,6 +65,8 @@ def machine() -> dict[str, object]:
     return {
         "cpu": _cpu_model(),
         "cores": os.cpu_count(),
+        "affinity": len(os.sched_getaffinity(0)),
+        "environment": _tuning(),
         "threads": torch.get_num_threads(),
         "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
         "gpus": [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())],
@@ -65,19 +85,34 @@ def computed_by(*things: Any) -> dict[str, object]:
         "libraries": libraries(*things),
         "machine": {name: record[name] for name in ("cpu", "instructions", "gpus", "python")},
         "threads": record["threads"],
-        "kernel_threads": os.environ.get("NUMBA_NUM_THREADS", ""),  # upper limit
+        "environment": {name: of for name, of in _tuning().items() if name not in OF_TIMES},
     }
 
 
+def _tuning() -> dict[str, str]:
+    return {name: of for name, of in sorted(os.environ.items()) if TUNING.match(name)}
+
+
+def conditions_apart(then: Mapping[str, Any]) -> str:
+    """What may change times since a run with `then` as record of its machine, although it changes
+    no result; empty if nothing."""
+    cores = len(os.sched_getaffinity(0))
+    before = {"cores": then.get("affinity", cores), **then.get("environment", {})}
+    now = {"cores": cores, **_tuning()}
+    names = [name for name in before | now if before.get(name) != now.get(name)]
+    return ", ".join(f"{name}: {before.get(name)}, now {now.get(name)}" for name in names)
+
+
 def digest(*things: Any) -> str:
-    """SHA-256 of the names and bytes of the `sources` of `things`.
+    """SHA-256 of the names and the content of the `sources` of `things`: of Python what it
+    computes, whatever its comments and docstrings, of other files their bytes.
 
     Raises SteerbenchError if a file changed after this process first hashed it: it may still run
     the old code, and would store its results under the key of the new one.
     """
     total = hashlib.sha256()
     for name, path in sorted(sources(*things).items()):
-        content = sha256(path)
+        content = code_sha256(path)
         if _loaded(path) != content:
             raise SteerbenchError(f"{name} was changed while this process runs: start it again")
         total.update(f"{name} {content}\n".encode())
@@ -86,19 +121,86 @@ def digest(*things: Any) -> str:
 
 @cache
 def _loaded(path: Path) -> str:
-    """SHA-256 of a file of code as this process has loaded it: as it was when first asked for."""
-    return sha256(path)
+    """`code_sha256` of a file as this process has loaded it: as it was when first asked for."""
+    return code_sha256(path)
 
 
 def sha256(path: Path) -> str:
-    """SHA-256 of a file, read again only if its time of change differs."""
-    return _sha256(path, path.stat().st_mtime_ns)
+    """SHA-256 of a file, read again only if it has changed."""
+    return _sha256(path, _stamp(path))
+
+
+def code_sha256(path: Path) -> str:
+    """SHA-256 of what a file of Python computes; of another file, as `sha256`."""
+    return _module(path, _stamp(path)).sha256 if path.suffix == ".py" else sha256(path)
+
+
+def _stamp(path: Path) -> tuple[int, ...]:
+    """Changes whenever the content of a file does."""
+    now = path.stat()
+    return now.st_mtime_ns, now.st_ctime_ns, now.st_size, now.st_ino
 
 
 @cache
-def _sha256(path: Path, changed: int) -> str:
+def _sha256(path: Path, stamp: tuple[int, ...]) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+class _Module(NamedTuple):
+    """What is known of a file of Python: the modules, and names from modules, that it imports
+    anywhere in its code; SHA-256 of its syntax tree."""
+
+    imports: tuple[str, ...]
+    sha256: str
+
+
+@cache
+def _module(path: Path, stamp: tuple[int, ...]) -> _Module:
+    content = path.read_bytes()
+    try:
+        tree = ast.parse(content)
+    except (SyntaxError, ValueError):  # a template, or of another version of Python
+        return _Module((), hashlib.sha256(content).hexdigest())
+    imports: list[str] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            imports += (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            imports += (f"{node.module}.{alias.name}" for alias in node.names)
+    parts: list[str] = []
+    _write_tree(tree, parts, documented=b"__doc__" in content)
+    return _Module(tuple(imports), hashlib.sha256("".join(parts).encode()).hexdigest())
+
+
+UNREAD = ("ctx", "kind", "type_comment", "type_ignores")  # fields that change nothing
+
+
+def _write_tree(node: object, parts: list[str], documented: bool) -> None:
+    """Append a syntax tree as text, without positions and, unless code reads what is `documented`,
+    without docstrings: the same in all versions of Python that parse it alike."""
+    if isinstance(node, list):
+        parts.append("[")
+        for each in node:
+            if documented or not _is_text(each):
+                _write_tree(each, parts, documented)
+        parts.append("]")
+    elif isinstance(node, ast.AST):
+        parts.append(f"{type(node).__name__}(")
+        for name in node._fields:
+            value = getattr(node, name, None)
+            if name not in UNREAD and value not in (None, []):
+                parts.append(f"{name}=")
+                _write_tree(value, parts, documented)
+        parts.append(")")
+    else:
+        parts.append(f"{node!r},")
+
+
+def _is_text(node: object) -> bool:
+    """Whether a statement is a text alone, as docstrings are."""
+    alone = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    return alone and isinstance(node.value.value, str)  # type: ignore[attr-defined]
 
 
 def libraries(*things: Any) -> dict[str, str]:
@@ -128,9 +230,14 @@ def sources(*things: Any) -> dict[str, Path]:
     """
     collected: dict[str, Path] = {}
     seen: set[str] = set()
-    pending = {
-        name: path for thing in things for name, path in _files(thing.__module__, home=True).items()
-    }
+    pending: dict[str, Path] = {}
+    for thing in things:
+        own = _files(thing.__module__, home=True)
+        if not own:
+            raise unexpected(
+                thing.__module__, "a module in a file, whose code a key can hold", thing
+            )
+        pending |= own
     while pending:
         name, path = pending.popitem()
         collected[name] = path
@@ -141,28 +248,64 @@ def sources(*things: Any) -> dict[str, Path]:
     return collected
 
 
+def check_unchanged(loaded: Collection[str], *things: Any) -> None:
+    """Raise SteerbenchError if results since `loaded` were the names of all modules may come from
+    code that the key of `things` does not hold: a file was changed, or a module was imported that
+    is not among their `sources`."""
+    digest(*things)
+    known = {path.resolve() for path in sources(*things).values()}
+    ours = [ROOT / top for top in (*OURS, "reports", "sweeps")]
+    for name in sys.modules.keys() - loaded:
+        file = getattr(sys.modules[name], "__file__", None)
+        if not file or not is_edited(file):
+            continue
+        path = Path(file).resolve()
+        if path not in known and not set(path.parents).intersection(ours):
+            raise SteerbenchError(
+                f"{name} was imported while the run went on, so its key does not hold {file}: "
+                "import it at the top of a file of the method, and run again"
+            )
+
+
 def _files(name: str, home: bool = False) -> dict[str, Path]:
     """The files of the module or package `name`, or of the module that defines that name.
 
     Empty for installed distributions and Python itself, whose versions are enough, unless it is the
-    `home` of a thing.
+    `home` of a thing, or was installed so that it can be edited.
     """
     top = name.partition(".")[0]
     if top in OURS:
         return {path.relative_to(ROOT).as_posix(): path for path in _ours(name)}
-    if not home and (top in _distributions() or top in sys.stdlib_module_names):
+    if not home and top in sys.stdlib_module_names:
         return {}
-    spec = importlib.util.find_spec(top)
-    if spec is None:
+    try:
+        spec = importlib.util.find_spec(top)
+    except (ImportError, ValueError):  # one that was made while the process runs
+        return {}
+    if spec is None or not (home or is_edited(spec.origin or _first_place(spec))):
         return {}
     if spec.submodule_search_locations is None:
         return {Path(str(spec.origin)).name: Path(str(spec.origin))} if spec.has_location else {}
-    return {
-        path.relative_to(Path(folder).parent).as_posix(): path
-        for folder in spec.submodule_search_locations
-        for path in Path(folder).rglob("*")
-        if path.is_file() and "__pycache__" not in path.parts
-    }
+    files = {}
+    for folder in map(Path, spec.submodule_search_locations):
+        for path in folder.rglob("*"):
+            name = path.relative_to(folder.parent).as_posix()
+            if path.is_file() and not LEFT_OUT.search(f"/{name}"):
+                files[name] = path
+    return files
+
+
+def _first_place(spec: Any) -> str:
+    """The folder of a package without an `__init__`; empty if it has none."""
+    return next(iter(spec.submodule_search_locations or ()), "")
+
+
+def is_edited(file: str | None) -> bool:
+    """Whether a module at `file` may change under one version: it lies neither in Python itself nor
+    where packages are installed."""
+    place = Path(file or "built-in")
+    installed = INSTALLED.intersection(place.parts) or STDLIB in place.parents
+    return place.is_absolute() and not installed
 
 
 def _ours(name: str) -> list[Path]:
@@ -177,19 +320,7 @@ def _ours(name: str) -> list[Path]:
 
 
 def _imports(path: Path) -> tuple[str, ...]:
-    """The modules, and names from modules, that a file imports anywhere in its code."""
-    return _parsed(path, path.stat().st_mtime_ns) if path.suffix == ".py" else ()
-
-
-@cache
-def _parsed(path: Path, changed: int) -> tuple[str, ...]:
-    names: list[str] = []
-    for node in ast.walk(ast.parse(path.read_bytes())):
-        if isinstance(node, ast.Import):
-            names += (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            names += (f"{node.module}.{alias.name}" for alias in node.names)
-    return tuple(names)
+    return _module(path, _stamp(path)).imports if path.suffix == ".py" else ()
 
 
 _version = cache(metadata.version)  # of a distribution

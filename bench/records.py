@@ -96,3 +96,14 @@ def fits(value: object, hint: Any) -> bool:
     parts: Iterable[object] = value if isinstance(value, list) and origin is not tuple else ()
     parts = value.values() if isinstance(value, dict) else parts
     return all(fits(part, inner[-1]) for part in parts) if inner else True
+
+
+def coerced(value: Any, hint: Any) -> Any:
+    """A `value` that fits `hint` as that type has it: a whole number as a float where only floats
+    are meant, also inside lists and objects."""
+    if isinstance(value, list):
+        inner = [*get_args(hint), Any][0]
+        return [coerced(each, inner) for each in value]
+    meant = get_args(hint) if get_origin(hint) is UnionType else (hint,)
+    whole = type(value) is int and int not in meant
+    return float(value) if whole and float in meant else value

@@ -24,7 +24,7 @@ from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable, unexpected, unknown
 from bench.isolation import fit
 from bench.protocol import EvaluationProtocol
-from bench.records import fits
+from bench.records import coerced, fits
 from bench.scenes.assemble import hold_out
 from bench.trajectories import Trajectory
 from bench.types import DEVICE, Log, Method, Scene
@@ -240,13 +240,28 @@ def build(config: DictConfig, group: str, *args: Any, **extra: Any) -> Any:
     given = [*list(inspect.signature(target).parameters)[: len(args)], *extra]
     check_settings(target, node, f"{group}.", given)
     try:
-        prepared = instantiate(node, _partial_=True, _convert_="all")
+        prepared = instantiate(as_declared(node), _partial_=True, _convert_="all")
         return prepared(*args, **extra)
     except (InstantiationException, ValueError) as error:
         cause = (isinstance(error, InstantiationException) and error.__cause__) or error
         if isinstance(cause, ValueError):  # the target's message names the setting
             raise SteerbenchError(f"{group}: {cause}") from error
         raise cause from error
+
+
+def as_declared(node: Any) -> Any:
+    """The settings of a node in the types that its `_target_` and those below it declare: `2` and
+    `2.0` are the same length, in one key and one training."""
+    if not isinstance(node, dict):
+        return node
+    hints = _hints(target_of(node)) if "_target_" in node else {}
+    return {name: coerced(as_declared(value), hints.get(name, Any)) for name, value in node.items()}
+
+
+def _hints(target: Any) -> dict[str, Any]:
+    # Types of inherited dataclass fields must be looked up in the modules of its bases.
+    plain = inspect.isclass(target) and not is_dataclass(target)
+    return get_type_hints(target.__init__ if plain else target)
 
 
 def check_settings(
@@ -257,9 +272,7 @@ def check_settings(
     Errors put `prefix` before the names. Parameters `given` by the caller are not settings.
     Settings that are nodes with a `_target_` are checked against that target.
     """
-    # Types of inherited dataclass fields must be looked up in the modules of its bases.
-    plain = inspect.isclass(target) and not is_dataclass(target)
-    hints = get_type_hints(target.__init__ if plain else target)
+    hints = _hints(target)
     parameters = inspect.signature(target).parameters
     names = [name for name in parameters if name not in given]
     if not settings.get("_partial_"):

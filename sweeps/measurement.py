@@ -1,9 +1,10 @@
 """Jobs: what identifies them, and their runs, which are found in the store or measured now."""
 
-import hashlib
 import shlex
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,14 +16,16 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, explained, unexpected
+from bench.isolation import put_back
 from bench.measure import MethodFailed, Task, measure, train
-from bench.provenance import computed_by
+from bench.provenance import check_unchanged, code_sha256, computed_by
 from bench.results import Store, content_key
 from bench.sharing import whole
 from bench.trajectories import resized
-from bench.types import Log, Method
+from bench.types import Budget, Log, Method, Scene
 from reports.runs import Run, readable
 from sweeps.configured import (
+    as_declared,
     build,
     checked_settings,
     protocol_of,
@@ -55,7 +58,7 @@ def described(config: DictConfig) -> dict[str, Any]:
     unused = ["exclusive"] if plain.get("exclusive") is True else []
     unused += [] if "engine" in plain["method"] else ["engine", "precision"]
     left_out = ("split", "tables", "in_turns", *PLACES, *unused)
-    kept = {key: value for key, value in plain.items() if key not in left_out}
+    kept = {key: as_declared(value) for key, value in plain.items() if key not in left_out}
     for group, place in (("scene", "root"), ("method", "folders")):
         kept[group] = {name: value for name, value in plain[group].items() if name != place}
     if "path" in kept["scene"]:
@@ -178,6 +181,16 @@ class _Ready:
     method: Method
     task: Task
     parts: Mapping[str, Any]
+    loaded: frozenset[str]  # the names of all modules before
+
+    def check_unchanged(self) -> None:
+        """Raise SteerbenchError if its figures may be of other code or files than `parts` hold."""
+        check_unchanged(self.loaded, measure, *_targets(self.job.settings))
+        files = (*getattr(self.method, "reads", ()), *self.task.trajectory.reads)
+        if self.parts["files"] != [code_sha256(file) for file in files if file.is_file()]:
+            raise SteerbenchError(
+                f"a file that {self.method.name} or its path reads was changed meanwhile: run again"
+            )
 
     @cached_property
     def run(self) -> str:
@@ -216,10 +229,14 @@ def _needed(job: Job, jobs: Sequence[Job]) -> bool:
 
 
 def _prepared(job: Job, log: Log) -> _Ready:
-    config, settings = job.config, checked_settings(job.config)
+    loaded = frozenset(sys.modules)
+    config = job.config
+    settings = checked_settings(config)
     use_threads(settings)
     torch.manual_seed(settings.seed)
-    method, budget = (build(config, name) for name in ("method", "budget"))
+    with put_back():
+        method = build(config, "method")
+    budget = build(config, "budget")
     protocol = protocol_of(config)
     scene = scene_of(config)
     trajectory = trajectory_of(config, scene, log)
@@ -227,17 +244,38 @@ def _prepared(job: Job, log: Log) -> _Ready:
         trajectory = resized(trajectory, *settings.frame_size)
     weights = Path(settings.weights_dir) if settings.weights_dir else None
     files = (*getattr(method, "reads", ()), *trajectory.reads)
+    scored = scene.splits.get(trajectory.split)
     parts = {
-        "config": job.settings,
+        "config": _resolved(job.settings, method, scene, budget),
         "scene": scene.digest,
+        "names": content_key({"names": list(scored.names if scored else ())}),
         "resolved": method.settings(),
-        "files": [hashlib.sha256(f.read_bytes()).hexdigest() for f in files if f.is_file()],
+        "files": [code_sha256(file) for file in files if file.is_file()],
         **computed_by(measure, *_targets(job.settings)),
         "lpips": protocol.find_lpips(weights, log),
         **({"turns": job.turns} if job.turns else {}),
     }
     task = Task(scene, trajectory, protocol, budget, settings.seed, weights, settings.pictures)
-    return _Ready(job, method, task, parts)
+    return _Ready(job, method, task, parts, loaded)
+
+
+def _resolved(
+    settings: Mapping[str, Any], method: Method, scene: Scene, budget: Budget
+) -> dict[str, Any]:
+    """The `settings` of a job with what stands for something else (null, auto) as what it became:
+    equal runs have one key, and tables show it."""
+    found = deepcopy(dict(settings))
+    computed = method.settings()
+    for name in found.keys() & {"device", "backend"}:
+        found[name] = computed[name]
+    became = getattr(method, "became", None)
+    for name, value in became(scene, budget).items() if became else ():
+        *groups, last = name.split(".")
+        node = found["method"]
+        for group in groups:
+            node = node[group]
+        node[last] = value
+    return found
 
 
 def _targets(node: Any) -> Iterator[Any]:
@@ -283,6 +321,8 @@ def _turn(ready: Sequence[_Ready], log: ConsoleLog, threads: int | None = None) 
 def _measure(ready: Sequence[_Ready], log: Log) -> None:
     """Measure all, and put them in the place of what an interruption has left of them."""
     measurements = measure([each.method for each in ready], ready[0].task, log)
+    for each in ready:
+        each.check_unchanged()
     for each in ready if len(ready) > 1 else ():
         each.job.store.remove(each.run)
     for each, measurement in zip(ready, measurements, strict=True):

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from bench.errors import SteerbenchError, explained, unexpected
-from bench.provenance import computed_by, sha256
+from bench.errors import SteerbenchError, explained, some, unexpected
+from bench.provenance import code_sha256, computed_by
 from bench.records import read_record
 from bench.results import content_key
 from bench.scenes.export import data_camera, picture_file, write_blender
@@ -164,6 +164,8 @@ class External:
         with missing(finished, log) as untrained:
             if untrained:
                 self.train_s = self._train(folder, job, log)
+                if log.stage_dir("external", self._key(job)) != folder:
+                    raise SteerbenchError(f"{self.name}: its code was changed meanwhile: run again")
                 if "load" in can:  # otherwise the next process trains again, alone
                     with whole(finished) as new:
                         new.write_text(json.dumps({"train_s": self.train_s}) + "\n")
@@ -193,9 +195,9 @@ class External:
             "name": self.name,
             "options": {name: value for name, value in self.options.items() if name not in knobs},
             "command": [
-                sha256(Path(word)) if Path(word).is_file() else word for word in self._typed
+                code_sha256(Path(word)) if Path(word).is_file() else word for word in self._typed
             ],
-            "files": [sha256(file) for file in self.reads],
+            "files": [code_sha256(file) for file in self.reads],
             "environment": [self._packages, dict(self.environment)],
             "device": self._about["device"],
             **computed_by(write_blender),
@@ -283,9 +285,16 @@ class External:
         self._worker.expect(holds, "render", expected, got)
 
     def sizes(self) -> dict[str, int]:
+        """The bytes of its components. Asked last: what it has loaded meanwhile is known now."""
         told, _ = self._worker.ask("sizes", self.frame_s, {})
         sizes: Any = told.get("sizes")
         self._worker.expect(_counts(sizes), "sizes", "sizes in bytes", told)
+        late = {*told.get("files", ())} - {*self._about["files"], *map(str, self.reads)}
+        if late:
+            raise SteerbenchError(
+                f"{self.name} has loaded {some(sorted(late))} after it was made, so no key holds "
+                "that: import it at the top of the worker, or list it in its `files`"
+            )
         return sizes
 
 

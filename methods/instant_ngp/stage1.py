@@ -16,7 +16,7 @@ from methods.kernels.dispatch import by_kernel
 from methods.kernels.encode import HashGrid
 from methods.kernels.settings import Checked
 from methods.kernels.types import Occupancy
-from methods.rendering.occupancy import DensityGrid
+from methods.rendering.occupancy import STEP, DensityGrid
 from methods.rendering.sampling import Sampling
 from methods.training import checkpoint, loop
 
@@ -71,14 +71,24 @@ class Setup:
         grid = self.grid.of(scene) if isinstance(self.grid, SuitedGrid) else self.grid
         return replace(self, grid=grid)
 
+    def became(self, scene: Scene, budget: Budget) -> dict[str, object]:
+        """What settings that are left to scene, budget and machine became, by name."""
+        return {
+            "grid.log2_table": self.suited(scene).grid.log2_table,
+            "training.march_step": self.training.sampling(budget).step / STEP,
+            "device": str(self.device),
+            "backend": self.backend,
+        }
+
     def key(self, scene: Scene, budget: Budget) -> dict[str, object]:
         """Everything the trained field depends on."""
+        march_step = self.became(scene, budget)["training.march_step"]
         return {
             "scene": scene.digest,
             "steps": budget.steps,
             "samples": budget.samples,
             "grid": asdict(self.suited(scene).grid),
-            "training": asdict(self.training),
+            "training": {**asdict(self.training), "march_step": march_step},
             "precision": self.precision,
             "backend": by_kernel(self.backend, train_field, self.device),
             "device": self.device.type,
@@ -110,6 +120,10 @@ class OnField(Checked):
 
     def settings(self) -> dict[str, str]:
         return self.setup.settings(type(self))
+
+    def became(self, scene: Scene, budget: Budget) -> dict[str, object]:
+        """See `bench.types.Method`."""
+        return self.setup.became(scene, budget)
 
 
 @dataclass(frozen=True)

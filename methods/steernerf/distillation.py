@@ -39,6 +39,7 @@ def distilled_views(
                     rgb = render_frame(placed, occupancy, background, probe, render).values
                     pictures[name] = (rgb.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
                     progress.advance()
+            digest(distilled_views)  # refuses if the code was changed meanwhile
             checkpoint.write(path, pictures, {"seconds": time.monotonic() - began})
     pictures, figures = checkpoint.read(path)
     with checkpoint.restoring(path):

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from bench.memory import MemoryMeter
+from bench.provenance import digest
 from bench.sharing import missing
 from bench.types import Log, SteerbenchError
 from methods.training import checkpoint
@@ -115,6 +116,7 @@ def _drive(training: Training, finished: Path, label: str, log: Log) -> None:
             if time.monotonic() - saved > CHECKPOINT_S:
                 save(training, unfinished)
                 saved = time.monotonic()
+    digest(type(training))  # refuses if its code was changed: the key is that of the old one
     save(training, finished, done=True)
     unfinished.unlink(missing_ok=True)
 

@@ -1,7 +1,9 @@
 """The digest of a thing follows the files it stands on; commit and machine are as they are."""
 
+import importlib
 import shutil
 import subprocess
+import sys
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -133,8 +135,63 @@ def test_a_file_that_is_changed_while_a_process_runs_ends_it(tree):
 def test_what_a_thing_stands_on_changes_its_digest_and_nothing_else(tree, name, counts):
     before = digest(METHOD)
     assert digest(METHOD) == before
-    write(tree, {name: FILES.get(name, "") + "# a comment\n"})
+    write(tree, {name: FILES.get(name, "") + "B = 1\n"})
     assert (digest(METHOD) != before) == counts
+
+
+PLAIN = """
+import math
+
+WIDTH = 3
+
+
+def area(side):
+    return math.pi * side * f"{side!r:>{WIDTH}}"
+"""
+DOCUMENTED = '''"""A module, now with words."""
+import math  # not numpy
+
+WIDTH = 3
+"""Of a text."""
+
+
+def area(
+    side,
+):
+    """What it is."""
+    # Long lines
+    # are no other code.
+
+    return math.pi * side * f"{side!r:>{WIDTH}}"
+'''
+
+
+def test_comments_docstrings_and_layout_are_free_and_all_that_computes_counts(tree):
+    def of(text: str) -> str:
+        write(tree, {"bench/ruler.py": text})
+        return digest(METHOD)
+
+    before = of(PLAIN)
+    assert of(DOCUMENTED) == before
+    changes = {"= 3": "= 4", "math.pi": "math.e", "area": "Area", "!r": "!s", "side *": "side /"}
+    assert len({of(PLAIN.replace(*change)) for change in changes.items()} | {before}) == 6
+    assert of(PLAIN.replace("WIDTH = 3", "WIDTH = 3.0")) != before
+    assert of(PLAIN.replace("WIDTH = 3", 'WIDTH = "3"')) != before
+    # Here the words are read, by a program.
+    read = [of(text + "print(__doc__)\n") for text in (PLAIN, DOCUMENTED)]
+    assert read[0] != read[1]
+    assert of("print 3\n") != of("print 4\n")  # of Python 2
+
+
+def test_a_comment_may_be_written_while_a_process_runs(tree):
+    before = digest(METHOD)
+    write(tree, {"bench/ruler.py": "# why\n"})
+    assert provenance.digest(METHOD) == before
+
+
+def test_code_that_is_in_no_file_has_no_key():
+    with pytest.raises(SteerbenchError, match="nowhere: expected a class or function in a file"):
+        digest(defined_in("nowhere"))
 
 
 def test_the_digest_depends_on_names_but_not_on_where_the_project_lies_nor_on_an_order(
@@ -176,10 +233,10 @@ def test_all_of_a_plugin_and_what_it_imports_of_ours_count_and_not_where_it_lies
 ):
     folder, thing = plugin
     before = digest(thing)
-    write(tree, {"bench/unused.py": "# another\n"})
+    write(tree, {"bench/unused.py": "B = 1\n"})
     write(folder.parent, {"beside.py": "", f"{folder.name}/__pycache__/helper.pyc": ""})
     assert digest(thing) == before
-    write(tree, {"bench/ruler.py": "# another\n"})
+    write(tree, {"bench/ruler.py": "B = 1\n"})
     assert digest(thing) != before
     before = digest(thing)
     elsewhere = folder.parent.with_name("elsewhere")
@@ -190,6 +247,51 @@ def test_all_of_a_plugin_and_what_it_imports_of_ours_count_and_not_where_it_lies
         before = digest(thing)
         (elsewhere / folder.name / name).write_text("A = 2\n")
         assert digest(thing) != before
+
+
+@pytest.mark.parametrize("place", ["site-packages", "src"])
+def test_a_package_counts_by_its_version_where_packages_are_installed_and_else_by_its_files(
+    place, tree, tmp_path, monkeypatch
+):
+    """`pip install -e` leaves it where it is edited, whatever its version."""
+    name = f"edited_in_{place.replace('-', '_')}"
+    home = tmp_path / "else" / place
+    info = f"{name}-1.0.dist-info"
+    files = {f"{name}/__init__.py": "", f"{name}/inner/part.py": "A = 1\n"}
+    files |= {f"{info}/METADATA": f"Name: {name}\nVersion: 1.0\n", f"{info}/top_level.txt": name}
+    write(home, files)
+    monkeypatch.syspath_prepend(home)
+    monkeypatch.setattr(provenance, "_distributions", metadata.packages_distributions)
+    write(tree, {"bench/ruler.py": f"import {name}\n"})
+    before = digest(METHOD)
+    assert libraries(METHOD)[name] == "1.0"
+    write(home, {f"{name}/inner/part.py": "A = 2\n"})
+    assert (digest(METHOD) != before) == (place == "src")
+
+
+def test_a_module_that_is_imported_while_a_run_goes_on_is_refused(plugin, tmp_path):
+    _, thing = plugin
+    write(tmp_path / "site", {"imported_late.py": ""})
+    loaded = set(sys.modules)
+    importlib.import_module(f"{thing.__module__.partition('.')[0]}.helper")  # one of its files
+    importlib.import_module("colorsys")  # of Python
+    provenance._loaded.cache_clear()
+    provenance.check_unchanged(loaded, thing)
+    importlib.import_module("imported_late")
+    with pytest.raises(SteerbenchError, match="imported_late was imported while the run went on"):
+        provenance.check_unchanged(loaded, thing)
+    del sys.modules["imported_late"]
+
+
+def test_what_may_have_changed_times_is_said(monkeypatch):
+    then = provenance.machine()
+    assert provenance.conditions_apart(then) == ""
+    monkeypatch.setenv("OMP_PROC_BIND", "close")
+    one_core = {**then, "affinity": 99}
+    assert provenance.conditions_apart(then) == "OMP_PROC_BIND: None, now close"
+    assert provenance.conditions_apart(one_core).startswith("cores: 99, now ")
+    monkeypatch.setenv("TRITON_CACHE_DIR", "elsewhere")  # which changes nothing
+    assert "TRITON" not in provenance.conditions_apart(then)
 
 
 def test_a_single_file_counts_with_the_module_that_it_imports(tree, tmp_path, monkeypatch):
@@ -221,11 +323,15 @@ def test_a_library_that_was_half_removed_has_no_version_and_counts_as_absent(tre
         lambda patch: patch.setattr(provenance, "machine", lambda: {**MACHINE, "python": "4.0"}),
         lambda patch: patch.setattr(provenance, "libraries", lambda *_: {"torch": "99"}),
         lambda patch: patch.setenv("NUMBA_NUM_THREADS", "99"),
+        lambda patch: patch.setenv("ATEN_CPU_CAPABILITY", "default"),
+        lambda patch: patch.setenv("ONEDNN_MAX_CPU_ISA", "SSE41"),
     ],
 )
 def test_what_else_decides_a_result_is_part_of_its_key(change, monkeypatch):
     monkeypatch.setattr(provenance, "machine", lambda: MACHINE)
     before = computed_by(measure)
+    assert computed_by(measure) == before
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")  # a key has the names of GPUs
     assert computed_by(measure) == before
     change(monkeypatch)
     assert computed_by(measure) != before

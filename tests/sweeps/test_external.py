@@ -82,7 +82,7 @@ def test_the_worker_of_the_document_is_a_row_of_ten_lines(steerbench, documented
 
 def test_another_worker_or_another_option_is_another_run(run, write, tmp_path):
     counts = []
-    for lines, option in (("", 0.5), ("", 0.25), ("'changed'", 0.25), ("'changed'", 0.25)):
+    for lines, option in (("", 0.5), ("", 0.25), ("CHANGED = 1", 0.25), ("CHANGED = 1", 0.25)):
         write(lines)
         assert run(*EXTERNAL, f"++method.options.level={option}").status == 0
         counts.append(len(list(tmp_path.glob("outputs/runs/*"))))

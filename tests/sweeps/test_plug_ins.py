@@ -62,7 +62,7 @@ def test_a_change_in_a_module_is_a_new_run_of_a_new_process(call, folder, tmp_pa
     assert call("run", "method=mine", *SMALL).err.startswith("already measured")
     for number, name in enumerate(("helper.py", "renderer.py"), 2):
         with (folder / "mine" / name).open("a") as file:
-            file.write("# changed\n")
+            file.write("CHANGED = 1\n")
         refused = call("run", "method=mine", *SMALL)
         assert f"mine/{name} was changed while this process runs" in refused.err
         provenance._loaded.cache_clear()  # as a new process

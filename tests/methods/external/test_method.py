@@ -157,7 +157,9 @@ def test_what_it_was_trained_with_makes_another_training(
 
     assert stages() == stages() == 1
     assert stages(seed=4) == 2
-    worker(STORES, after="\nserve(Stores)\n")
+    worker(STORES, after="CHANGED = 1\nserve(Stores)\n")
+    assert stages() == 3
+    worker(STORES, after="CHANGED = 1  # by a comment\nserve(Stores)\n")
     assert stages() == 3
     (path.parent / "lib.py").write_text("")
     worker(STORES, after="import lib\nserve(Stores)\n")
