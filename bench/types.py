@@ -224,9 +224,6 @@ class Method(Protocol):
     them even if it only loads. It may also set `train_peak_bytes`, the peak of memory meanwhile, and
     `compile_s`, the seconds of compiling before the training, which are not among those of it.
 
-    A method may have `became(scene, budget)`: what settings of it that stand for something else
-    (null, auto) became there, by their names below `method.`; keys and tables have these.
-
     If `sees_scored` is true, `fit` is given all splits and the exact pictures, which rows say;
     otherwise the training split alone.
     """

@@ -4,7 +4,6 @@ import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -22,7 +21,7 @@ from bench.provenance import check_unchanged, code_sha256, computed_by
 from bench.results import Store, content_key
 from bench.sharing import whole
 from bench.trajectories import resized
-from bench.types import Budget, Log, Method, Scene
+from bench.types import Log, Method
 from reports.runs import Run, readable
 from sweeps.configured import (
     as_declared,
@@ -246,7 +245,7 @@ def _prepared(job: Job, log: Log) -> _Ready:
     files = (*getattr(method, "reads", ()), *trajectory.reads)
     scored = scene.splits.get(trajectory.split)
     parts = {
-        "config": _resolved(job.settings, method, scene, budget),
+        "config": job.settings,
         "scene": scene.digest,
         "names": content_key({"names": list(scored.names if scored else ())}),
         "resolved": method.settings(),
@@ -257,25 +256,6 @@ def _prepared(job: Job, log: Log) -> _Ready:
     }
     task = Task(scene, trajectory, protocol, budget, settings.seed, weights, settings.pictures)
     return _Ready(job, method, task, parts, loaded)
-
-
-def _resolved(
-    settings: Mapping[str, Any], method: Method, scene: Scene, budget: Budget
-) -> dict[str, Any]:
-    """The `settings` of a job with what stands for something else (null, auto) as what it became:
-    equal runs have one key, and tables show it."""
-    found = deepcopy(dict(settings))
-    computed = method.settings()
-    for name in found.keys() & {"device", "backend"}:
-        found[name] = computed[name]
-    became = getattr(method, "became", None)
-    for name, value in became(scene, budget).items() if became else ():
-        *groups, last = name.split(".")
-        node = found["method"]
-        for group in groups:
-            node = node[group]
-        node[last] = value
-    return found
 
 
 def _targets(node: Any) -> Iterator[Any]:

@@ -1,5 +1,6 @@
 """The project's own files agree with each other and with what is installed."""
 
+import ast
 import os
 import re
 import subprocess
@@ -46,15 +47,25 @@ def closure(requirements: list[str]) -> Iterator[Requirement]:
                 ]
 
 
-MOST_LINES = {"product": 31_000, "tests": 20_500}
-"""What is added is paid for with what is cut: lower these, never raise them."""
+MOST_NODES = {"product": 277_000, "tests": 184_500}
+"""Nodes of the syntax tree without docstrings, so that lines are free: lower these."""
+
+
+def nodes(path: Path) -> int:
+    every = ast.walk(ast.parse(path.read_text()))
+    return sum(not (isinstance(x, ast.Expr) and _is_text(x.value)) for x in every)
+
+
+def _is_text(node: ast.expr) -> bool:
+    return isinstance(node, ast.Constant) and isinstance(node.value, str)
 
 
 def test_there_is_no_more_code_than_there_was():
     product = [path for top in PACKAGES for path in (ROOT / top).rglob("*.py")]
-    files = {"product": [*product, ROOT / "steerbench.py"], "tests": (ROOT / "tests").rglob("*.py")}
+    product += [ROOT / "steerbench.py", ROOT / "steerbench_worker.py"]
+    files = {"product": product, "tests": (ROOT / "tests").rglob("*.py")}
     for part, of in files.items():
-        assert sum(len(path.read_text().splitlines()) for path in of) <= MOST_LINES[part], part
+        assert sum(map(nodes, of)) <= MOST_NODES[part], part
 
 
 def test_every_file_beside_the_sources_is_shipped():

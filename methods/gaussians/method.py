@@ -104,10 +104,5 @@ class GaussianSplatting(OnField):
         plain = sum(4 * x.numel() for x in self.gaussians.parameters())
         return {"gaussians": plain if self.stored == "fp32" else stored_bytes(self.gaussians)}
 
-    def became(self, scene: Scene, budget: Budget) -> dict[str, object]:
-        """See `bench.types.Method`."""
-        steps = self.steps or budget.renderer_steps
-        return {**super().became(scene, budget), "steps": steps}
-
     def settings(self) -> dict[str, str]:
         return super().settings() | {"field_precision": "fp32"}

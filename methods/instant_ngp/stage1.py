@@ -71,18 +71,9 @@ class Setup:
         grid = self.grid.of(scene) if isinstance(self.grid, SuitedGrid) else self.grid
         return replace(self, grid=grid)
 
-    def became(self, scene: Scene, budget: Budget) -> dict[str, object]:
-        """What settings that are left to scene, budget and machine became, by name."""
-        return {
-            "grid.log2_table": self.suited(scene).grid.log2_table,
-            "training.march_step": self.training.sampling(budget).step / STEP,
-            "device": str(self.device),
-            "backend": self.backend,
-        }
-
     def key(self, scene: Scene, budget: Budget) -> dict[str, object]:
         """Everything the trained field depends on."""
-        march_step = self.became(scene, budget)["training.march_step"]
+        march_step = self.training.sampling(budget).step / STEP
         return {
             "scene": scene.digest,
             "steps": budget.steps,
@@ -120,10 +111,6 @@ class OnField(Checked):
 
     def settings(self) -> dict[str, str]:
         return self.setup.settings(type(self))
-
-    def became(self, scene: Scene, budget: Budget) -> dict[str, object]:
-        """See `bench.types.Method`."""
-        return self.setup.became(scene, budget)
 
 
 @dataclass(frozen=True)

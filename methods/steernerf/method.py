@@ -132,11 +132,6 @@ class SteerNerf(OnField):
     def sizes(self) -> dict[str, int]:
         return self.trained.sizes() | {"renderer2d": self.built.size}
 
-    def became(self, scene: Scene, budget: Budget) -> dict[str, object]:
-        """See `bench.types.Method`."""
-        steps = self.steps or budget.renderer_steps
-        return {**super().became(scene, budget), "steps": steps}
-
     def settings(self) -> dict[str, str]:
         """Those of the field, with the engine and precision of the 2D renderer."""
         computed = self.engine.computed(self.setup.device)

@@ -102,10 +102,5 @@ class Student(Checked, ABC):
     def reset(self) -> None:
         """Do nothing: every frame stands alone."""
 
-    def became(self, scene: Scene, budget: Budget) -> dict[str, object]:
-        """See `bench.types.Method`."""
-        found = {f"teacher.{x}": of for x, of in self.teacher.became(scene, budget).items()}
-        return {**found, "steps": self.steps or budget.renderer_steps}
-
     def settings(self) -> dict[str, str]:
         return {**self.teacher.settings(type(self)), **self.computed}
