@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, explained, unexpected
-from bench.isolation import put_back
+from bench.isolation import Guard, put_back
 from bench.measure import MethodFailed, Task, measure, train
 from bench.provenance import check_unchanged, code_sha256, computed_by
 from bench.results import Store, content_key
@@ -27,6 +27,7 @@ from sweeps.configured import (
     as_declared,
     build,
     checked_settings,
+    forget_scene,
     protocol_of,
     scene_digest,
     scene_folder,
@@ -147,15 +148,23 @@ def obtain(jobs: Sequence[Job]) -> tuple[list[str], bool]:
     for whatever reason: the others can then be obtained without it.
     """
     log = ConsoleLog(jobs[0].outputs)
+    try:
+        return _obtained(jobs, log)
+    except Exception:
+        forget_scene()  # a method may have spoilt it
+        raise
+
+
+def _obtained(jobs: Sequence[Job], log: ConsoleLog) -> tuple[list[str], bool]:
     ready = _ready(jobs, log)
     measured = not _stored(ready)
     if measured:
         with _turn(ready, log, training_threads(jobs[0].config)):
-            train([each.method for each in ready], ready[0].task, log)
+            guard = train([each.method for each in ready], ready[0].task, log)
         with _turn(ready, log):
             measured = not _stored(ready)  # by another process meanwhile
             if measured:
-                _measure(ready, log)
+                _measure(ready, guard, log)
     return _told(ready, measured, log), measured
 
 
@@ -298,9 +307,9 @@ def _turn(ready: Sequence[_Ready], log: ConsoleLog, threads: int | None = None) 
         raise JobFailed(job) from failed.__cause__
 
 
-def _measure(ready: Sequence[_Ready], log: Log) -> None:
+def _measure(ready: Sequence[_Ready], guard: Guard, log: Log) -> None:
     """Measure all, and put them in the place of what an interruption has left of them."""
-    measurements = measure([each.method for each in ready], ready[0].task, log)
+    measurements = measure([each.method for each in ready], ready[0].task, log, guard)
     for each in ready:
         each.check_unchanged()
     for each in ready if len(ready) > 1 else ():
