@@ -27,7 +27,7 @@ UNKNOWN = [
           for word in ("demo", "a=b=c", "seed=[")),
         ("method=steernerf field=nerf", "field: each method brings its own"),
         ("scene=blender", "scene.path is not set: give scene.path=...\n"),
-        ("method.level=7", "method.level: expected 0 to 1, got 7\n"),
+        ("method.level=7", "method.level: expected 0 to 1, got 7.0\n"),
         ("split=holdout", "split: expected test or validation, got 'holdout'\n"),
         ("seed=one", "seed: expected int, got 'one'\n"),
         ("seed=-1", "seed: expected 0 or more, below 2^63, got -1\n"),
