@@ -96,11 +96,11 @@ def test_a_study_that_was_killed_measures_the_other_half(study, monkeypatch):
     measure, measured = measurement.measure, []
 
     def killed_at(limit: int):
-        def call(methods, task, log):
+        def call(methods, task, log, guard):
             if len(measured) == limit:
                 raise KeyboardInterrupt
             measured.append(len(methods))
-            return measure(methods, task, log)
+            return measure(methods, task, log, guard)
 
         return call
 
