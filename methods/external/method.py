@@ -198,7 +198,7 @@ class External:
                 code_sha256(Path(word)) if Path(word).is_file() else word for word in self._typed
             ],
             "files": [code_sha256(file) for file in self.reads],
-            "environment": [self._packages, dict(self.environment)],
+            "of_worker": [self._packages, dict(self.environment)],
             "device": self._about["device"],
             **computed_by(write_blender),
         }
