@@ -46,7 +46,7 @@ def test_a_study_scores_what_it_did_not_learn_from(steerbench, learned_from, mon
     steerbench(command, *axis, *words, *SIXTEEN).ok()
     assert learned_from
     for scene in learned_from:
-        assert scene.splits["validation"].names == HELD_OUT
+        assert list(scene.splits) == ["train"]
         assert not set(HELD_OUT) & set(scene.splits["train"].names)
 
 
