@@ -11,7 +11,7 @@ import pytest
 from omegaconf import DictConfig
 
 from bench.results import Store
-from bench.types import Scene, SteerbenchError, Unavailable
+from bench.types import SteerbenchError, Unavailable
 from reports.claims import gap
 from reports.runs import load_runs
 from sweeps import configured, execute
@@ -152,9 +152,9 @@ def scenes(store: Store, stored_run: str, tmp_path: Path) -> Store:
     ],
 )
 def test_folders_show_their_own(scenes, tmp_path, monkeypatch, tiny_scene, folder, digest, found):
-    def loaded(*contents: object) -> Scene:
+    def loaded(*contents: object) -> configured._Read:
         assert digest, f"loads {contents}"
-        return replace(tiny_scene, digest=digest)
+        return configured._Read(replace(tiny_scene, digest=digest), (), {})
 
     monkeypatch.setattr(configured, "_scene", loaded)
     (tmp_path / "c" / "mic").mkdir(parents=True)
