@@ -233,10 +233,9 @@ def sources(*things: Any) -> dict[str, Path]:
     pending: dict[str, Path] = {}
     for thing in things:
         own = _files(thing.__module__, home=True)
-        if not own:
-            raise unexpected(
-                thing.__module__, "a module in a file, whose code a key can hold", thing
-            )
+        if not own and thing.__module__ not in sys.stdlib_module_names:
+            in_a_file = "a class or function in a file, whose code a key can hold"
+            raise unexpected(thing.__module__, in_a_file, thing.__qualname__)
         pending |= own
     while pending:
         name, path = pending.popitem()
