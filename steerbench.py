@@ -128,13 +128,17 @@ def fit(*settings: str) -> Method:
     `method.render(camera, NullProbe())` renders a camera in scene units; see `load_scene`.
     """
     config = composed(settings)
-    return configured.trained(config, ConsoleLog(Path(config.outputs)))
+    method = configured.trained(config, ConsoleLog(Path(config.outputs)))
+    configured.forget_scene()  # whose pictures the method has from now on
+    return method
 
 
 @put_back()
 def load_scene(*settings: str) -> Scene:
     """Load the scene of `settings`: "scene=blender", "scene.path=DIR"."""
-    return configured.scene_of(composed(settings))
+    scene = configured.scene_of(composed(settings))
+    configured.forget_scene()  # it is the user's from now on, who may write to it
+    return scene
 
 
 def results(outputs: str | Path = "outputs") -> pd.DataFrame:

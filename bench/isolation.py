@@ -74,7 +74,8 @@ def given(scene: Scene, method: Method) -> Scene:
 
 
 class Guard:
-    """Finds out whether pictures or masks of a scene were written to, by their checksums."""
+    """Finds out whether pictures or masks of a scene were written to, by their checksums. It reads
+    all of them when it is made, so that damaged files raise there."""
 
     def __init__(self, scene: Scene, log: Log) -> None:
         self._scene, self._log = scene, log
@@ -241,7 +242,16 @@ class Isolated:
             self._log.info(f"{self._method.name} changed {part}, which was put back")
 
 
-def fit(method: Method, scene: Scene, budget: Budget, seed: int, log: Log) -> None:
-    """Let `method` learn from what it is given of `scene`."""
+def fit(
+    method: Method, scene: Scene, budget: Budget, seed: int, log: Log, guard: Guard | None = None
+) -> None:
+    """Let `method` learn from what it is given of `scene`: every training passes here.
+
+    `guard` watches pictures of `scene`, by default those that the method is given. Raises
+    SteerbenchError if the method changed one: the scene is then of no use to others.
+    """
+    part = given(scene, method)
+    guard = guard or Guard(part, log)
     with Isolated(method, seed, log).call():
-        method.fit(given(scene, method), budget, log)
+        method.fit(part, budget, log)
+    guard.check([method])

@@ -80,13 +80,11 @@ def train(methods: Sequence[Method], task: Task, log: Log) -> Guard:
     task.protocol.check(task.scene, task.trajectory)
     if task.protocol.compared:
         _check_steady(methods, task.trajectory)
-    guard = Guard(task.scene, log)  # decodes now, so that damaged files raise before any training
+    guard = Guard(task.scene, log)  # before any training, which damaged files would end
     for method in methods:
         with _named(method, len(methods) > 1):
             counted(f"{method.name}: memory", method.memory)
-            fit(method, task.scene, task.budget, task.seed, log)
-            if len(methods) > 1:  # or nobody knows later which one it was
-                guard.check([method])
+            fit(method, task.scene, task.budget, task.seed, log, guard)
     return guard
 
 

@@ -110,8 +110,12 @@ def trained(
     budget = build(config, "budget")
     scene = scene or scene_of(config)
     turn = device_lock(settings.device, log, training_threads(config))
-    with turn if settings.exclusive else nullcontext():
-        fit(method, scene, budget, settings.seed, progress or log)
+    try:
+        with turn if settings.exclusive else nullcontext():
+            fit(method, scene, budget, settings.seed, progress or log)
+    except Exception:
+        forget_scene()  # the method may have spoilt it
+        raise
     return method
 
 

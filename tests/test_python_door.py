@@ -67,7 +67,7 @@ def test_the_users_process_is_left_as_it_was_found(tmp_path, monkeypatch):
 def test_a_scene_that_changed_on_disk_is_read_again(tmp_path):
     words = [*QUICK, f"outputs={tmp_path}"]
     first = steerbench.load_scene(*words)
-    assert steerbench.load_scene(*words) is first
+    assert steerbench.load_scene(*words).digest == first.digest
     (file,) = tmp_path.glob("scenes/*/test/r_1.png")
     Image.new("RGBA", (24, 24), "red").save(file)
     scene = ["scene=blender", f"scene.path={file.parents[1]}"]
@@ -80,6 +80,16 @@ def test_a_scene_that_changed_on_disk_is_read_again(tmp_path):
     file.rename(file.with_name("r_9.png"))
     with pytest.raises(steerbench.SteerbenchError, match="r_1"):
         steerbench.load_scene(*scene)
+
+
+def test_what_is_handed_out_may_be_written_to_and_spoils_no_run(tmp_path):
+    words = [*QUICK, f"outputs={tmp_path}"]
+    psnr = steerbench.run(*words).values["psnr"]
+    for split in steerbench.load_scene(*words).splits.values():
+        for image in split.images:
+            image.fill_(255)
+    assert steerbench.run(*words, "pictures=1").values["psnr"] == psnr
+    assert steerbench.run(*words, "pictures=2").values["psnr"] == psnr
 
 
 def test_choices_come_with_what_they_are():

@@ -78,7 +78,8 @@ def test_a_method_that_changes_pictures_in_place_is_named(deed, tiny_scene, quie
         Guard(tiny_scene, quiet_log),
     )
     guard.check([method])
-    fit(method, tiny_scene, BUDGET, 0, quiet_log)
+    with pytest.raises(SteerbenchError, match="offset changed pictures of tiny in place"):
+        fit(method, tiny_scene, BUDGET, 0, quiet_log)
     with pytest.raises(SteerbenchError, match="offset changed pictures of tiny in place"):
         guard.check([method])
 

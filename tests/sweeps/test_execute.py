@@ -2,16 +2,18 @@
 
 import os
 import pickle
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from functools import cache
+from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 
 import steerbench
 from bench import waiting
+from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
-from sweeps import execute
+from sweeps import configured, execute
 from sweeps.execute import Ended
 from sweeps.hydra_runs import label
 from sweeps.measurement import Job, obtain, stored
@@ -128,6 +130,25 @@ def test_a_failure_is_kept_for_its_job_until_that_succeeds(elsewhere):
     assert timed.failure is None  # in turns it is another job
     obtain([job])
     assert job.failure is None
+
+
+def test_a_training_after_one_that_spoilt_the_pictures_has_the_right_ones(monkeypatch, elsewhere):
+    """They may be trained in one process, ahead of their jobs."""
+
+    def blacken(method, scene, budget, log):
+        for image in scene.splits["train"].images:
+            image.fill_(0)
+
+    def means(method, scene, budget, log):
+        seen.append([image.float().mean().item() for image in scene.splits["train"].images])
+
+    seen: list[list[float]] = []
+    for fit in (means, blacken, means):
+        monkeypatch.setattr("stand_ins.Grey.fit", fit)
+        with suppress(SteerbenchError) if fit is blacken else nullcontext():
+            configured.trained(composed(STAND_INS), ConsoleLog(Path("outputs")))
+    assert seen[0] == seen[1]
+    assert min(seen[0]) > 0
 
 
 # Turns on a device
