@@ -15,7 +15,6 @@ What else the class may have, as `serve` explains, is optional. The messages tha
 are in docs/external.md of steerbench.
 """
 
-import hashlib
 import json
 import math
 import os
@@ -30,8 +29,6 @@ import time
 import traceback
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from urllib.parse import urlparse
-from urllib.request import url2pathname
 
 import numpy as np
 
@@ -285,39 +282,23 @@ def _about(renderer):
 
 def _files():
     """The files of all loaded modules that belong neither to Python nor to an installed package."""
-    library = Path(sysconfig.get_paths()["stdlib"])
+    library = {Path(sysconfig.get_paths()[name]) for name in ("stdlib", "platstdlib")}
     files = (getattr(module, "__file__", None) for module in list(sys.modules.values()))
     paths = {Path(file).absolute() for file in files if file}
     installed = {"site-packages", "dist-packages"}
     return sorted(
         str(path)
         for path in paths
-        if path.is_file() and library not in path.parents and not installed & set(path.parts)
+        if path.is_file() and not library & set(path.parents) and not installed & set(path.parts)
     )
 
 
 def _packages():
-    """The version of every package of this environment, and of Python; of one that was installed
-    so that it can be edited, also a digest of its files."""
+    """The version of every package of this environment, and of Python."""
     from importlib import metadata  # takes 0.1 s, while steerbench waits
 
-    found = {"python": sys.version.split()[0]}
-    for package in metadata.distributions():
-        found[str(package.metadata["Name"])] = str(package.version) + _edited(package)
-    return found
-
-
-def _edited(package):
-    """A digest of the Python files of a package that `pip install -e` installed, else empty."""
-    with suppress(OSError, ValueError, KeyError):
-        origin = json.loads(package.read_text("direct_url.json") or "{}")
-        if origin.get("dir_info", {}).get("editable"):
-            digest = hashlib.sha256()
-            folder = Path(url2pathname(urlparse(origin["url"]).path))
-            for path in sorted(folder.rglob("*.py")):
-                digest.update(path.read_bytes())
-            return " " + digest.hexdigest()
-    return ""
+    found = {each.metadata["Name"]: each.version for each in metadata.distributions()}
+    return {"python": sys.version.split()[0], **{str(k): str(v) for k, v in found.items()}}
 
 
 def _now():
