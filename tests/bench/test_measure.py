@@ -433,6 +433,10 @@ def test_reported_times_far_below_what_passed_here_are_doubted_in_every_row(
     of = {"wall_ns": passed, "transfer_ns": int(transfer * passed)}
     records = [FrameRecord({"other": int(share * passed)}, {}, {}, **of)] * 2
     assert bool(bench.measure._doubted_times(records)) == doubted
+    # Honest frames hide no others, and one pause of the system is no reason.
+    honest = FrameRecord({"other": passed}, {}, {}, wall_ns=passed)
+    assert bool(bench.measure._doubted_times([*records, *[honest] * 8])) == doubted
+    assert not bench.measure._doubted_times([*records[:1], *[honest] * 10])
     # As large a share of a short frame is the rounding of clocks.
     short = FrameRecord({"other": 100_000}, {}, {}, wall_ns=2_000_000)
     assert not bench.measure._doubted_times([short])
