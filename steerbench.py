@@ -33,7 +33,7 @@ import pandas as pd
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
-from bench.isolation import put_back
+from bench.isolation import as_begun
 from bench.results import existing_store
 from bench.types import Budget, Camera, Frame, Method, NullProbe, Probe, Scene, Split
 from reports.comparison import columns_of
@@ -74,7 +74,7 @@ __all__ = [
 ]
 
 
-@put_back()
+@as_begun()
 def run(*settings: str) -> Run:
     """Measure what `settings` describe, unless the store has it already.
 
@@ -100,7 +100,7 @@ class Sweep(NamedTuple):
     table: pd.DataFrame
 
 
-@put_back()
+@as_begun()
 def sweep(*settings: str) -> Sweep:
     """Measure every combination of `settings`, of which any may have several values: "seed=0,1,2".
 
@@ -121,7 +121,7 @@ def load(key: str, outputs: str | Path = "outputs") -> Run:
     return load_runs(store, [store.whole_key(key)])[0]
 
 
-@put_back()
+@as_begun()
 def fit(*settings: str) -> Method:
     """Train the method that `settings` describe on its scene, or load its stored stages.
 
@@ -133,7 +133,7 @@ def fit(*settings: str) -> Method:
     return method
 
 
-@put_back()
+@as_begun()
 def load_scene(*settings: str) -> Scene:
     """Load the scene of `settings`: "scene=blender", "scene.path=DIR"."""
     scene = configured.scene_of(composed(settings))

@@ -13,7 +13,7 @@ import signal
 import sys
 import warnings
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -162,22 +162,32 @@ def _set_cores(cores: set[int]) -> None:
     os.sched_setaffinity(0, cores)
 
 
-SETTERS: tuple[Callable[[Any], object], ...] = (
-    torch.set_num_threads,
-    torch.set_default_dtype,
-    torch.set_default_device,
-    torch.set_grad_enabled,
-    torch.set_float32_matmul_precision,
-    torch.set_deterministic_debug_mode,
-    torch.set_flush_denormal,
-    os.chdir,
-    _set_environment,
-    _set_words,
-    _set_handlers,
-    _set_warnings,
-    _set_cores,
-)
-"""What sets the parts of `_state` again, in their order."""
+SETTERS: Mapping[str, Callable[[Any], object]] = {
+    "torch's number of threads": torch.set_num_threads,
+    "torch's default type": torch.set_default_dtype,
+    "torch's default device": torch.set_default_device,
+    "torch's recording of gradients": torch.set_grad_enabled,
+    "torch's precision of products": torch.set_float32_matmul_precision,
+    "torch's deterministic mode": torch.set_deterministic_debug_mode,
+    "the flushing of denormal numbers": torch.set_flush_denormal,
+    "the working folder": os.chdir,
+    "the environment": _set_environment,
+    "sys.argv": _set_words,
+    "handlers of signals": _set_handlers,
+    "filters of warnings": _set_warnings,
+    "the cores of this process": _set_cores,
+}
+"""What sets each part of `_state` again."""
+
+USUAL: Mapping[str, object] = {
+    "torch's default type": torch.float32,
+    "torch's default device": None,
+    "torch's recording of gradients": True,
+    "torch's precision of products": "highest",
+    "torch's deterministic mode": "default",
+    "the flushing of denormal numbers": False,
+}
+"""What changes figures and is in no key, as it is in a process that has just begun."""
 
 
 def _drawn() -> tuple[Any, ...]:
@@ -202,10 +212,19 @@ def put_back(tell: Callable[[str], object] = lambda part: None) -> Iterator[None
     finally:
         _draw_from(drawn)
         now = _state()
-        for part, put in zip(before, SETTERS, strict=True):
+        for part, put in SETTERS.items():
             if now[part] != before[part]:
                 put(before[part])
                 tell(part)
+
+
+@contextmanager
+def as_begun() -> Iterator[None]:
+    """Compute as in a process that has just begun, whatever its user has set, and put all back."""
+    with put_back():
+        for part, value in USUAL.items():
+            SETTERS[part](value)
+        yield
 
 
 class Isolated:

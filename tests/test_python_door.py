@@ -14,6 +14,7 @@ import torch
 from PIL import Image
 
 import steerbench
+from bench.isolation import put_back
 
 DOCS = Path(__file__).parent.parent / "docs"
 QUICK = (
@@ -62,6 +63,20 @@ def test_the_users_process_is_left_as_it_was_found(tmp_path, monkeypatch):
     steerbench.sweep(*QUICK, "threads=2", "seed=0,1", outputs)
     steerbench.fit(*QUICK, "threads=2", outputs)
     assert state() == before
+
+
+def test_what_a_user_has_set_of_torch_changes_no_figure(tmp_path):
+    """It is in no key."""
+    usual = steerbench.run(*QUICK, f"outputs={tmp_path / 'usual'}")
+    with put_back():
+        torch.set_default_dtype(torch.float64)
+        torch.set_float32_matmul_precision("medium")
+        torch.set_grad_enabled(False)
+        found = steerbench.run(*QUICK, f"outputs={tmp_path / 'set'}")
+        assert torch.get_default_dtype() == torch.float64
+        assert not torch.is_grad_enabled()
+    assert found.key == usual.key
+    assert found.values["psnr"] == usual.values["psnr"]
 
 
 def test_a_scene_that_changed_on_disk_is_read_again(tmp_path):

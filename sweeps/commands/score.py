@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from bench import pictures as given
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, unknown
-from bench.isolation import put_back
+from bench.isolation import as_begun
 from bench.provenance import digest, libraries
 from bench.results import REPORTED, Store
 from reports.runs import Run, load_runs
@@ -30,7 +30,7 @@ def main(options: argparse.Namespace) -> int:
     return 0
 
 
-@put_back()
+@as_begun()
 def score(
     pictures: str | Path,
     truth: str | Path | None = None,
