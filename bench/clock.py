@@ -143,12 +143,12 @@ class StageClock:
         self._last = now
 
 
-def counted(what: str, number: object) -> int:
+def counted(what: str, number: Any) -> int:
     """`number` as a plain int; SteerbenchError unless it is whole, 0 or more, and below 2^63."""
     whole = isinstance(number, Integral) and not isinstance(number, bool)
-    if whole and 0 <= number < MOST:  # type: ignore[operator]
-        return int(number)  # type: ignore[call-overload]
-    got = "one beyond" if whole and abs(number) >= MOST else repr(number)  # type: ignore[arg-type]
+    if whole and 0 <= number < MOST:
+        return int(number)
+    got = "one beyond" if whole and abs(number) >= MOST else repr(number)
     raise unexpected(what, "a whole number from 0 on, below 2^63", got)
 
 

@@ -25,7 +25,7 @@ from bench.errors import SteerbenchError, unexpected
 
 ROOT = Path(__file__).resolve().parent.parent
 OURS = ("bench", "methods")
-STDLIB = Path(sysconfig.get_paths()["stdlib"])
+STDLIB = {Path(sysconfig.get_paths()[name]) for name in ("stdlib", "platstdlib")}
 INSTALLED = {"site-packages", "dist-packages"}
 LEFT_OUT = re.compile(r"/(\.|__pycache__/)")  # hidden files and folders, and what Python compiles
 CHECKS = ("cases.py", "experiments.py")  # the checks of their folder, which affect no results
@@ -127,16 +127,16 @@ def _loaded(path: Path) -> str:
 
 def sha256(path: Path) -> str:
     """SHA-256 of a file, read again only if it has changed."""
-    return _sha256(path, _stamp(path))
+    return _sha256(path, stamp(path))
 
 
 def code_sha256(path: Path) -> str:
     """SHA-256 of what a file of Python computes; of another file, as `sha256`."""
-    return _module(path, _stamp(path)).sha256 if path.suffix == ".py" else sha256(path)
+    return _module(path, stamp(path)).sha256 if path.suffix == ".py" else sha256(path)
 
 
-def _stamp(path: Path) -> tuple[int, ...]:
-    """Changes whenever the content of a file does."""
+def stamp(path: Path) -> tuple[int, ...]:
+    """Times, size and number of a file: they change whenever its content does."""
     now = path.stat()
     return now.st_mtime_ns, now.st_ctime_ns, now.st_size, now.st_ino
 
@@ -158,10 +158,11 @@ class _Module(NamedTuple):
 @cache
 def _module(path: Path, stamp: tuple[int, ...]) -> _Module:
     content = path.read_bytes()
+    in_bytes = hashlib.sha256(content).hexdigest()
     try:
         tree = ast.parse(content)
     except (SyntaxError, ValueError):  # a template, or of another version of Python
-        return _Module((), hashlib.sha256(content).hexdigest())
+        return _Module((), in_bytes)
     imports: list[str] = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -169,7 +170,10 @@ def _module(path: Path, stamp: tuple[int, ...]) -> _Module:
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
             imports += (f"{node.module}.{alias.name}" for alias in node.names)
     parts: list[str] = []
-    _write_tree(tree, parts, documented=b"__doc__" in content)
+    try:
+        _write_tree(tree, parts, documented=b"__doc__" in content)
+    except RecursionError:  # a sum of a thousand terms
+        return _Module(tuple(imports), in_bytes)
     return _Module(tuple(imports), hashlib.sha256("".join(parts).encode()).hexdigest())
 
 
@@ -281,29 +285,27 @@ def _files(name: str, home: bool = False) -> dict[str, Path]:
         spec = importlib.util.find_spec(top)
     except (ImportError, ValueError):  # one that was made while the process runs
         return {}
-    if spec is None or not (home or is_edited(spec.origin or _first_place(spec))):
+    if spec is None:
+        return {}
+    place = spec.origin or next(iter(spec.submodule_search_locations or ()), None)
+    if not home and not is_edited(place):
         return {}
     if spec.submodule_search_locations is None:
         return {Path(str(spec.origin)).name: Path(str(spec.origin))} if spec.has_location else {}
     files = {}
     for folder in map(Path, spec.submodule_search_locations):
         for path in folder.rglob("*"):
-            name = path.relative_to(folder.parent).as_posix()
-            if path.is_file() and not LEFT_OUT.search(f"/{name}"):
-                files[name] = path
+            inside = path.relative_to(folder.parent).as_posix()
+            if path.is_file() and not LEFT_OUT.search(f"/{inside}"):
+                files[inside] = path
     return files
-
-
-def _first_place(spec: Any) -> str:
-    """The folder of a package without an `__init__`; empty if it has none."""
-    return next(iter(spec.submodule_search_locations or ()), "")
 
 
 def is_edited(file: str | None) -> bool:
     """Whether a module at `file` may change under one version: it lies neither in Python itself nor
     where packages are installed."""
     place = Path(file or "built-in")
-    installed = INSTALLED.intersection(place.parts) or STDLIB in place.parents
+    installed = INSTALLED.intersection(place.parts) or STDLIB.intersection(place.parents)
     return place.is_absolute() and not installed
 
 
@@ -319,7 +321,7 @@ def _ours(name: str) -> list[Path]:
 
 
 def _imports(path: Path) -> tuple[str, ...]:
-    return _module(path, _stamp(path)).imports if path.suffix == ".py" else ()
+    return _module(path, stamp(path)).imports if path.suffix == ".py" else ()
 
 
 _version = cache(metadata.version)  # of a distribution

@@ -258,11 +258,5 @@ class NullProbe:
     def count(self, name: str, done: int | Tensor, dense: int | None = None) -> None:
         pass
 
-    def report(
-        self,
-        ns: int,
-        stages_ns: Mapping[str, int],
-        peak_bytes: int | None = None,
-        transfer_ns: int = 0,
-    ) -> None:
+    def report(self, *told: object, **more: object) -> None:
         pass

@@ -159,6 +159,7 @@ class Run:
             "commit": row["commit"],
             "computed on": _listed(computed),
             "times": record.get("times", "not recorded"),
+            "doubts": "; ".join(record.get("doubts", ())) or "none",
             "peak memory": record["peak_bytes"],
             "machine": f"{machine['cpu']}, {machine['threads']} threads, {memory}",
             "beside it": str(Neighbours(**seen)) if seen else "not recorded",

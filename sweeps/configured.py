@@ -24,6 +24,7 @@ from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable, unexpected, unknown
 from bench.isolation import fit
 from bench.protocol import EvaluationProtocol
+from bench.provenance import stamp
 from bench.records import coerced, fits
 from bench.scenes.assemble import hold_out
 from bench.trajectories import Trajectory
@@ -138,8 +139,7 @@ def scene_of(config: DictConfig) -> Scene:
     If its trajectory renders held-out training pictures, these, one in eight, are removed from the
     training split, so that a model is never scored on pictures that it was trained on.
     """
-    scene = _current(_scene, config).value
-    assert isinstance(scene, Scene)
+    scene: Scene = _current(_scene, config).value
     return scene
 
 
@@ -157,7 +157,8 @@ def trajectory_of(config: DictConfig, scene: Scene, log: Log) -> Trajectory:
 
 
 def scene_digest(config: DictConfig) -> str:
-    return str(_current(_digest, config).value)
+    digest: str = _current(_digest, config).value
+    return digest
 
 
 def scene_folder(config: DictConfig) -> str | None:
@@ -174,7 +175,7 @@ def _contents(config: DictConfig) -> tuple[str, Path, bool]:
 class _Read(NamedTuple):
     """What was made of files, and how these were then."""
 
-    value: Scene | str
+    value: Any  # a Scene, or its digest
     files: Sequence[Path]
     stamps: Mapping[str, tuple[int, ...]]
 
@@ -183,7 +184,6 @@ class _Read(NamedTuple):
 def _digest(node: str, root: Path, held_out: bool) -> _Read:
     """Cached, because it takes loading the whole scene."""
     read = _scene(node, root, held_out)
-    assert isinstance(read.value, Scene)
     return read._replace(value=read.value.digest)
 
 
@@ -209,21 +209,13 @@ def _current(read: Any, config: DictConfig) -> _Read:
 
 
 def _stamps(files: Iterable[Path]) -> dict[str, tuple[int, ...]]:
-    """Times, size and number of each file, and of all files beside it: pictures may be added, lists
-    of names changed."""
+    """The `stamp` of each file, and of all files beside it: pictures may be added, lists of names
+    changed."""
     stamps: dict[str, tuple[int, ...]] = {}
     folders = {file.parent for file in files}
     for folder in filter(Path.is_dir, folders):
-        for entry in os.scandir(folder):
-            stamps[entry.path] = ()
-            if entry.is_file():
-                now = entry.stat()
-                stamps[entry.path] = (
-                    now.st_mtime_ns,
-                    now.st_ctime_ns,
-                    now.st_size,
-                    now.st_ino,
-                )
+        for path in folder.iterdir():
+            stamps[str(path)] = stamp(path) if path.is_file() else ()
     return stamps
 
 

@@ -17,10 +17,10 @@ from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, explained, unexpected
 from bench.isolation import Guard, put_back
 from bench.measure import MethodFailed, Task, measure, train
-from bench.provenance import check_unchanged, code_sha256, computed_by
+from bench.provenance import check_unchanged, code_sha256, computed_by, conditions_apart
 from bench.results import Store, content_key
 from bench.sharing import whole
-from bench.trajectories import resized
+from bench.trajectories import Trajectory, resized
 from bench.types import Log, Method
 from reports.runs import Run, readable
 from sweeps.configured import (
@@ -194,8 +194,7 @@ class _Ready:
     def check_unchanged(self) -> None:
         """Raise SteerbenchError if its figures may be of other code or files than `parts` hold."""
         check_unchanged(self.loaded, measure, *_targets(self.job.settings))
-        files = (*getattr(self.method, "reads", ()), *self.task.trajectory.reads)
-        if self.parts["files"] != [code_sha256(file) for file in files if file.is_file()]:
+        if self.parts["files"] != _read_by(self.method, self.task.trajectory):
             raise SteerbenchError(
                 f"a file that {self.method.name} or its path reads was changed meanwhile: run again"
             )
@@ -251,20 +250,25 @@ def _prepared(job: Job, log: Log) -> _Ready:
     if settings.frame_size:
         trajectory = resized(trajectory, *settings.frame_size)
     weights = Path(settings.weights_dir) if settings.weights_dir else None
-    files = (*getattr(method, "reads", ()), *trajectory.reads)
     scored = scene.splits.get(trajectory.split)
     parts = {
         "config": job.settings,
         "scene": scene.digest,
         "names": content_key({"names": list(scored.names if scored else ())}),
         "resolved": method.settings(),
-        "files": [code_sha256(file) for file in files if file.is_file()],
+        "files": _read_by(method, trajectory),
         **computed_by(measure, *_targets(job.settings)),
         "lpips": protocol.find_lpips(weights, log),
         **({"turns": job.turns} if job.turns else {}),
     }
     task = Task(scene, trajectory, protocol, budget, settings.seed, weights, settings.pictures)
     return _Ready(job, method, task, parts, loaded)
+
+
+def _read_by(method: Method, trajectory: Trajectory) -> list[str]:
+    """The checksums of the files that a method and a path read."""
+    files = (*getattr(method, "reads", ()), *trajectory.reads)
+    return [code_sha256(file) for file in files if file.is_file()]
 
 
 def _targets(node: Any) -> Iterator[Any]:
@@ -286,6 +290,8 @@ def _told(ready: Sequence[_Ready], measured: bool, log: Log) -> list[str]:
         if not measured:
             folder = each.job.store.folder / each.run
             log.info(f"already measured; to measure again, remove {folder}")
+            if apart := conditions_apart(each.job.store.record(each.run)["machine"]):
+                log.info(f"its times are of other conditions: {apart}")
         each.job.failure_file.unlink(missing_ok=True)
     return [each.run for each in ready]
 

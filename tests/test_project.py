@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from bench import provenance
 from sweeps.overrides import CONFIGS, composed
 
 ROOT = Path(__file__).parent.parent
@@ -53,11 +54,7 @@ MOST_NODES = {"product": 277_000, "tests": 184_500}
 
 def nodes(path: Path) -> int:
     every = ast.walk(ast.parse(path.read_text()))
-    return sum(not (isinstance(x, ast.Expr) and _is_text(x.value)) for x in every)
-
-
-def _is_text(node: ast.expr) -> bool:
-    return isinstance(node, ast.Constant) and isinstance(node.value, str)
+    return sum(not provenance._is_text(node) for node in every)
 
 
 def test_there_is_no_more_code_than_there_was():

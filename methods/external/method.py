@@ -159,12 +159,13 @@ class External:
             if "load" in can:
                 self._load({**job, "state": None}, log)
             return
-        folder = log.stage_dir("external", self._key(job))
+        key = self._key(job)
+        folder = log.stage_dir("external", key)
         finished = folder / "trained.json"
         with missing(finished, log) as untrained:
             if untrained:
                 self.train_s = self._train(folder, job, log)
-                if log.stage_dir("external", self._key(job)) != folder:
+                if self._key(job) != key:
                     raise SteerbenchError(f"{self.name}: its code was changed meanwhile: run again")
                 if "load" in can:  # otherwise the next process trains again, alone
                     with whole(finished) as new:

@@ -181,6 +181,8 @@ def test_comments_docstrings_and_layout_are_free_and_all_that_computes_counts(tr
     read = [of(text + "print(__doc__)\n") for text in (PLAIN, DOCUMENTED)]
     assert read[0] != read[1]
     assert of("print 3\n") != of("print 4\n")  # of Python 2
+    long = f"import {{}}\nA = {' + '.join(['1'] * 2000)}\n"
+    assert of(long.format("math")) != of(long.format("cmath"))  # too deep to be written as a tree
 
 
 def test_a_comment_may_be_written_while_a_process_runs(tree):
