@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from bench.download import fetch, file_sha256
+from bench.download import fetch
 from bench.errors import unexpected
 from bench.scenes.files import data_folder
-from bench.sharing import locked
+from bench.sharing import file_sha256, locked
 from bench.threads import in_parallel
 from bench.types import Log, Unavailable
 

@@ -1,9 +1,8 @@
 """Downloads a file, and checks it."""
 
-import hashlib
 from pathlib import Path
 
-from bench.sharing import whole
+from bench.sharing import file_sha256, whole
 from bench.types import Log, Unavailable
 
 CONNECT_S, READ_S = 3.0, 10.0  # so long it waits for a connection, and for an answer
@@ -43,12 +42,3 @@ def _download(address: str, file: Path, name: str, log: Log) -> None:
         offline = type(error) in (requests.ConnectionError, requests.ConnectTimeout)
         why = "no connection" if offline else error
         raise Unavailable(f"the download of {address} failed ({why})") from error
-
-
-def file_sha256(path: Path) -> str | None:
-    """SHA-256 of a file's content; None if it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError:
-        return None

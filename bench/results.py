@@ -1,11 +1,12 @@
 """The store of runs, `outputs/runs/<key>/`, and the tidy table made from all of them.
 
 A run folder holds `rows.csv` (one metric per row, `COLUMNS`), `frames.csv` (one frame per row),
-`record.json` (what the key was made of, commit, machine, what the figures mean) and `pictures/`.
-It gets its final name only when it is complete.
+`record.json` (what the key was made of, commit, machine, what the figures mean), `pictures/`, and
+`SHA256SUMS` of all of them, which is checked whenever one is read. It gets its final name only when
+it is complete. `used.json` alone changes afterwards: when the run was last asked for, and by which
+jobs.
 """
 
-import csv
 import hashlib
 import io
 import json
@@ -13,10 +14,9 @@ import os
 import shutil
 import time
 import uuid
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import reduce
 from glob import escape
 from pathlib import Path
 from typing import Any
@@ -25,11 +25,12 @@ import numpy as np
 import pandas as pd
 from PIL import Image
 
-from bench.errors import SteerbenchError, explained, nearest, not_there, some, unexpected
+from bench.errors import SteerbenchError, explained, not_there, some, unexpected
 from bench.provenance import commit, machine
 from bench.records import Record, read_record
+from bench.sharing import check_sums, whole, write_sums
 
-SCHEMA_VERSION = 4  # of record.json and rows.csv; other folders are reported and skipped
+SCHEMA_VERSION = 5  # of record.json and rows.csv; other folders are reported and skipped
 
 COLUMNS = [
     *("run", "method", "scene", "split", "trajectory", "resolution", "protocol", "budget"),
@@ -47,14 +48,9 @@ REPORTED = "reported"  # as `device`: others measured the times
 
 FRAME = ("frame", "name", "phase")  # the first columns of frames.csv
 FIGURES = {"value": "float64", "lo": "float64", "hi": "float64", "n": "int64", "seed": "int64"}
-KINDS = {
-    **dict.fromkeys(("made_of", "made_of.config", "machine", "scene", "protocol", "budget"), dict),
-    **dict.fromkeys(("missing", "parts", "neighbours", "axes"), dict),
-    **dict.fromkeys(("command", "scene.digest", "machine.cpu", "peak_bytes", "error_map"), str),
-    **{"stored": float, "machine.gpus": list},
-}
-"""What the fields of a record hold."""
-RECORD, ROWS, PARTIAL = "record.json", "rows.csv", ".partial-"
+RECORD, ROWS, FRAMES = "record.json", "rows.csv", "frames.csv"
+USED = "used.json"
+PARTIAL = ".partial-"
 STALE_S = 24 * 3600.0
 
 
@@ -89,6 +85,14 @@ class Store:
         folder = self.folder / key
         return folder if (folder / RECORD).is_file() else None
 
+    def intact(self, key: str) -> bool:
+        """Whether there is a complete run, whose files are as they were stored."""
+        with suppress(SteerbenchError):
+            if folder := self.find(key):
+                check_sums(folder)
+                return True
+        return False
+
     def whole_key(self, beginning: str) -> str:
         """The key of the only run whose key starts with `beginning`; raises unless there is one."""
         wanted = Path(beginning).name  # the key may be given as the path of its folder
@@ -116,7 +120,7 @@ class Store:
         rows = measurement.rows.assign(run=key, commit=commit())[COLUMNS]
         with self.write(key) as folder:
             rows.to_csv(folder / ROWS, index=False, lineterminator="\n")
-            measurement.frames.to_csv(folder / "frames.csv", index=False, lineterminator="\n")
+            measurement.frames.to_csv(folder / FRAMES, index=False, lineterminator="\n")
             (folder / "pictures").mkdir()
             for name, pixels in measurement.pictures.items():
                 Image.fromarray(pixels).save(folder / "pictures" / f"{name}.png")
@@ -137,6 +141,7 @@ class Store:
             partial.mkdir()
             try:
                 yield partial
+                write_sums(partial)
                 for path in [*partial.rglob("*"), partial]:
                     _sync(path)
                 folder = self.folder / key
@@ -182,27 +187,32 @@ class Store:
             na_values={column: ["", "nan"] for column in ("value", "lo", "hi")},
         )
 
-    def frames(self, run: str, metrics: Iterable[str] = ()) -> pd.DataFrame:
-        """The frames of a run, which must have the columns `FRAME`, and `metrics`."""
-        path = self._existing(run) / "frames.csv"
-        table = read_table(path, keep_default_na=False, na_values=[""])
-        for name in (*FRAME, *metrics):
-            if name not in table:
-                raise unexpected(path, f"a column {name}", nearest(name, map(str, table)))
-        for name in table.columns.difference(["name", "phase"]):
-            if not pd.api.types.is_numeric_dtype(table[name]):
-                raise unexpected(path, f"numbers in the column {name}", "text")
-        return table
+    def frames(self, run: str) -> pd.DataFrame:
+        """The frames of a run, which have the columns `FRAME`."""
+        check_sums(folder := self._existing(run), [FRAMES])
+        return read_table(folder / FRAMES, keep_default_na=False, na_values=[""])
 
     def record(self, run: str) -> Record:
         """The record of a run: what it was made of, and on which machine."""
-        record = read_record(path := self._existing(run) / RECORD)
-        for name, kind in KINDS.items():
-            *outer, last = name.split(".")
-            held = reduce(lambda of, part: of.get(part, {}), outer, record).get(last, kind())
-            if not isinstance(held, kind):
-                raise unexpected(f"{path}: {name}", kind.__name__, repr(held)[:80])
+        check_sums(folder := self._existing(run), [RECORD])
+        record: Record = read_record(folder / RECORD)
         return record
+
+    def use(self, run: str, *jobs: str) -> None:
+        """Note that the run was asked for now, by `jobs` with these keys; not where others own the
+        store."""
+        path, (_, before) = self._existing(run) / USED, self.used(run)
+        held = {"used": time.time(), "jobs": sorted({*before, *jobs})}
+        with suppress(OSError), whole(path) as new:
+            new.write_text(json.dumps(held) + "\n", encoding="utf-8")
+
+    def used(self, run: str) -> tuple[float, list[str]]:
+        """When a run was last asked for, in seconds, and the keys of all jobs that asked for it."""
+        try:
+            held = json.loads(_text(self.folder / run / USED))
+            return float(held["used"]), list(held["jobs"])
+        except (ValueError, KeyError, TypeError):  # stored and never asked for
+            return 0.0, []
 
     def _sweep(self) -> None:
         """Delete what killed processes left behind: partial folders older than a day."""
@@ -250,22 +260,8 @@ def _body(folder: Path) -> str:
             f"stored by another version of steerbench (schema {schema}, this one reads "
             f"{SCHEMA_VERSION}); measure again, with outputs=DIR to keep what is there"
         )
-    first, _, body = _text(folder / ROWS).partition("\n")
-    names = first.split(",")
-    for name in COLUMNS:
-        if name not in names:
-            others = [other for other in names if other not in COLUMNS]
-            raise unexpected(ROWS, f"a column {name}", nearest(name, others))
-    if names != COLUMNS:
-        raise unexpected(ROWS, f"{', '.join(COLUMNS)} in this order", "another")
-    if not body.endswith("\n"):
-        raise unexpected(ROWS, "whole lines below its first", "half of one" if body else "none")
-    try:
-        for line in csv.reader(io.StringIO(body)):
-            of = dict(zip(COLUMNS, line, strict=True))
-            _ = int(of["n"]), int(of["seed"]), [float(of[x] or 0) for x in ("value", "lo", "hi")]
-    except ValueError as error:
-        raise unexpected(ROWS, "numbers, and a value for each column", error) from error
+    check_sums(folder, [RECORD, ROWS])
+    body = _text(folder / ROWS).partition("\n")[2]
     if (run := body.partition(",")[0]) != folder.name:
         raise unexpected(ROWS, "the run that its folder is named after", run)
     return body

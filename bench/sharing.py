@@ -1,4 +1,5 @@
-"""Files shared by processes, users and machines: written atomically, and made only once.
+"""Files shared by processes, users and machines: written atomically, made only once, and checked
+when they are read.
 
 A lock is released when its process ends, no matter how it ends.
 """
@@ -6,17 +7,53 @@ A lock is released when its process ends, no matter how it ends.
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import os
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.errors import explained
+from bench.errors import SteerbenchError, explained, unexpected
 
 if TYPE_CHECKING:  # loads torch; a lock should not wait for that
     from bench.types import Log
+
+SUMS = "SHA256SUMS"  # in a folder: the checksums of its files, as `sha256sum --check` reads them
+
+
+def file_sha256(path: Path) -> str | None:
+    """SHA-256 of a file's content; None if it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return None
+
+
+def write_sums(folder: Path, pattern: str = "*", sums: str = SUMS) -> None:
+    """Keep the checksums of all files below `folder` whose names fit `pattern` in its file `sums`,
+    for `check_sums`."""
+    files = sorted(path for path in folder.rglob(pattern) if path.is_file() and path.name != sums)
+    lines = [f"{file_sha256(file)}  {file.relative_to(folder).as_posix()}\n" for file in files]
+    (folder / sums).write_text("".join(lines), encoding="utf-8")
+
+
+def check_sums(folder: Path, names: Iterable[str] | None = None, sums: str = SUMS) -> None:
+    """Raise SteerbenchError unless the files `names` in `folder`, or all, are as they were when
+    `write_sums` was called."""
+    try:
+        lines = (folder / sums).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise unexpected(folder / sums, "checksums of the files beside it", error) from error
+    known = {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
+    for name in known if names is None else names:
+        if file_sha256(folder / name) != known.get(name, "none"):
+            raise SteerbenchError(
+                f"{folder / name}: damaged, or changed since it was written ({sums}); "
+                f"remove {folder}, and it is made again"
+            )
 
 
 @contextmanager

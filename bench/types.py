@@ -225,7 +225,8 @@ class Method(Protocol):
     `compile_s`, the seconds of compiling before the training, which are not among those of it.
 
     If `sees_scored` is true, `fit` is given all splits and the exact pictures, which rows say;
-    otherwise the training split alone.
+    otherwise the training split alone. `decided(scene)`, if there is one, says what settings that a
+    scene decides become for it, by the names that one types.
     """
 
     name: str  # as shown in result rows

@@ -11,8 +11,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from bench.download import fetch, file_sha256
-from bench.sharing import locked
+from bench.download import fetch
+from bench.sharing import file_sha256, locked
 from bench.types import Log, SteerbenchError, Unavailable
 
 ADDRESS = "https://download.pytorch.org/models/"

@@ -144,7 +144,7 @@ def changes(
             )
     here = all(before.machine == after.machine for before, after in pairs)
     for metric, limit in limits.items():
-        if metric in old[0].values and (here or not limit.here):
+        if any(metric in each.values for each in old) and (here or not limit.here):
             yield _change(metric, limit, pairs)
 
 
@@ -165,7 +165,7 @@ def _change(metric: str, limit: Limit, pairs: Sequence[tuple[Figures, Figures]])
         certain = broken or -limit.better * by - half > 0
     verdict = "worse" if certain and -limit.better * by > allowed else ""
     gone = (one.frames.get(metric, {}).keys() - of.frames.get(metric, {}) for one, of in pairs)
-    if math.isnan(after) or any(gone):
+    if math.isnan(before + after) or any(gone):  # of a seed, too
         verdict = "missing"
     return Assertion(metric, before, after, by, interval, limit, verdict)
 

@@ -22,12 +22,11 @@ from bench.records import Record
 from bench.results import COLD, ROWS, STEADY, Store, content_key
 from bench.rows import half_interval, phase_rows
 from bench.scenes.images import contents, decode_bytes
+from bench.sharing import check_sums
 from bench.study import part_of
 from reports.tables import phases, run_tables
 
 STAGE = "stage_ms."  # prefix of the metrics of stages
-
-SHOWN = {"psnr", "frame_ms"}  # figures of single frames that pages show
 
 FIGURES = ("metric", "unit", "phase", "value", "n", "lo", "hi")
 """The columns of rows that are not facts about the whole run."""
@@ -245,7 +244,7 @@ def readable(
             folder.name,
             _label(record["command"], of_run),
             of_run,
-            cache(partial(store.frames, folder.name, SHOWN & set(of_run["metric"]))),
+            cache(partial(store.frames, folder.name)),
             record,
             folder / "pictures",
         )
@@ -382,7 +381,8 @@ def _record(runs: Sequence[Run]) -> dict[str, Any]:
 
 
 def read_picture(path: Path) -> np.ndarray:
-    """uint8 [H, W, 3]"""
+    """A picture that a run kept, uint8 [H, W, 3]."""
+    check_sums(path.parent.parent, [f"{path.parent.name}/{path.name}"])
     return decode_bytes(contents(path), path)[..., :3].numpy()
 
 

@@ -52,6 +52,7 @@ class Settings:
     outputs: str
     weights_dir: str | None
     report: str | None
+    store: Literal["missing", "always", "only"]
 
 
 def checked_settings(config: DictConfig) -> Settings:

@@ -176,10 +176,6 @@ def attempt(group: Group, total: int, folder: Path, begun: float) -> dict[str, E
             failed = [each for each in left if alone is None or each[1] is alone]
             for number, job in failed:
                 print(f"steerbench: failed: {job.name}: {cause}", file=sys.stderr)
-                try:
-                    job.keep_failure(reason(cause))
-                except Exception as problem:  # does not hide the failure
-                    print(f"steerbench: {problem}", file=sys.stderr)
                 ended[job.key] = Ended(error=cause)
                 _count(folder, number)
             left = [each for each in left if each not in failed]
@@ -280,7 +276,7 @@ def train_ahead(jobs: Sequence[Job], measured: Collection[str]) -> None:
         with suppress(SteerbenchError):  # it says so when it is measured
             todo.setdefault(_training(job), job)
     todo = {name: job for name, job in todo.items() if job.key not in measured}
-    if len(todo) < 2:
+    if len(todo) < 2 or jobs[0].config.get("store") == "only":
         return
     workers, log = room(jobs), ConsoleLog(jobs[0].outputs)
     log.info(f"training {len(todo)} models, {workers} at a time")

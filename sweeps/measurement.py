@@ -1,10 +1,12 @@
 """Jobs: what identifies them, and their runs, which are found in the store or measured now."""
 
+import json
+import re
 import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,15 +16,16 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.console import ConsoleLog
-from bench.errors import SteerbenchError, explained, unexpected
+from bench.errors import SteerbenchError, Unavailable, explained, unexpected
 from bench.isolation import Guard, put_back
 from bench.measure import MethodFailed, Task, measure, train
 from bench.provenance import check_unchanged, code_sha256, computed_by, conditions_apart
+from bench.records import made, read_record
 from bench.results import Store, content_key
 from bench.sharing import whole
 from bench.trajectories import Trajectory, resized
-from bench.types import Log, Method
-from reports.runs import Run, readable
+from bench.types import DEVICE, Log, Method, Scene
+from reports.runs import Run
 from sweeps.configured import (
     as_declared,
     build,
@@ -40,8 +43,8 @@ from sweeps.experiments import axes
 from sweeps.overrides import target_of
 from sweeps.processes import device_lock
 
-PLACES = ("outputs", "report", "weights_dir")
-"""Settings that are only locations and do not change a row."""
+PLACES = ("outputs", "report", "weights_dir", "store")
+"""Settings that say where things are, and whether to measure, but change no row."""
 
 
 def described(config: DictConfig) -> dict[str, Any]:
@@ -116,20 +119,33 @@ class Job:
     @property
     def failure_file(self) -> Path:
         """Holds why the job failed, until it succeeds."""
-        return self.outputs / "failures" / f"{self.key[:16]}.txt"
+        return self.outputs / "failures" / f"{self.key[:16]}.json"
 
     @property
-    def failure(self) -> str | None:
-        """Why it failed in its last attempt; None if it did not."""
+    def failure(self) -> "Failure | None":
+        """How it failed in its last attempt; None if it did not."""
         file = self.failure_file
-        return file.read_text(encoding="utf-8").strip() if file.exists() else None
+        return made(Failure, read_record(file), str(file)) if file.exists() else None
 
-    def keep_failure(self, why: str) -> None:
-        """Record why it failed, for reports."""
+    def keep_failure(self, error: BaseException) -> None:
+        """Record why it failed, for reports and gates: no earlier run stands for it."""
+        why = reason(error).encode("utf-8", "backslashreplace").decode()  # of odd names of files
+        missing = isinstance(error, Unavailable)
+        held = Failure(why, shlex.join(self.command), self.key, missing)
         with explained(self.failure_file.parent):
             self.failure_file.parent.mkdir(parents=True, exist_ok=True)
             with whole(self.failure_file) as new:
-                new.write_text(f"{why}\n", encoding="utf-8", errors="backslashreplace")
+                new.write_text(json.dumps(asdict(held), indent=1) + "\n", encoding="utf-8")
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why the last attempt of a job failed, which the `command` makes alone."""
+
+    why: str
+    command: str
+    job: str  # its key
+    unavailable: bool  # it needs what this machine lacks
 
 
 class JobFailed(SteerbenchError):
@@ -140,29 +156,51 @@ class JobFailed(SteerbenchError):
         self.job = job
 
 
+class NotStored(SteerbenchError):
+    """A run that is not in the store, where nothing may be measured (store=only)."""
+
+
 def obtain(jobs: Sequence[Job]) -> tuple[list[str], bool]:
     """The keys of the runs of `jobs`, whose `turns` are equal, and whether they are measured now.
 
     They are measured unless the store has all of them: figures that are compared come from the same
-    hour. Earlier failures are forgotten. Raises JobFailed if one of several jobs fails,
-    for whatever reason: the others can then be obtained without it.
+    hour. The setting `store` may have them measured always, or raise NotStored instead. Earlier
+    failures are forgotten, new ones kept. Raises JobFailed if one of several jobs fails, for
+    whatever reason: the others can then be obtained without it.
     """
     log = ConsoleLog(jobs[0].outputs)
     try:
         return _obtained(jobs, log)
-    except Exception:
+    except Exception as error:
         forget_scene()  # a method may have spoilt it
+        if not isinstance(error, NotStored):
+            _keep_failure(jobs, error)
         raise
 
 
+def _keep_failure(jobs: Sequence[Job], error: Exception) -> None:
+    failed, cause = jobs, error
+    if isinstance(error, JobFailed) and isinstance(error.__cause__, Exception):
+        failed, cause = [error.job], error.__cause__
+    for job in failed:
+        with suppress(Exception):  # nothing hides the failure itself
+            job.keep_failure(cause)
+
+
 def _obtained(jobs: Sequence[Job], log: ConsoleLog) -> tuple[list[str], bool]:
-    ready = _ready(jobs, log)
-    measured = not _stored(ready)
+    ready, policy = _ready(jobs, log), jobs[0].config.get("store")
+    measured = policy == "always" or not _stored(ready)
+    if measured and policy == "only":
+        raise NotStored(
+            f"{jobs[0].name or 'this run'}: not in {jobs[0].store.folder}, as this code and these "
+            "files would measure it; store=missing measures it"
+        )
     if measured:
         with _turn(ready, log, training_threads(jobs[0].config)):
             guard = train([each.method for each in ready], ready[0].task, log)
         with _turn(ready, log):
-            measured = not _stored(ready)  # by another process meanwhile
+            # By another process meanwhile?
+            measured = policy == "always" or not _stored(ready)
             if measured:
                 _measure(ready, guard, log)
     return _told(ready, measured, log), measured
@@ -170,15 +208,16 @@ def _obtained(jobs: Sequence[Job], log: ConsoleLog) -> tuple[list[str], bool]:
 
 def stored(jobs: Sequence[Job]) -> dict[str, Job]:
     """Those of `jobs` that can be used here, by the keys that `obtain` would find in the store, if
-    it has all of them; otherwise none."""
+    it has all of them and they need not be measured again; otherwise none."""
     log, left = ConsoleLog(jobs[0].outputs), list(jobs)
-    while True:
+    while jobs[0].config.get("store") != "always":
         try:
             ready = _ready(left, log)
         except JobFailed as failed:
             left = [job for job in left if job is not failed.job]
         else:
             return dict(zip(_told(ready, False, log), left, strict=True)) if _stored(ready) else {}
+    return {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +232,7 @@ class _Ready:
 
     def check_unchanged(self) -> None:
         """Raise SteerbenchError if its figures may be of other code or files than `parts` hold."""
-        check_unchanged(self.loaded, measure, *_targets(self.job.settings))
+        check_unchanged(self.loaded, measure, *targets(self.job.settings))
         if self.parts["files"] != _read_by(self.method, self.task.trajectory):
             raise SteerbenchError(
                 f"a file that {self.method.name} or its path reads was changed meanwhile: run again"
@@ -252,17 +291,36 @@ def _prepared(job: Job, log: Log) -> _Ready:
     weights = Path(settings.weights_dir) if settings.weights_dir else None
     scored = scene.splits.get(trajectory.split)
     parts = {
-        "config": job.settings,
+        "config": became(job.settings, method, scene),
         "scene": scene.digest,
         "names": content_key({"names": list(scored.names if scored else ())}),
         "resolved": method.settings(),
         "files": _read_by(method, trajectory),
-        **computed_by(measure, *_targets(job.settings)),
+        **computed_by(measure, *targets(job.settings)),
         "lpips": protocol.find_lpips(weights, log),
         **({"turns": job.turns} if job.turns else {}),
     }
     task = Task(scene, trajectory, protocol, budget, settings.seed, weights, settings.pictures)
     return _Ready(job, method, task, parts, loaded)
+
+
+def became(settings: Mapping[str, Any], method: Method, scene: Scene) -> dict[str, Any]:
+    """`settings` with what "auto" stands for on this machine, and what `method` leaves to the scene
+    as it is for this one: who types the same has the same run."""
+    shown = method.settings()
+    known = {"device": DEVICE, "backend": re.compile("reference|cpu|gpu")}
+    auto = {name: shown[name] for name, form in known.items() if form.fullmatch(shown[name])}
+
+    decided: Mapping[str, Any] = getattr(method, "decided", lambda scene: {})(scene)
+
+    def resolved(node: Mapping[str, Any], before: str) -> dict[str, Any]:
+        found = {}
+        for name, value in node.items():
+            of = resolved(value, f"{before}{name}.") if isinstance(value, Mapping) else value
+            found[name] = auto.get(name, of) if of == "auto" else decided.get(before + name, of)
+        return found
+
+    return resolved(settings, "")
 
 
 def _read_by(method: Method, trajectory: Trajectory) -> list[str]:
@@ -271,25 +329,26 @@ def _read_by(method: Method, trajectory: Trajectory) -> list[str]:
     return [code_sha256(file) for file in files if file.is_file()]
 
 
-def _targets(node: Any) -> Iterator[Any]:
+def targets(node: Any) -> Iterator[Any]:
     """The classes and functions named by the `_target_` of `node` and all nodes below it."""
     if isinstance(node, Mapping):
         if "_target_" in node:
             yield target_of(node)
         for value in node.values():
-            yield from _targets(value)
+            yield from targets(value)
 
 
 def _stored(ready: Sequence[_Ready]) -> bool:
-    return all(each.job.store.find(each.run) for each in ready)
+    return all(each.job.store.intact(each.run) for each in ready)
 
 
 def _told(ready: Sequence[_Ready], measured: bool, log: Log) -> list[str]:
-    """Forget earlier failures of runs that the store has now; their keys."""
+    """Note that these runs stand for their jobs from now on, whose earlier failures are forgotten;
+    their keys."""
     for each in ready:
+        each.job.store.use(each.run, each.job.key)
         if not measured:
-            folder = each.job.store.folder / each.run
-            log.info(f"already measured; to measure again, remove {folder}")
+            log.info(f"already measured: {each.run}; store=always measures again")
             if apart := conditions_apart(each.job.store.record(each.run)["machine"]):
                 log.info(f"its times are of other conditions: {apart}")
         each.job.failure_file.unlink(missing_ok=True)
@@ -314,11 +373,12 @@ def _turn(ready: Sequence[_Ready], log: ConsoleLog, threads: int | None = None) 
 
 
 def _measure(ready: Sequence[_Ready], guard: Guard, log: Log) -> None:
-    """Measure all, and put them in the place of what an interruption has left of them."""
+    """Measure all, and put them in the place of earlier ones, damaged ones, and what is left by an
+    interruption."""
     measurements = measure([each.method for each in ready], ready[0].task, log, guard)
     for each in ready:
         each.check_unchanged()
-    for each in ready if len(ready) > 1 else ():
+    for each in ready:
         each.job.store.remove(each.run)
     for each, measurement in zip(ready, measurements, strict=True):
         command, place = shlex.join(each.job.command), scene_folder(each.job.config)
@@ -329,20 +389,6 @@ def _measure(ready: Sequence[_Ready], guard: Guard, log: Log) -> None:
         if each.task.protocol.compared:
             record["compared_with"] = ready[0].run
         each.job.store.save(each.parts, replace(measurement, record=record))
-
-
-def newest(store: Store) -> dict[str, list[Run]]:
-    """The latest run of each job and scene, by job key, newest first.
-
-    A job has several if its settings fit scenes in different folders.
-    """
-    of_jobs: dict[str, dict[str, Run]] = {}
-    for run in reversed(readable(store)):
-        parts = run.record["made_of"]
-        if "config" in parts:
-            of_job = of_jobs.setdefault(job_key(parts["config"], parts.get("turns", "")), {})
-            of_job.setdefault(run.record["scene"]["digest"], run)
-    return {job: list(of_scenes.values()) for job, of_scenes in of_jobs.items()}
 
 
 def of_scene(run: Run, config: DictConfig) -> bool:

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from bench.errors import Unavailable, explained, install_command
 from bench.provenance import digest, libraries
-from bench.sharing import missing
+from bench.sharing import check_sums, missing, write_sums
 from bench.types import Log
 from methods.engines.network import Built as Built
 
@@ -105,15 +105,17 @@ def keep(path: Path, write: Callable[[Path], None], log: Log) -> None:
     """Let `write` create the file `path` unless it exists: atomically, and in one process only.
 
     `write` gets a path with the same name in a temporary folder. Files that it leaves there which
-    differ from `path` only in their suffix are kept, too. A folder that cannot be written to raises
-    `SteerbenchError`.
+    differ from `path` only in their suffix are kept, too. A folder that cannot be written to, or
+    files that are not as they were written, raise `SteerbenchError`.
     """
     with missing(path, log) as to_build:
         if not to_build:
+            check_sums(path.parent, sums=f"{path.stem}.sha256")
             log.info(f"found: {path}")
             return
         with explained(path.parent), tempfile.TemporaryDirectory(dir=path.parent) as place:
             write(Path(place, path.name))
+            write_sums(Path(place), f"{path.stem}.*", f"{path.stem}.sha256")
             parts = Path(place).glob(f"{path.stem}.*")
             for part in sorted(parts, key=lambda part: part.name == path.name):  # `path` comes last
                 part.replace(path.parent / part.name)

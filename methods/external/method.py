@@ -26,7 +26,7 @@ from bench.provenance import code_sha256, computed_by
 from bench.records import read_record
 from bench.results import content_key
 from bench.scenes.export import data_camera, picture_file, write_blender
-from bench.sharing import missing, whole
+from bench.sharing import check_sums, missing, whole, write_sums
 from bench.study import Study, turned
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.external.worker import Header, Worker
@@ -173,6 +173,7 @@ class External:
                     self._restart()  # without the memory of a training
             else:
                 log.info(f"{self.name}: found in {folder}")
+                check_sums(folder)
                 self.train_s = read_record(finished)["train_s"]
         if "load" in can:
             self._load({**job, "state": str(folder / "state")}, log)
@@ -233,7 +234,8 @@ class External:
                 seconds = time.monotonic() - begun
             shutil.rmtree(folder / "state", ignore_errors=True)
             state.rename(folder / "state")
-            (folder / "output.txt").write_text(self._worker.output())
+        (folder / "output.txt").write_text(self._worker.output())
+        write_sums(folder)
         return seconds
 
     def _described(self, camera: Camera) -> dict[str, object]:

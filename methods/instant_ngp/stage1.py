@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import asdict, dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import torch
 
@@ -111,6 +111,10 @@ class OnField(Checked):
 
     def settings(self) -> dict[str, str]:
         return self.setup.settings(type(self))
+
+    def decided(self, scene: Scene) -> dict[str, Any]:
+        """What settings that are left to the scene become for it, by the names that one types."""
+        return {"method.grid.log2_table": self.setup.suited(scene).grid.log2_table}
 
 
 @dataclass(frozen=True)

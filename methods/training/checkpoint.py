@@ -1,5 +1,6 @@
 """Files of trained and half-trained stages: tensors and numbers, written whole or not at all."""
 
+import hashlib
 import json
 import os
 from collections.abc import Iterator, Mapping
@@ -22,7 +23,8 @@ def write(path: Path, tensors: Mapping[str, Tensor], figures: Mapping[str, float
     packed = {name: tensor.contiguous() for name, tensor in tensors.items()}
     try:
         with whole(path) as new:
-            save_file(packed, new, {"training": json.dumps(figures)})
+            held = json.dumps(figures)
+            save_file(packed, new, {"training": held, "sha256": _sum(packed, held)})
             with new.open("rb") as file:
                 os.fsync(file.fileno())
     except (OSError, SafetensorError) as error:
@@ -34,13 +36,25 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, float]]:
     written by `write`."""
     try:
         with safe_open(path, "pt") as file:
-            figures = json.loads(file.metadata()["training"])
-        return load_file(path), figures
+            held, promised = (file.metadata()[name] for name in ("training", "sha256"))
+        tensors = load_file(path)
+        if _sum(tensors, held) != promised:
+            raise ValueError("its checksum is wrong")
+        return tensors, json.loads(held)
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
         raise SteerbenchError(
             f"{path}: expected the file of a training, could not read one ({error}); "
             "remove it, and it is made again"
         ) from error
+
+
+def _sum(tensors: Mapping[str, Tensor], figures: str) -> str:
+    """SHA-256 of the names and the content of `tensors`, and of `figures`."""
+    total = hashlib.sha256(figures.encode())
+    for name, tensor in sorted(tensors.items()):
+        total.update(f"{name} {tensor.dtype} {[*tensor.shape]}".encode())
+        total.update(tensor.reshape(-1).view(torch.uint8).cpu().numpy().data)
+    return total.hexdigest()
 
 
 @contextmanager

@@ -29,7 +29,7 @@ def main(options: argparse.Namespace) -> int:
     if options.record:
         record(options.baseline, options.outputs, options.limit, say)
         return 0
-    found = checked(options.baseline, options.outputs)
+    found = checked(options.baseline, options.outputs, say)
     for name, form in forms.items():
         if path := getattr(options, name):
             _write(path, form(found))
@@ -52,14 +52,19 @@ def _compare(options: argparse.Namespace) -> int:
 
 
 def _verdict(found: list[list[Assertion]]) -> str:
-    """One line: what is worse, by how much, against which limit, and what is missing."""
+    """One line: what is worse, by how much, against which limit, what is missing; how many figures
+    were compared, and what else to know."""
+    rows = list(chain(*found))
+    compared = sum(each.verdict != "missing" for each in rows)
+    notes = dict.fromkeys(run[0].note for run in found if run[0].note)
     parts = [
         f"{verdict}: {', '.join(said)}: {run[0].run}"
         for run in found
         for verdict in ("worse", "missing")
         if (said := [str(each) for each in run if each.verdict == verdict])
     ]
-    return "; ".join(parts) or "as good as the baseline"
+    told = f"{compared} of {len(rows)} figures of {len(found)} runs compared"
+    return "; ".join((*(parts or ["as good as the baseline"]), told, *notes))
 
 
 def _markdown(found: list[list[Assertion]]) -> str:

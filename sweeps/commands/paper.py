@@ -17,10 +17,11 @@ from reports.paper_tables import Place
 from reports.runs import Repeated, Run, over_common_frames, over_scenes
 from sweeps.data_sets import DataSet, data_sets, find
 from sweeps.execute import Ended, divided, launcher_of, run_jobs
-from sweeps.measurement import newest, of_scene
+from sweeps.measurement import of_scene
 from sweeps.overrides import unquoted
 from sweeps.plan import Planned, plan, scenes_of
 from sweeps.tables import chosen
+from sweeps.versions import by_job
 
 DATA = "data="  # prefix of the word that names the folder of a data set
 
@@ -43,7 +44,8 @@ def main(options: argparse.Namespace) -> int:
     ended: list[Ended] = []
     if options.command != "report":
         ended = run_jobs(jobs, launcher_of([*options.config_dir, *of_hydra], outputs))
-    runs = newest(existing_store(outputs) if options.command == "report" else Store(outputs))
+    store = existing_store(outputs) if options.command == "report" else Store(outputs)
+    runs = by_job(store, lambda line: print(line, file=sys.stderr))
     folder = options.report or outputs / (one or "paper")
     measured = gather(jobs, runs)
     page = write_paper_page(tables, measured, folder, missing)
@@ -79,7 +81,7 @@ def gather(jobs: Sequence[Planned], runs: Mapping[str, Sequence[Run]]) -> dict[P
     """The line of every job, with its runs and the reasons why others are missing.
 
     With several scenes, a run of a line is the mean of one seed over the scenes that all lines of
-    the block have. Lines without any measurement are ignored for this. `runs` are from `newest`.
+    the block have. Lines without any measurement are ignored for this. `runs` are from `by_job`.
     """
     blocks: dict[tuple[str, str], dict[Place, list[Outcome]]] = {}
     for job in jobs:
@@ -90,10 +92,13 @@ def gather(jobs: Sequence[Planned], runs: Mapping[str, Sequence[Run]]) -> dict[P
 
 def _outcome(job: Planned, runs: Sequence[Run]) -> Outcome:
     failure = job.failure
-    if run := next((run for run in runs if of_scene(run, job.config)), None):
-        why = failure and f"failed when it was tried again: {failure}"
+    run = next((run for run in runs if of_scene(run, job.config)), None)
+    if failure and not (run and failure.unavailable):  # no earlier run stands for it
+        return Outcome(job, None, f"failed: {failure.why}")
+    if run:
+        why = f"cannot run here: {failure.why}" if failure else None
         return Outcome(job, replace(run, label=job.label), why)
-    return Outcome(job, None, f"failed: {failure}" if failure else "not measured yet")
+    return Outcome(job, None, "not measured yet")
 
 
 def _lines(of_block: Mapping[Place, Sequence[Outcome]]) -> dict[Place, Repeated]:

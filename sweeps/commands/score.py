@@ -98,6 +98,7 @@ def score(
         **{part: record[part] for part in ("pictures", "truths")},
         "protocol": asdict(protocol),
         "lpips": protocol.find_lpips(weights, log),
+        "names": [pair.name for pair in pairs],
         "facts": facts,
         "sequence": sequence,
         "kept": plain.pictures,
@@ -113,5 +114,6 @@ def score(
         "budget": {"name": NOTHING},
     }
     key = store.save(parts, replace(measurement, record={**record, **more}))
+    store.use(key)
     (run,) = load_runs(store, [key])
     return run

@@ -17,6 +17,9 @@ from PIL import Image
 from bench import results
 from bench.results import COLUMNS, SCHEMA_VERSION, STEADY, Measurement, Store, content_key
 from bench.types import SteerbenchError
+from reports.runs import read_picture
+
+PICTURE = Path("pictures/0000-truth.png")
 
 
 def measurement(values: list[float], text: str = "plain") -> Measurement:
@@ -50,7 +53,7 @@ def test_a_saved_run_is_found_with_its_rows_frames_record_and_pictures(store):
     assert key == store.key({"seed": 0})
     folder = store.find(key)
     assert sorted(path.name for path in folder.iterdir()) == [
-        *("frames.csv", "pictures", "record.json", "rows.csv")
+        *("SHA256SUMS", "frames.csv", "pictures", "record.json", "rows.csv")
     ]
     rows = store.rows()
     assert set(rows["run"]) == {key}
@@ -153,38 +156,47 @@ def test_runs_of_another_schema_are_reported_in_one_line_and_left_out(store):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("file", "read"),
     [
-        (",phase,", ",fase,", "expected a column phase, got fase"),
-        (",lo,hi,", ",hi,lo,", "in this order, got another"),
-        ("metric_0", "metric_0,,", "a value for each column, got zip() argument 2 is longer"),
-        (",1,", ",one,", "got invalid literal for int() with base 10: 'one'"),
-        ("\n", "", "expected a column commit"),
-        ("{key}", "other", "the run that its folder is named after, got other"),
+        ("rows.csv", lambda store, key: store.rows(pytest.fail)),
+        ("frames.csv", Store.frames),
+        ("record.json", Store.record),
+        ("pictures/0000-truth.png", lambda store, key: read_picture(store.find(key) / PICTURE)),
     ],
 )
-def test_a_run_whose_rows_are_damaged_is_left_out_and_the_reason_is_said(store, old, new, said):
+def test_a_file_of_a_run_that_was_changed_is_refused_by_whatever_reads_it(store, file, read):
     key, kept = (store.save({"seed": i}, measurement([i])) for i in range(2))
-    file = store.folder / key / "rows.csv"
-    file.write_text(file.read_text().replace(old.format(key=key), new))
-    reports: list[str] = []
-    assert set(store.rows(reports.append)["run"]) == {kept}
-    assert [f"left out: {key}: rows.csv: " in line and said in line for line in reports] == [True]
+    read(store, key)
+    assert store.intact(key)
+    path = store.find(key) / file
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"3", b"4", 1) if b"3" in content else content[:-1])
+    assert not store.intact(key)
+    with pytest.raises(
+        (SteerbenchError, pytest.fail.Exception), match=f"{file}: damaged, or changed"
+    ):
+        read(store, key)
+    read(store, kept) if file != "rows.csv" else None
 
 
-def test_fields_of_frames_and_records_that_are_not_there_are_named(store):
+def test_a_run_in_the_folder_of_another_is_left_out(store):
     key = store.save({"seed": 0}, measurement([1.0]))
-    frames, record = (store.folder / key / name for name in ("frames.csv", "record.json"))
-    with pytest.raises(SteerbenchError, match=r"frames.csv: expected a column psnr_, got psnr"):
-        store.frames(key, ["psnr_"])
-    frames.write_text(frames.read_text().replace("30.25", "thirty"))
-    with pytest.raises(SteerbenchError, match=r"expected numbers in the column psnr, got text"):
-        store.frames(key)
-    with pytest.raises(SteerbenchError, match=r"record.json: expected a field Note, got note"):
-        store.record(key)["Note"]
-    record.write_text(record.read_text().replace('"made_of": {', '"made_of": 5, "x": {'))
-    with pytest.raises(SteerbenchError, match=r"record.json: made_of: expected dict, got 5"):
-        store.record(key)
+    (store.folder / key).rename(store.folder / "other")
+    reports: list[str] = []
+    assert store.rows(reports.append).empty
+    assert f"expected the run that its folder is named after, got {key}" in reports[0]
+
+
+def test_a_run_knows_when_and_by_which_jobs_it_was_asked_for(store):
+    key = store.save({"seed": 0}, measurement([1.0]))
+    assert store.used(key) == (0.0, [])
+    before = time.time()
+    store.use(key, "b")
+    store.use(key, "a", "b")
+    used, jobs = store.used(key)
+    assert jobs == ["a", "b"]
+    assert used >= before
+    assert store.intact(key)
 
 
 def test_a_disk_that_refuses_is_a_clear_error_and_leaves_nothing(store, monkeypatch):

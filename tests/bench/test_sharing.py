@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from bench.errors import SteerbenchError
-from bench.sharing import locked, missing, whole
+from bench.sharing import check_sums, locked, missing, whole, write_sums
 
 MAKER = """
 import sys
@@ -116,3 +116,36 @@ def test_what_is_there_needs_no_lock_and_a_folder_that_cannot_be_written_is_name
     assert [path.name for path in tmp_path.iterdir()] == ["made"]
     with pytest.raises(SteerbenchError, match="gone"), missing(tmp_path / "gone" / "x", log):
         pass
+
+
+@pytest.mark.parametrize("change", ["content", "gone", "sums"])
+def test_a_file_that_is_not_as_it_was_written_is_named(tmp_path, change):
+    inner = tmp_path / "a folder" / "wei ght.bin"
+    inner.parent.mkdir()
+    inner.write_bytes(b"weights")
+    (tmp_path / "other.txt").write_text("other")
+    write_sums(tmp_path)
+    check_sums(tmp_path)
+    told = subprocess.run(["sha256sum", "--check", "--quiet", "SHA256SUMS"], cwd=tmp_path)
+    assert told.returncode == 0
+    if change == "content":
+        inner.write_bytes(b"weightz")
+    elif change == "gone":
+        inner.unlink()
+    else:
+        (tmp_path / "SHA256SUMS").unlink()
+    said = (
+        "SHA256SUMS: expected checksums" if change == "sums" else "bin: damaged, or changed since"
+    )
+    with pytest.raises(SteerbenchError, match=said):
+        check_sums(tmp_path)
+    if change != "sums":
+        check_sums(tmp_path, ["other.txt"])  # alone
+
+
+def test_a_file_that_nobody_summed_does_not_pass(tmp_path):
+    write_sums(tmp_path)
+    (tmp_path / "late.txt").touch()
+    for name in ("late.txt", "never.txt"):
+        with pytest.raises(SteerbenchError, match=f"{name}: damaged"):
+            check_sums(tmp_path, [name])

@@ -13,6 +13,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from bench.results import COLUMNS, Store
+from bench.sharing import write_sums
 from reports.paper_tables import PaperTable, Place
 from reports.runs import Repeated, Run, load_runs
 from sweeps.tables import chosen
@@ -123,6 +124,7 @@ def rewrite(store: Store, key: str, **others: object) -> None:
     for name, value in others.items():
         record[name] = {**record[name], **value} if isinstance(value, dict) else value
     path.write_text(json.dumps(record))
+    write_sums(path.parent)
 
 
 def copied(store: Store, source: str, key: str) -> Path:
@@ -130,6 +132,7 @@ def copied(store: Store, source: str, key: str) -> Path:
     folder = shutil.copytree(store.folder / source, store.folder / key)
     for file in (folder / "rows.csv", folder / "record.json"):
         file.write_text(file.read_text().replace(source, key))
+    write_sums(folder)
     return folder
 
 
@@ -157,4 +160,5 @@ def several(store: Store, stored_run: str) -> tuple[Store, dict[str, str]]:
     table = pd.read_csv(rows)
     table.loc[table["metric"] == "psnr", "value"] += 1  # the best
     table.to_csv(rows, index=False)
+    write_sums(rows.parent)
     return store, labels

@@ -1,6 +1,7 @@
 """`steerbench check` and `compare`: exit statuses, what is missing, files that are no baseline."""
 
 import json
+import math
 import shutil
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -10,8 +11,10 @@ import pytest
 
 from bench.errors import SteerbenchError
 from bench.results import Store
-from sweeps.baseline import portable
+from sweeps.baseline import Entry, portable
 from sweeps.cli import dispatch
+from sweeps.measurement import Job
+from sweeps.overrides import composed
 from tests.reports.conftest import copied, rewrite
 from tests.sweeps.conftest import HERE, QUICK
 
@@ -45,7 +48,7 @@ def test_a_figure_that_became_worse_is_shown_and_fails(baseline, outputs, capsys
     line, last = [line for line in capsys.readouterr().out.splitlines() if "psnr" in line]
     assert "-1" in line
     assert "| 0.1 | worse |" in line
-    assert last == "worse: psnr -1 dB (limit 0.1): offset, scene tiny"
+    assert last.startswith("worse: psnr -1 dB (limit 0.1): offset, scene tiny; ")
 
 
 def test_a_baseline_that_is_recorded_anew_keeps_its_limits_and_its_runs(baseline, outputs):
@@ -73,7 +76,7 @@ def test_a_run_of_other_frames_fails_and_the_others_are_still_compared(baseline,
     out = capsys.readouterr().out
     assert "these are figures of other frames" in out
     assert f"no such run below {outputs}: run method=other" in out
-    assert out.endswith("peak_bytes: other, scene tiny\n")
+    assert "peak_bytes: other, scene tiny; 0 of " in out
 
 
 @pytest.mark.parametrize("text", [None, "", "{}", '{"schema": 99}'])
@@ -108,6 +111,7 @@ def test_all_seeds_of_a_run_are_one_entry_and_none_may_be_missing(outputs, copy,
     rows = pd.read_csv(copy / "rows.csv").assign(seed=6)
     rows.loc[rows["metric"] == "psnr", "value"] += 1
     rows.to_csv(copy / "rows.csv", index=False)
+    rewrite(Store(outputs), copy.name, command="steerbench run scene=tiny method=offset seed=6")
     path = tmp_path / "baseline.json"
     assert check(path, outputs, "--record") == 0
     (run,) = json.loads(path.read_text())["runs"]
@@ -130,8 +134,7 @@ def test_a_run_of_another_schema_is_left_out_and_not_compared(baseline, outputs,
 
 def test_what_a_record_leaves_out_is_said(outputs, copy, tmp_path, capsys):
     rewrite(Store(outputs), copy.name, schema_version=1)
-    (outputs / "failures").mkdir()
-    (outputs / "failures" / "0.txt").write_text("no room\n")
+    Job(composed([f"outputs={outputs}"]), []).keep_failure(MemoryError("no room"))
     assert check(tmp_path / "baseline.json", outputs, "--record") == 0
     out = capsys.readouterr().out
     assert "without a limit: fps, frame_ms.*, " in out
@@ -149,6 +152,102 @@ def test_a_folder_that_is_no_store_is_an_error_of_every_command(steerbench, base
             refused = steerbench(*command.split()).refused()
             assert f"steerbench: nowhere: {said}; `steerbench run outputs=nowhere`" in refused
         Path("nowhere/runs").mkdir(parents=True, exist_ok=True)
+
+
+def held_of(baseline: Path) -> dict:
+    """What a baseline of one run with the seed 5 holds."""
+    held = json.loads(baseline.read_text())
+    return {**held, "values": held["runs"][0]["seeds"]["5"]["values"]}
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda held: held["runs"].clear(), "runs: expected some, as a list, got none"),
+        (lambda held: held["limits"].clear(), "limits: expected some, as a dict, got none"),
+        (lambda held: held["values"].clear(), "values: expected figures with a limit, got none"),
+        (
+            lambda held: held["values"].update(psnr=math.nan),
+            "psnr: expected a finite number, got nan",
+        ),
+        (lambda held: held["values"].update(psnr=-math.inf), "finite number, got -inf"),
+        (lambda held: held["values"].update(frame_ms=math.inf), "finite number, got inf"),
+        (lambda held: held["values"].update(psnr=10**400), "finite number, got 1000000"),
+        (lambda held: held["limits"]["psnr"].update(absolute=math.nan), "finite number, got nan"),
+        (lambda held: held["limits"]["psnr"].update(relative=math.inf), "finite number, got inf"),
+        (lambda held: held["limits"]["psnr"].update(better=-1), "better: expected 1, got -1"),
+        (lambda held: held["limits"]["flicker"].update(better=0), "better: expected -1, got 0"),
+    ],
+)
+def test_a_baseline_that_compares_nothing_is_refused(baseline, outputs, change, said):
+    held = held_of(baseline)
+    change(held)
+    del held["values"]
+    baseline.write_text(json.dumps(held))
+    with pytest.raises(SteerbenchError, match=f"no baseline: .*{said}"):
+        check(baseline, outputs)
+
+
+def test_a_metric_that_one_seed_of_a_baseline_lacks_is_missing(outputs, copy, tmp_path, capsys):
+    rows = pd.read_csv(copy / "rows.csv").assign(seed=6)
+    rows.to_csv(copy / "rows.csv", index=False)
+    rewrite(Store(outputs), copy.name, command="steerbench run scene=tiny method=offset seed=6")
+    path = tmp_path / "baseline.json"
+    assert check(path, outputs, "--record") == 0
+    held = json.loads(path.read_text())
+    del held["runs"][0]["seeds"]["5"]["values"]["ssim"]
+    path.write_text(json.dumps(held))
+    assert check(path, outputs) == 1
+    assert "missing: ssim: offset" in capsys.readouterr().out
+
+
+def test_a_run_of_which_nothing_can_be_compared_is_missing(outputs, stored_run, tmp_path, capsys):
+    path = tmp_path / "baseline.json"
+    assert check(path, outputs, "--record") == 0
+    held = json.loads(path.read_text())
+    held["limits"] = {"frame_ms": held["limits"]["frame_ms"]}
+    (of_seed,) = held["runs"][0]["seeds"].values()
+    of_seed |= {"values": {"frame_ms": 1.0}, "frames": {}, "machine": "another"}
+    path.write_text(json.dumps(held))
+    assert check(path, outputs) == 1
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.startswith("missing: every metric: offset, scene tiny; 0 of 1 figures")
+    assert last.endswith("before on another")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "same"),
+    [
+        ("run", "run", True),  # both of the default, which changed
+        ("run method.level=0.5", "run", False),
+        ("run", "run method.level=0.25", False),
+        ("run budget=tiny", "run budget=tiny", True),
+        ("run budget=tiny", "run", True),  # the default by now: its settings are equal
+        ("run method=grey", "run", False),  # the choice brought a setting that differs
+        ("run +experiment=own", "run", False),  # nobody knows what it brought
+    ],
+)
+def test_only_a_default_that_changed_is_forgiven(old, new, same):
+    one, other = (
+        Entry(["grey"], command, {"method.level": level, "budget.steps": "3"}, {})
+        for command, level in ((old, "0.5"), (new, "0.25"))
+    )
+    assert one.same(other) == other.same(one) == same
+    assert one.same(Entry(["grey"], new, one.settings, {}))  # however it was typed
+    assert not one.same(Entry(["black"], new, one.settings, {}))
+
+
+@pytest.mark.parametrize("known_by", ["job", "command"])
+def test_no_run_stands_for_code_that_fails(baseline, outputs, stored_run, capsys, known_by):
+    word = f"outputs={outputs}"
+    command = ["steerbench", "run", "method=offset", "scene=tiny", "seed=5", word]
+    failed = Job(composed([word]), command if known_by == "command" else [])
+    if known_by == "job":
+        Store(outputs).use(stored_run, failed.key)
+    assert check(baseline, outputs) == 0
+    failed.keep_failure(RuntimeError("it diverged"))
+    assert check(baseline, outputs) == 1
+    assert "failed with it diverged: run scene=tiny method=offset" in capsys.readouterr().out
 
 
 # A gate for other checkouts
@@ -172,7 +271,11 @@ def gate(steerbench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 def test_a_gate_passes_in_a_checkout_elsewhere_with_a_method_of_its_own(gate, tmp_path):
     assert str(tmp_path) not in Path("../baseline.json").read_text()
-    assert gate("two").ok().out.endswith("as good as the baseline\n")
+    assert (
+        gate("two")
+        .ok()
+        .out.endswith("as good as the baseline; 6 of 6 figures of 1 runs compared\n")
+    )
 
 
 def test_a_setting_that_makes_it_worse_fails_and_every_form_names_the_metrics(gate, monkeypatch):
@@ -182,9 +285,9 @@ def test_a_setting_that_makes_it_worse_fails_and_every_form_names_the_metrics(ga
     failed = gate("two", "--markdown", str(summary), "--junit", "junit.xml", level=0.25)
     last = failed.out.splitlines()[-1]
     assert failed.status == 1
-    assert "other settings: method.level=0.25 (was 0.5)" in failed.out
+    assert "defaults that changed: method.level=0.25 (was 0.5)" in failed.out
     assert last.startswith("worse: psnr -3.54 dB (limit 0.1), ssim -0.")
-    assert last.endswith(" (limit 0.002): grey, scene white")
+    assert " (limit 0.002): grey, scene white; 6 of 6 figures of 1 runs compared" in last
     assert summary.read_text().startswith(f"before\n## steerbench check\n\n{last}\n\n### grey")
     cases = ET.parse("junit.xml").getroot()
     worse = [case.attrib["name"] for case in cases if case.find("failure") is not None]

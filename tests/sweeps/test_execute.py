@@ -16,10 +16,11 @@ from bench.errors import SteerbenchError, Unavailable
 from sweeps import configured, execute
 from sweeps.execute import Ended
 from sweeps.hydra_runs import label
-from sweeps.measurement import Job, obtain, stored
+from sweeps.measurement import Job, NotStored, became, obtain, stored
 from sweeps.overrides import composed
 from sweeps.plan import plan
 from sweeps.processes import LOCKS, device_lock
+from sweeps.versions import by_job
 from tests.sweeps.conftest import HERE, STAND_INS
 from tests.sweeps.test_plan import TABLES
 
@@ -36,17 +37,14 @@ def test_a_label_has_method_and_what_varies_by_whole_names_where_ends_are_alike(
     assert label("ngp", varied) == expected
 
 
-def test_a_failure_that_cannot_be_kept_is_printed_all_the_same(tmp_path, monkeypatch, capsys):
+def test_a_stored_run_that_cannot_be_read_is_the_failure_of_its_job(tmp_path, monkeypatch, capsys):
     cause = SteerbenchError("the cause")
     monkeypatch.setattr(execute, "obtain", lambda jobs: ([job.key for job in jobs], True))
     monkeypatch.setattr(execute, "say", Mock(side_effect=cause))  # of a stored run that is damaged
-    (tmp_path / "outputs").touch()  # no folder can be made there
     job = Job(composed([f"outputs={tmp_path / 'outputs'}"]), [], "a job")
     ended = execute.attempt([(0, job)], 1, tmp_path / "sweep", 0.0)
     assert ended == {job.key: Ended(error=cause)}
-    printed = capsys.readouterr().err
-    assert "failed: a job: the cause" in printed
-    assert "cannot write to" in printed
+    assert "failed: a job: the cause" in capsys.readouterr().err
 
 
 class Diverged(Exception):
@@ -107,7 +105,7 @@ def test_a_job_that_fails_is_left_out_and_the_others_are_measured_in_turns(
         ended = execute.attempt(list(enumerate(jobs)), 3, tmp_path, 0.0)
         error = ended.pop(jobs[1].key).error
         assert isinstance(error, SteerbenchError)
-        assert jobs[1].failure == str(error)
+        assert jobs[1].failure.why == str(error)
     assert ended == {job.key: Ended(run) for run, job in stored([first, last]).items()}
     if broken.startswith("device"):  # what cannot be used here is not looked for
         assert stored(jobs) == stored([first, last])
@@ -124,8 +122,8 @@ def test_scenes_in_folders_of_one_name_are_refused_in_one_sweep(tmp_path):
 
 def test_a_failure_is_kept_for_its_job_until_that_succeeds(elsewhere):
     (job,), (other,) = in_turns(0.5, turns=""), in_turns(0.75, turns="")
-    job.keep_failure("no room: \udce9")  # of a name of a file that is no UTF-8
-    assert (job.failure, other.failure) == (r"no room: \udce9", None)
+    job.keep_failure(OSError("no room: \udce9"))  # of a name of a file that is no UTF-8
+    assert (job.failure.why, other.failure) == (r"no room: \udce9", None)
     (timed,) = in_turns(0.5)
     assert timed.failure is None  # in turns it is another job
     obtain([job])
@@ -149,6 +147,66 @@ def test_a_training_after_one_that_spoilt_the_pictures_has_the_right_ones(monkey
             configured.trained(composed(STAND_INS), ConsoleLog(Path("outputs")))
     assert seen[0] == seen[1]
     assert min(seen[0]) > 0
+
+
+# Whether to measure
+
+
+def test_what_is_stored_is_measured_again_where_that_is_asked_for(elsewhere):
+    words = [*STAND_INS, "method.level=0.25"]
+    first, again = (Job(composed([*words, *more]), []) for more in ([], ["store=always"]))
+    (key,), _ = obtain([first])
+    stored_at = first.store.record(key)["stored"]
+    assert obtain([first]) == ([key], False)
+    assert obtain([again]) == ([key], True)  # the same run: how it came to be is no setting
+    assert first.store.record(key)["stored"] > stored_at
+    assert stored([again]) == {}
+
+
+def test_nothing_is_measured_where_the_store_must_have_it(elsewhere, run):
+    (only,) = (Job(composed([*STAND_INS, "store=only"]), []),)
+    with pytest.raises(NotStored, match=r"not in outputs/runs.*store=missing measures it"):
+        obtain([only])
+    assert only.failure is None  # nothing was tried
+    assert not list(Path("outputs").glob("*/*"))
+    assert "not in outputs/runs" in run("store=only").refused()
+    run("-m", "seed=0,1").ok()
+    assert run("-m", "seed=0,1", "store=only").ok().err.count("already measured") == 2
+    assert run("-m", "seed=0,1,2", "store=only").err.count("failed: grey (seed=2)") == 1
+
+
+def test_a_damaged_run_is_measured_again(elsewhere):
+    (job,) = in_turns(0.5, turns="")
+    (key,), _ = obtain([job])
+    picture = next((job.store.folder / key / "pictures").iterdir())
+    picture.write_bytes(b"")
+    assert obtain([job]) == ([key], True)
+    assert picture.read_bytes()
+
+
+@pytest.mark.parametrize("turns", ["", "table"])
+def test_a_failure_is_kept_by_whatever_asks_for_the_run(turns, elsewhere):
+    jobs = in_turns(0.5, 7, turns=turns)[-1 - bool(turns) :]
+    with pytest.raises(SteerbenchError):
+        obtain(jobs)
+    assert [job.failure and "level" in job.failure.why for job in jobs][-1]
+
+
+def test_what_stands_for_a_value_is_the_same_run_as_the_value(elsewhere):
+    (by_itself,), _ = obtain([Job(composed(STAND_INS), [])])
+    typed = Job(composed([*STAND_INS, "device=cpu"]), [])
+    assert obtain([typed]) == ([by_itself], False)
+    assert typed.store.record(by_itself)["made_of"]["config"]["device"] == "cpu"
+    assert by_job(typed.store, pytest.fail)[typed.key][0].key == by_itself
+
+
+def test_what_a_method_leaves_to_the_scene_is_shown_as_it_became(tiny_scene):
+    jobs = [Job(composed([f"method.grid.log2_table={x}"]), []) for x in ("null", "17")]
+    typed, became_17 = (
+        became(job.settings, configured.build(job.config, "method"), tiny_scene) for job in jobs
+    )
+    assert typed == became_17
+    assert typed["method"]["grid"]["log2_table"] == 17
 
 
 # Turns on a device

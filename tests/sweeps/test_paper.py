@@ -14,12 +14,13 @@ from bench.results import Store
 from bench.types import SteerbenchError, Unavailable
 from reports.claims import gap
 from reports.runs import load_runs
-from sweeps import configured, execute
+from sweeps import configured, measurement
 from sweeps.commands import paper
-from sweeps.commands.paper import gather, newest
+from sweeps.commands.paper import gather
 from sweeps.data_sets import DataSet
 from sweeps.measurement import Job, JobFailed, described
 from sweeps.plan import Planned, plan
+from sweeps.versions import by_job
 from tests.reports.conftest import changed, copied, rewrite
 from tests.sweeps.conftest import CONFIGS
 from tests.sweeps.test_plan import TABLES, blender
@@ -41,7 +42,7 @@ def measured(
     for."""
     asked: list[DictConfig] = []
 
-    def obtain(jobs: list[Job]) -> tuple[list[str], bool]:
+    def obtained(jobs: list[Job], log: object) -> tuple[list[str], bool]:
         for job in jobs:
             if job.config.method.model.frames == 3:
                 asked.append(job.config)
@@ -50,7 +51,7 @@ def measured(
         asked.extend(job.config for job in jobs)
         return [put(store, stored_run, job) for job in jobs], True
 
-    monkeypatch.setattr(execute, "obtain", obtain)
+    monkeypatch.setattr(measurement, "_obtained", obtained)
     monkeypatch.chdir(tmp_path)
     return asked
 
@@ -88,7 +89,7 @@ def test_the_jobs_go_where_hydras_launcher_puts_them(steerbench, measured, launc
 
 def test_what_cannot_run_here_says_so_and_does_not_fail(steerbench, monkeypatch, outputs):
     cause = Unavailable("no bfloat16 on this CPU")
-    monkeypatch.setattr(execute, "obtain", Mock(side_effect=cause))
+    monkeypatch.setattr(measurement, "_obtained", Mock(side_effect=cause))
     outcome = steerbench("table", "table3", "seed=0", outputs).ok()
     page = Path(re.search(r"report: (.*)", outcome.err)[1])
     assert labels(page)[0] == "L = 0: failed: no bfloat16 on this CPU"
@@ -97,7 +98,7 @@ def test_what_cannot_run_here_says_so_and_does_not_fail(steerbench, monkeypatch,
 def test_a_report_has_what_is_there_alone(steerbench, measured, outputs, store, stored_run):
     jobs = plan(TABLE3, [outputs, "seed=0"])
     put(store, stored_run, jobs[1])
-    jobs[2].keep_failure("killed")
+    jobs[2].keep_failure(SteerbenchError("killed"))
     outcome = steerbench("report", "--table", "table3", "seed=0", outputs)
     assert (outcome.status, measured) == (0, [])
     page = Path(re.search(r"report: (.*)", outcome.err)[1])
@@ -158,16 +159,23 @@ def test_folders_show_their_own(scenes, tmp_path, monkeypatch, tiny_scene, folde
 
     monkeypatch.setattr(configured, "_scene", loaded)
     (tmp_path / "c" / "mic").mkdir(parents=True)
-    (line,) = gather([job(tmp_path / folder / "mic")], newest(scenes)).values()
+    (line,) = gather([job(tmp_path / folder / "mic")], by_job(scenes, print)).values()
     assert [run.record["scene"]["digest"] for run in line.runs] == found
 
 
-def test_a_failure_stands_beside_what_was_measured_before(scenes, tmp_path, elsewhere):
+@pytest.mark.parametrize(
+    ("error", "kept", "said"),
+    [
+        (SteerbenchError("no such folder"), 0, "failed: no such folder"),
+        (Unavailable("no GPU"), 1, "cannot run here: no GPU"),
+    ],
+)
+def test_no_earlier_run_stands_for_what_fails(scenes, tmp_path, elsewhere, error, kept, said):
     asked = job(tmp_path / "b" / "mic")
-    asked.keep_failure("no such folder")
-    (line,) = gather([asked], newest(scenes)).values()
-    assert len(line.runs) == 1
-    assert line.gaps == ["failed when it was tried again: no such folder"]
+    asked.keep_failure(error)
+    (line,) = gather([asked], by_job(scenes, print)).values()
+    assert len(line.runs) == kept
+    assert line.gaps == [said]
 
 
 # Means over the scenes of a data set

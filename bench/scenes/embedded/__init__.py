@@ -20,6 +20,7 @@ from bench.scenes import blender
 from bench.scenes.embedded.models import MODELS
 from bench.scenes.embedded.raytrace import SceneModel, Solids, render
 from bench.scenes.files import opengl_to_opencv, whole_number
+from bench.sharing import check_sums, write_sums
 from bench.threads import in_parallel
 from bench.types import Camera, Log, Scene, SteerbenchError, Unavailable
 
@@ -59,6 +60,7 @@ def load(
     folder = Path(root) / f"{name}-{hashlib.sha256(key.encode()).hexdigest()[:12]}"
     if not folder.is_dir():
         write(folder, settings, log)
+    check_sums(folder)
     scene = blender.load(
         folder,
         downscale=downscale,
@@ -111,8 +113,9 @@ def write(folder: Path, settings: dict, log: Log) -> None:
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as temporary:
-            _write_pictures(Path(temporary) / "scene", settings, log)
-            (Path(temporary) / "scene").rename(folder)
+            _write_pictures(scene := Path(temporary) / "scene", settings, log)
+            write_sums(scene)
+            scene.rename(folder)
     except OSError as error:
         if folder.is_dir():  # another process was faster
             return

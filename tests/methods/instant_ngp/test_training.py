@@ -183,6 +183,11 @@ def test_a_file_that_is_damaged_or_of_another_training_is_named_with_what_to_do(
     with pytest.raises(SteerbenchError, match=rf"{name}\.safetensors.*remove it, and it is made"):
         trained(ball_scene, tmp_path)
     checkpoint.write(path, {"mean.weight": torch.zeros(3)}, {})
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-1] + b"1")  # one weight is another number
+    with pytest.raises(SteerbenchError, match=rf"{name}\.safetensors.*its checksum is wrong"):
+        trained(ball_scene, tmp_path)
+    path.write_bytes(whole)
     message = rf"{name}\.safetensors: expected the file of this .*; remove it to train again"
     with pytest.raises(SteerbenchError, match=message):
         trained(ball_scene, tmp_path)
