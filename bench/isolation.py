@@ -106,6 +106,9 @@ def _checksum(tensor: torch.Tensor) -> int:
 SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM, signal.SIGUSR1
 """Those that programs handle; to look up the handlers of all takes longer than a small frame."""
 
+CUDNN = "enabled", "benchmark", "deterministic", "allow_tf32"
+"""Options of `torch.backends.cudnn`."""
+
 OF_IMPORTS = ("the environment", "filters of warnings")
 """Parts that libraries change when they are first imported; no line is said of these."""
 
@@ -120,6 +123,8 @@ def _state() -> dict[str, Any]:
         "torch's recording of gradients": torch.is_grad_enabled(),
         "torch's precision of products": torch.get_float32_matmul_precision(),
         "torch's deterministic mode": torch.get_deterministic_debug_mode(),
+        "cuDNN's options": [getattr(torch.backends.cudnn, name) for name in CUDNN],
+        "numpy's handling of errors": np.geterr(),
         "the flushing of denormal numbers": sys.float_info.min / 2 == 0.0,
         "the working folder": _folder(),
         "the environment": dict(os.environ),
@@ -158,6 +163,11 @@ def _set_warnings(state: tuple[list[Any], Any]) -> None:
     warnings.filters[:], warnings.showwarning = state  # type: ignore[index]
 
 
+def _set_cudnn(values: list[Any]) -> None:
+    for name, value in zip(CUDNN, values, strict=True):
+        setattr(torch.backends.cudnn, name, value)
+
+
 def _set_cores(cores: set[int]) -> None:
     os.sched_setaffinity(0, cores)
 
@@ -169,6 +179,8 @@ SETTERS: Mapping[str, Callable[[Any], object]] = {
     "torch's recording of gradients": torch.set_grad_enabled,
     "torch's precision of products": torch.set_float32_matmul_precision,
     "torch's deterministic mode": torch.set_deterministic_debug_mode,
+    "cuDNN's options": _set_cudnn,
+    "numpy's handling of errors": lambda errors: np.seterr(**errors),
     "the flushing of denormal numbers": torch.set_flush_denormal,
     "the working folder": os.chdir,
     "the environment": _set_environment,
@@ -192,13 +204,16 @@ USUAL: Mapping[str, object] = {
 
 def _drawn() -> tuple[Any, ...]:
     """The state of all global random numbers."""
-    return torch.get_rng_state(), np.random.get_state(), random.getstate()
+    gpus = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else []
+    return torch.get_rng_state(), np.random.get_state(), random.getstate(), gpus
 
 
 def _draw_from(drawn: tuple[Any, ...]) -> None:
     torch.set_rng_state(drawn[0])
     np.random.set_state(drawn[1])
     random.setstate(drawn[2])
+    if drawn[3]:
+        torch.cuda.set_rng_state_all(drawn[3])
 
 
 @contextmanager

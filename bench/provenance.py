@@ -49,12 +49,30 @@ CPU_MARKS = ("cpu family", "model", "CPU implementer", "CPU part")
 @cache
 def commit() -> str:
     """The commit of a git checkout, with `-dirty` if changed; otherwise the installed version."""
+    return _commit_of(Path(__file__)) or metadata.version("steerbench")
+
+
+def repositories(*things: Any) -> dict[str, str]:
+    """The commits of the git checkouts that files of others among the `sources` of `things` lie in,
+    with `-dirty` if changed, by their top-level package."""
+    first = {name.partition("/")[0]: path for name, path in sorted(sources(*things).items())}
+    commits = {top: _commit_of(path) for top, path in first.items() if top not in OURS}
+    return {top: of for top, of in commits.items() if of}
+
+
+def _commit_of(file: Path) -> str | None:
+    """The commit of the checkout that has this `file`; None of a file that git does not know: an
+    installed copy may lie inside a repository that has nothing to do with it."""
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(file.parent), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
     try:
-        # An installed copy may lie inside a repository that has nothing to do with it.
-        _git("ls-files", "--error-unmatch", __file__)
-        return _git("describe", "--always", "--dirty", "--abbrev=12", "--exclude=*")
+        git("ls-files", "--error-unmatch", str(file))
+        return git("describe", "--always", "--dirty", "--abbrev=12", "--exclude=*")
     except (OSError, subprocess.CalledProcessError):
-        return metadata.version("steerbench")
+        return None
 
 
 def machine() -> dict[str, object]:
@@ -326,11 +344,6 @@ def _imports(path: Path) -> tuple[str, ...]:
 
 _version = cache(metadata.version)  # of a distribution
 _distributions = cache(metadata.packages_distributions)  # that provide each top-level package
-
-
-def _git(*arguments: str) -> str:
-    command = ["git", "-C", str(ROOT), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def _cpu_model() -> str:

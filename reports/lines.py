@@ -3,6 +3,7 @@
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Any
 
 import pandas as pd
@@ -122,17 +123,26 @@ def varied(runs: Sequence[Run]) -> dict[str, list[str]]:
 
 
 def results(store: Store, report: Callable[[str], object] = lambda line: None) -> pd.DataFrame:
-    """Every row of all runs, with a column for each setting that differs between them.
+    """Every row of all runs, with a column for each setting that differs between them and, where
+    runs differ in no setting, one with the commits and the time of each.
 
     `report` gets a line on those that cannot be read, for each reason.
     """
     runs = readable(store, report=report)
     own = {name: values for name, values in varied(runs).items() if name not in (*FACTS, *COLUMNS)}
+    jobs = [(_line_of(run), run.facts["seed"]) for run in runs]
+    if len(set(jobs)) < len(jobs):
+        own["version"] = [f"{run.commit}, {_when(run)}" for run in runs]
     rows = [
         run.rows.assign(**{name: values[index] for name, values in own.items()})
         for index, run in enumerate(runs)
     ]
     return pd.concat(rows, ignore_index=True) if rows else store.rows()
+
+
+def _when(run: Run) -> str:
+    """When a run was stored, to the minute, in local time."""
+    return f"{datetime.fromtimestamp(run.record['stored']):%Y-%m-%d %H:%M}"
 
 
 def _follows(known: Sequence[Sequence[str]], values: Sequence[str]) -> bool:

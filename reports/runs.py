@@ -155,7 +155,7 @@ class Run:
             "protocol": _listed(record["protocol"]),
             "budget": _listed(record["budget"]),
             "seed": str(row["seed"]),
-            "commit": row["commit"],
+            "commit": self.commit,
             "computed on": _listed(computed),
             "times": record.get("times", "not recorded"),
             "doubts": "; ".join(record.get("doubts", ())) or "none",
@@ -166,6 +166,12 @@ class Run:
             "system": f"{machine['system']}, Python {machine['python']}",
             "versions": _listed(record["made_of"].get("libraries", {})),
         }
+
+    @property
+    def commit(self) -> str:
+        """The commits of steerbench and of the checkouts that code of others lies in."""
+        others = self.record.get("repositories", {})
+        return ", ".join((self.facts["commit"], *(f"{top} {of}" for top, of in others.items())))
 
     @property
     def settings(self) -> dict[str, str]:

@@ -19,7 +19,13 @@ from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable, explained, unexpected
 from bench.isolation import Guard, put_back
 from bench.measure import MethodFailed, Task, measure, train
-from bench.provenance import check_unchanged, code_sha256, computed_by, conditions_apart
+from bench.provenance import (
+    check_unchanged,
+    code_sha256,
+    computed_by,
+    conditions_apart,
+    repositories,
+)
 from bench.records import made, read_record
 from bench.results import Store, content_key
 from bench.sharing import whole
@@ -385,6 +391,7 @@ def _measure(ready: Sequence[_Ready], guard: Guard, log: Log) -> None:
         named = {axis.setting: name for name, axis in axes(each.method.name).items()}
         record: dict[str, Any] = {**measurement.record, "command": command}
         record |= {"scene_path": place, "axes": named}
+        record["repositories"] = repositories(*targets(each.job.settings))
         record["neighbours"] |= {"exclusive": each.job.config.exclusive}
         if each.task.protocol.compared:
             record["compared_with"] = ready[0].run

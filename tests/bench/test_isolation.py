@@ -103,6 +103,8 @@ def untidy(folder) -> None:
     torch.set_grad_enabled(not torch.is_grad_enabled())
     torch.set_float32_matmul_precision("medium")
     torch.set_deterministic_debug_mode("warn")
+    torch.backends.cudnn.benchmark = not torch.backends.cudnn.benchmark
+    np.seterr(all="raise")
     os.chdir(folder)
     os.environ["LEFT_BEHIND"] = "1"
     sys.argv.append("left behind")
@@ -117,14 +119,15 @@ def test_global_state_is_put_back_and_each_part_of_it_told(tmp_path):
         of_torch = torch.get_num_threads(), torch.get_default_dtype(), torch.is_grad_enabled()
         of_system = os.getcwd(), os.sched_getaffinity(0), signal.getsignal(signal.SIGUSR1)  # noqa: PTH109
         of_python = dict(os.environ), list(sys.argv), list(warnings.filters)
-        return device, *of_torch, *of_system, *of_python
+        of_libraries = np.geterr(), torch.backends.cudnn.benchmark
+        return device, *of_torch, *of_system, *of_python, *of_libraries
 
     before, told = seen(), []
     with put_back(told.append):
         untidy(tmp_path)
     assert seen() == before
     several_cores = len(os.sched_getaffinity(0)) > 1
-    assert len(told) == 11 + several_cores
+    assert len(told) == 13 + several_cores
     told.clear()
     with put_back(told.append):
         pass

@@ -14,7 +14,7 @@ import torch
 from bench import provenance
 from bench.errors import SteerbenchError
 from bench.measure import measure
-from bench.provenance import computed_by, libraries
+from bench.provenance import computed_by, libraries, repositories
 from methods.instant_ngp.stage1 import train_field
 
 commit = provenance.commit.__wrapped__
@@ -35,6 +35,20 @@ def test_a_checkout_names_its_commit_and_whether_it_was_changed(tree):
     assert commit() == head
     (tree / "methods/fields/cpu.py").write_text("A = 2\n")
     assert commit() == f"{head}-dirty"
+
+
+def test_the_checkout_of_a_package_of_others_is_named(tree, tmp_path, monkeypatch):
+    theirs = tmp_path / "theirs"
+    write(theirs, {"odd/__init__.py": "", "odd/method.py": "A = 1\n"})
+    monkeypatch.syspath_prepend(theirs)
+    assert repositories(defined_in("odd.method"), METHOD) == {}
+    git(theirs, "init", "-q")
+    git(theirs, "add", ".")
+    git(theirs, "commit", "-q", "-m", "first")
+    head = git(theirs, "rev-parse", "--short=12", "HEAD")
+    assert repositories(defined_in("odd.method"), METHOD) == {"odd": head}
+    write(theirs, {"odd/method.py": "A = 2\n"})
+    assert repositories(defined_in("odd.method"), METHOD) == {"odd": f"{head}-dirty"}
 
 
 def test_without_git_or_in_another_repository_the_version_is_named(tree, monkeypatch):

@@ -83,6 +83,23 @@ def test_a_setting_that_is_called_as_a_column_keeps_its_whole_name(make):
         assert name == f"method.of.{own}"
 
 
+def test_runs_that_differ_in_no_setting_have_their_commits_and_times(several):
+    store, keys = several
+    first, second, *others = keys
+    for key in others:
+        store.remove(key)
+    for key, commit in ((first, "one"), (second, "one-dirty")):
+        rename(store, key, "m")
+        rewrite(store, key, repositories={"odd": commit}, stored=0.0)
+    rows = results(store)
+    versions = rows.groupby("run")["version"].unique()
+    for key, commit in ((first, "one"), (second, "one-dirty")):
+        (said,) = versions[key]
+        assert f", odd {commit}, 19" in said  # the time is local
+    store.remove(second)
+    assert "version" not in results(store)
+
+
 def test_results_have_the_settings_that_differ(several):
     store, keys = several
     config = {"method": {"frames": 1}}
