@@ -1,5 +1,6 @@
 """What a new user does first: the demo, made small, as a process of its own."""
 
+import json
 import random
 import signal
 import subprocess
@@ -17,6 +18,7 @@ pytestmark = pytest.mark.slow
 
 SMALL = ["scene.width=64", "scene.train=6", "scene.test=3", "budget=tiny", "budget.frames=0"]
 METHODS = ("ngp", "steernerf", "gaussians")
+QUALITIES = {"psnr", "ssim", "lpips_alex"}
 MEASURED_ANEW = ("frame_ms", "fps", "stage_ms", "train_", "peak_bytes")
 """Metrics that differ from one run to the next on any machine."""
 
@@ -69,6 +71,20 @@ def test_the_same_seed_gives_the_same_rows(first, tmp_path, lpips_weights):
     kept = [repeatable(first[0]), repeatable(tmp_path)]
     assert {"psnr", "ssim", "lpips_alex", "work.samples"} <= set(kept[0]["metric"])
     pd.testing.assert_frame_equal(*kept, check_exact=True)
+
+
+def test_every_kind_of_figure_is_what_a_program_without_our_code_finds(first, lpips_weights):
+    """Of pictures it sees 8 bits, of the truth, too, which is scored as it is."""
+    program = [sys.executable, "-I", Path(__file__).with_name("recompute.py")]
+    weights = next(lpips_weights.glob("alexnet*"))
+    command = [*program, first[0] / "outputs", weights]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    worst = json.loads(done.stdout.splitlines()[-1])
+    of_pictures = {name: worst.pop(name) for name in list(worst) if name.startswith("picture: ")}
+    assert {name.removeprefix("picture: ") for name in of_pictures} == QUALITIES
+    assert max(of_pictures.values()) < 1e-3
+    assert {*QUALITIES, "frame_ms", "fps", "stage_ms", "work", "sum of sizes"} <= worst.keys()
+    assert max(worst.values()) < 1e-12
 
 
 def test_training_is_shared_by_methods_and_runs_that_render_differently(first, lpips_weights):

@@ -122,7 +122,7 @@ def rewrite(store: Store, key: str, **others: object) -> None:
     path = store.folder / key / "record.json"
     record = json.loads(path.read_text())
     for name, value in others.items():
-        record[name] = {**record[name], **value} if isinstance(value, dict) else value
+        record[name] = {**record.get(name, {}), **value} if isinstance(value, dict) else value
     path.write_text(json.dumps(record))
     write_sums(path.parent)
 
