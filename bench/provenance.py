@@ -272,20 +272,27 @@ def sources(*things: Any) -> dict[str, Path]:
 def check_unchanged(loaded: Collection[str], *things: Any) -> None:
     """Raise SteerbenchError if results since `loaded` were the names of all modules may come from
     code that the key of `things` does not hold: a file was changed, or a module was imported that
-    is not among their `sources`."""
+    is not among their `sources`. Such modules are forgotten, so that another run has to import them
+    again, and is refused, too."""
     digest(*things)
     known = {path.resolve() for path in sources(*things).values()}
     ours = [ROOT / top for top in (*OURS, "reports", "sweeps")]
+    late: dict[str, str] = {}
     for name in sys.modules.keys() - loaded:
         file = getattr(sys.modules[name], "__file__", None)
         if not file or not is_edited(file):
             continue
         path = Path(file).resolve()
         if path not in known and not set(path.parents).intersection(ours):
-            raise SteerbenchError(
-                f"{name} was imported while the run went on, so its key does not hold {file}: "
-                "import it at the top of a file of the method, and run again"
-            )
+            late[name] = file
+    for name in late:
+        del sys.modules[name]
+    if late:
+        name = min(late)
+        raise SteerbenchError(
+            f"{name} was imported while the run went on, so its key does not hold {late[name]}: "
+            "import it at the top of a file of the method, and run again"
+        )
 
 
 def _files(name: str, home: bool = False) -> dict[str, Path]:

@@ -129,15 +129,18 @@ def results(store: Store, report: Callable[[str], object] = lambda line: None) -
     `report` gets a line on those that cannot be read, for each reason.
     """
     runs = readable(store, report=report)
-    own = {name: values for name, values in varied(runs).items() if name not in (*FACTS, *COLUMNS)}
-    jobs = [(_line_of(run), run.facts["seed"]) for run in runs]
-    if len(set(jobs)) < len(jobs):
+    if not runs:
+        return store.rows()
+    shown = varied(runs)
+    own = {name: shown[name] for name in shown if name not in (*FACTS, *COLUMNS)}
+    jobs = {(_line_of(run), run.facts["seed"]) for run in runs}
+    if len(jobs) < len(runs):
         own["version"] = [f"{run.commit}, {_when(run)}" for run in runs]
-    rows = [
-        run.rows.assign(**{name: values[index] for name, values in own.items()})
-        for index, run in enumerate(runs)
-    ]
-    return pd.concat(rows, ignore_index=True) if rows else store.rows()
+    tables = []
+    for index, run in enumerate(runs):
+        columns = {name: values[index] for name, values in own.items()}
+        tables.append(run.rows.assign(**columns))
+    return pd.concat(tables, ignore_index=True)
 
 
 def _when(run: Run) -> str:

@@ -149,25 +149,47 @@ def changes(
 
 
 def _change(metric: str, limit: Limit, pairs: Sequence[tuple[Figures, Figures]]) -> Assertion:
-    values = np.array([[run.values.get(metric, math.nan) for run in pair] for pair in pairs])
     frames = [_hiding_nothing(_frames_apart(metric, *pair), limit) for pair in pairs]
-    pairwise = zip(frames, values, strict=True)
-    by_seed = np.array([x.mean() if len(x) > 1 else _apart(*pair) for x, pair in pairwise])
+    values = np.array([[run.values.get(metric, math.nan) for run in pair] for pair in pairs])
+    by_seed = np.array(
+        [
+            of_frames.mean() if len(of_frames) > 1 else _apart(*pair)
+            for of_frames, pair in zip(frames, values, strict=True)
+        ]
+    )
     by_seed = _hiding_nothing(by_seed, limit)
     before, after = map(float, values.mean(axis=0))
-    allowed = limit.absolute + (limit.relative and limit.relative * abs(before))
-    by, interval, certain = float(by_seed.mean()), None, True
+    by, interval = float(by_seed.mean()), None
     if len(pairs) > 1 or len(frames[0]) > 1:
         half = half_interval(by_seed) if len(pairs) > 1 else path_interval(frames[0])
         interval = (by - half, by + half)
-        moved = [(-limit.better * each).max() / len(each) for each in frames if len(each) > 1]
-        broken = not limit.here and max(moved, default=0) / len(pairs) > allowed
-        certain = broken or -limit.better * by - half > 0
-    verdict = "worse" if certain and -limit.better * by > allowed else ""
-    gone = (one.frames.get(metric, {}).keys() - of.frames.get(metric, {}) for one, of in pairs)
-    if math.isnan(before + after) or any(gone):  # of a seed, too
+    lost = -limit.better * by
+    allowed = limit.absolute
+    if limit.relative:
+        allowed += limit.relative * abs(before)
+    sure = interval is None or lost - half > 0 or _broken(frames, limit) > allowed
+    verdict = "worse" if sure and lost > allowed else ""
+    if math.isnan(before + after) or _lacks_frames(metric, pairs):  # of a seed, too
         verdict = "missing"
     return Assertion(metric, before, after, by, interval, limit, verdict)
+
+
+def _broken(frames: Sequence[np.ndarray], limit: Limit) -> float:
+    """By how much the worst frame alone moves the mean over frames and seeds; of times, which may
+    be long by chance, not at all."""
+    if limit.here:
+        return 0.0
+    moved = [
+        (-limit.better * of_seed).max() / len(of_seed) for of_seed in frames if len(of_seed) > 1
+    ]
+    return max(moved, default=0.0) / len(frames)
+
+
+def _lacks_frames(metric: str, pairs: Sequence[tuple[Figures, Figures]]) -> bool:
+    """Whether a run lacks a frame that an earlier one has."""
+    return any(
+        old.frames.get(metric, {}).keys() - new.frames.get(metric, {}).keys() for old, new in pairs
+    )
 
 
 def _frames_apart(metric: str, old: Figures, new: Figures) -> np.ndarray:

@@ -80,13 +80,21 @@ def _stored(store: Store, say: Callable[[str], object]) -> list[Entry]:
     """The runs of `store` that stand for their jobs, by entry; `say` gets a line on versions."""
     found: dict[str, Entry] = {}
     for run in standing(store, say):
+        made_of = run.record["made_of"]
         command = shlex.join(_words(str(run.record["command"])))
-        made_of, seed = run.record["made_of"], str(run.facts["seed"])
-        config = {**made_of.get("config", {"command": command}), "in_turns": "turns" in made_of}
-        settings = {name: portable(str(value)) for name, value in unseeded(config)}
-        entry = Entry([str(run.facts[x]) for x in SUBJECT], command, settings, {})
-        key = json.dumps([entry.subject, settings], sort_keys=True)
-        found.setdefault(key, entry).seeds.setdefault(seed, run)
+        config = {
+            **made_of.get("config", {"command": command}),
+            "in_turns": "turns" in made_of,
+        }
+        entry = Entry(
+            subject=[str(run.facts[name]) for name in SUBJECT],
+            command=command,
+            settings={name: portable(str(value)) for name, value in unseeded(config)},
+            seeds={},
+        )
+        key = json.dumps([entry.subject, entry.settings], sort_keys=True)
+        entry = found.setdefault(key, entry)
+        entry.seeds.setdefault(str(run.facts["seed"]), run)
     return list(found.values())
 
 
@@ -100,22 +108,38 @@ def read(path: Path) -> tuple[Mapping[str, Limit], list[Entry]]:
         for name, kind in (("limits", dict), ("runs", list)):
             if not isinstance(held[name], kind) or not held[name]:
                 raise unexpected(f"{path}: {name}", f"some, as a {kind.__name__}", "none")
-        limits = {x: made(Limit, of, f"{path}: limits.{x}") for x, of in held["limits"].items()}
-        known = limited([f"{metric}=0" for metric in limits])  # refuses what is no metric
-        for metric, limit in limits.items():
-            _refuse_endless(f"{path}: limits.{metric}", (limit.absolute, limit.relative))
-            if limit.better != (better := known[metric].better):
-                raise unexpected(f"{path}: limits.{metric}.better", str(better), limit.better)
-        runs = [made(Entry, of, f"{path}: runs[{n}]") for n, of in enumerate(held["runs"])]
-        for n, run in enumerate(runs):
-            if len(run.subject) != len(SUBJECT) or not run.seeds:
-                raise unexpected(f"{path}: runs[{n}]", f"{', '.join(SUBJECT)}, and seeds", "others")
-            for seed, of in run.seeds.items():
-                run.seeds[seed] = _figures(of, limits, f"{path}: runs[{n}].seeds.{seed}")
-        return limits, runs
+        limits = _limits(held["limits"], f"{path}: limits")
+        entries = [
+            _entry(one, limits, f"{path}: runs[{number}]")
+            for number, one in enumerate(held["runs"])
+        ]
+        return limits, entries
     except SteerbenchError as error:
         way = "remove it, then " * path.exists() + f"`steerbench check --record {path}` writes one"
         raise SteerbenchError(f"no baseline: {error}; {way}") from error
+
+
+def _limits(held: Mapping[str, Any], where: str) -> dict[str, Limit]:
+    """The limits in a baseline, of metrics that exist, in their direction."""
+    limits = {}
+    known = limited([f"{metric}=0" for metric in held])  # refuses what is no metric
+    for metric, one in held.items():
+        limit = limits[metric] = made(Limit, one, f"{where}.{metric}")
+        _refuse_endless(f"{where}.{metric}", (limit.absolute, limit.relative))
+        better = known[metric].better
+        if limit.better != better:
+            raise unexpected(f"{where}.{metric}.better", str(better), limit.better)
+    return limits
+
+
+def _entry(held: Any, limits: Mapping[str, Limit], where: str) -> Entry:
+    """One entry of a baseline, with figures."""
+    entry = made(Entry, held, where)
+    if len(entry.subject) != len(SUBJECT) or not entry.seeds:
+        raise unexpected(where, f"{', '.join(SUBJECT)}, and seeds", "others")
+    for seed, figures in entry.seeds.items():
+        entry.seeds[seed] = _figures(figures, limits, f"{where}.seeds.{seed}")
+    return entry
 
 
 def _figures(held: Any, limits: Mapping[str, Limit], where: str) -> Figures:
@@ -149,18 +173,32 @@ def record(path: Path, outputs: Path, words: Sequence[str], say: Callable[[str],
         if len(runs) < len(old):
             raise SteerbenchError(f"{path}: `steerbench check {path}` says which runs are missing")
     limits = limited(words, limits)
-    of = [{seed: Figures.of(run, limits) for seed, run in each.seeds.items()} for each in runs]
-    figures = [replace(each, seeds=seeds) for each, seeds in zip(runs, of, strict=True)]
-    held = {"schema": SCHEMA, "limits": limits, "runs": figures}
+    entries = []
+    for each in runs:
+        figures = {seed: Figures.of(run, limits) for seed, run in each.seeds.items()}
+        entries.append(replace(each, seeds=figures))
+    held = {"schema": SCHEMA, "limits": limits, "runs": entries}
     with explained(path.parent), whole(path) as new:
         new.write_text(json.dumps(held, indent=1, default=asdict) + "\n", encoding="utf-8")
     say(f"{path}: {len(runs)} of the {len(stored)} runs in the store")
-    metrics = {metric for each in runs for run in each.seeds.values() for metric in run.values}
-    families = sorted({re.sub(r"\..*", ".*", metric) for metric in metrics - limits.keys()})
-    say(f"left out: metrics without a limit: {', '.join(families)}")
+    _say_left_out(runs, limits, say)
     for failure in _failures(outputs):
         say(f"left out: a run that failed: {failure.why}")
     store.rows(report=say)  # on those that cannot be read
+
+
+def _say_left_out(
+    runs: Sequence[Entry], limits: Mapping[str, Limit], say: Callable[[str], object]
+) -> None:
+    metrics = {
+        metric
+        for each in runs
+        for run in each.seeds.values()
+        for metric in run.values
+        if metric not in limits
+    }
+    families = sorted({re.sub(r"\..*", ".*", metric) for metric in metrics})
+    say(f"left out: metrics without a limit: {', '.join(families)}")
 
 
 def checked(
@@ -168,25 +206,40 @@ def checked(
 ) -> list[list[Assertion]]:
     """Whether every metric of each run of the baseline `path` is as good in the store; `say` gets
     a line on which of several versions of a run were taken."""
-    limits, runs = read(path)
-    store, found = existing_store(outputs), []
+    limits, entries = read(path)
+    store = existing_store(outputs)
     stored, failures = _stored(store, say), list(_failures(outputs))
-    for old in runs:
-        before, new = list(old.seeds.values()), old.nearest(stored, runs)
+    found = []
+    for old in entries:
+        new = old.nearest(stored, entries)
         try:
             if failure := _failure_of(old, new, failures, store):
                 raise SteerbenchError(f"failed with {failure.why}: {old.command}")
-            if not new or (gone := sorted(old.seeds.keys() - new.seeds)):
-                seeds = f" with seed={','.join(gone)}" if new else ""
-                raise SteerbenchError(f"no such run{seeds} below {outputs}: {old.command}")
-            after = [Figures.of(new.seeds[seed], limits) for seed in old.seeds]
-            rows, notes = list(changes(before, after, limits)), list(_notes(old, new, after))
+            rows, note = _compared(old, new, limits, outputs)
         except SteerbenchError as error:
-            nothing = [replace(each, values={}, frames={}) for each in before]
-            rows, notes = list(changes(before, nothing, limits)), [str(error)]
-        rows = rows or [NOTHING]
-        found.append([replace(x, run=_name(old, runs), note="; ".join(notes)) for x in rows])
+            before = list(old.seeds.values())
+            nothing = [replace(figures, values={}, frames={}) for figures in before]
+            rows, note = list(changes(before, nothing, limits)), str(error)
+        name = _name(old, entries)
+        found.append([replace(row, run=name, note=note) for row in rows or [NOTHING]])
     return found
+
+
+def _compared(
+    old: Entry, new: Entry | None, limits: Mapping[str, Limit], outputs: Path
+) -> tuple[list[Assertion], str]:
+    """What became of the metrics of `old` in its runs `new`, and what else to know of these; raises
+    SteerbenchError if some are missing, or of other frames."""
+    if new is None:
+        raise SteerbenchError(f"no such run below {outputs}: {old.command}")
+    if gone := sorted(old.seeds.keys() - new.seeds):
+        raise SteerbenchError(
+            f"no such run with seed={','.join(gone)} below {outputs}: {old.command}"
+        )
+    before = list(old.seeds.values())
+    after = [Figures.of(new.seeds[seed], limits) for seed in old.seeds]
+    rows = list(changes(before, after, limits))
+    return rows, "; ".join(_notes(old, new, after))
 
 
 def _notes(old: Entry, new: Entry, after: Sequence[Figures]) -> Iterator[str]:
@@ -198,27 +251,31 @@ def _notes(old: Entry, new: Entry, after: Sequence[Figures]) -> Iterator[str]:
     ]
     if changed:
         yield f"defaults that changed: {', '.join(changed)}"
-    machines = [
-        (one.machine, other.machine) for one, other in zip(old.seeds.values(), after, strict=True)
-    ]
-    for before, now_on in dict.fromkeys(pair for pair in machines if len(set(pair)) > 1):
-        yield f"times and memory are not compared: measured on {now_on}, before on {before}"
-    of_code = [new.seeds[seed] for seed in old.seeds if "command" not in old.settings]
-    if not all(map(is_present, of_code)):
+    for then, here in zip(old.seeds.values(), after, strict=True):
+        if then.machine != here.machine:
+            yield (
+                f"times and memory are not compared: measured on {here.machine}, before on "
+                f"{then.machine}"
+            )
+            break
+    scored_alone = "command" in old.settings
+    if not scored_alone and not all(is_present(new.seeds[seed]) for seed in old.seeds):
         yield "of other code than is here now: run it again"
 
 
 def _failure_of(
     old: Entry, new: Entry | None, failures: Sequence[Failure], store: Store
 ) -> Failure | None:
-    """The failure of a job that one of the runs `old` stands for, since it was last measured."""
-    seeds = new.seeds.items() if new else ()
-    jobs = {job for seed, run in seeds if seed in old.seeds for job in store.used(run.key)[1]}
+    """The failure of a job that one of the runs `old` or `new` stands for, since it last ended
+    well: a job that asked for the run, or one of the same words."""
+    runs = [new.seeds[seed] for seed in old.seeds if seed in new.seeds] if new else []
+    jobs = {job for run in runs for job in store.used(run.key)[1]}
+    commands = [sorted(shlex.split(one.command)) for one in (old, new) if one]
     for failure in failures:
-        given = dict(word.split("=", 1) for word in shlex.split(failure.command) if "=" in word)
-        words = sorted(_words(failure.command))
-        alike = any(words == sorted(shlex.split(x.command)) for x in (old, new) if x)
-        if failure.job in jobs or (alike and given.get("seed", "0") in old.seeds):
+        words = shlex.split(failure.command)
+        seeds = [word.removeprefix("seed=") for word in words if word.startswith("seed=")]
+        alike = sorted(_words(failure.command)) in commands
+        if failure.job in jobs or (alike and (seeds or ["0"])[-1] in old.seeds):
             return failure
     return None
 

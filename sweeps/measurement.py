@@ -52,6 +52,9 @@ from sweeps.processes import device_lock
 PLACES = ("outputs", "report", "weights_dir", "store")
 """Settings that say where things are, and whether to measure, but change no row."""
 
+AUTOMATIC = {"device": DEVICE, "backend": re.compile("reference|cpu|gpu")}
+"""Settings that may be "auto", and what they can become in a key."""
+
 
 def described(config: DictConfig) -> dict[str, Any]:
     """The settings that determine a run; equal for equal jobs.
@@ -314,16 +317,22 @@ def became(settings: Mapping[str, Any], method: Method, scene: Scene) -> dict[st
     """`settings` with what "auto" stands for on this machine, and what `method` leaves to the scene
     as it is for this one: who types the same has the same run."""
     shown = method.settings()
-    known = {"device": DEVICE, "backend": re.compile("reference|cpu|gpu")}
-    auto = {name: shown[name] for name, form in known.items() if form.fullmatch(shown[name])}
-
-    decided: Mapping[str, Any] = getattr(method, "decided", lambda scene: {})(scene)
+    automatic = {
+        name: shown[name] for name, form in AUTOMATIC.items() if form.fullmatch(shown[name])
+    }
+    decided: Mapping[str, Any] = {}
+    if hasattr(method, "decided"):
+        decided = method.decided(scene)
 
     def resolved(node: Mapping[str, Any], before: str) -> dict[str, Any]:
         found = {}
         for name, value in node.items():
-            of = resolved(value, f"{before}{name}.") if isinstance(value, Mapping) else value
-            found[name] = auto.get(name, of) if of == "auto" else decided.get(before + name, of)
+            if isinstance(value, Mapping):
+                found[name] = resolved(value, f"{before}{name}.")
+            elif value == "auto":
+                found[name] = automatic.get(name, value)
+            else:
+                found[name] = decided.get(f"{before}{name}", value)
         return found
 
     return resolved(settings, "")
@@ -381,17 +390,20 @@ def _turn(ready: Sequence[_Ready], log: ConsoleLog, threads: int | None = None) 
 def _measure(ready: Sequence[_Ready], guard: Guard, log: Log) -> None:
     """Measure all, and put them in the place of earlier ones, damaged ones, and what is left by an
     interruption."""
-    measurements = measure([each.method for each in ready], ready[0].task, log, guard)
+    methods = [each.method for each in ready]
+    measurements = measure(methods, ready[0].task, log, guard)
     for each in ready:
         each.check_unchanged()
     for each in ready:
         each.job.store.remove(each.run)
     for each, measurement in zip(ready, measurements, strict=True):
-        command, place = shlex.join(each.job.command), scene_folder(each.job.config)
-        named = {axis.setting: name for name, axis in axes(each.method.name).items()}
-        record: dict[str, Any] = {**measurement.record, "command": command}
-        record |= {"scene_path": place, "axes": named}
-        record["repositories"] = repositories(*targets(each.job.settings))
+        record: dict[str, Any] = {
+            **measurement.record,
+            "command": shlex.join(each.job.command),
+            "scene_path": scene_folder(each.job.config),
+            "axes": {axis.setting: name for name, axis in axes(each.method.name).items()},
+            "repositories": repositories(*targets(each.job.settings)),
+        }
         record["neighbours"] |= {"exclusive": each.job.config.exclusive}
         if each.task.protocol.compared:
             record["compared_with"] = ready[0].run

@@ -27,14 +27,20 @@ def standing(store: Store, say: Callable[[str], object]) -> list[Run]:
 
     versions: dict[tuple[str, str], list[Run]] = {}
     for run in sorted(readable(store), key=last_used, reverse=True):
-        versions.setdefault((_own_job(run), run.record["scene"]["digest"]), []).append(run)
-    taken, said = [], []
+        scene = run.record["scene"]["digest"]
+        versions.setdefault((_own_job(run), scene), []).append(run)
+    taken: list[Run] = []
+    said: list[str] = []
     for several in versions.values():
-        present = [run for run in several if len(several) > 1 and is_present(run)]
-        taken.append((present or several)[0])
-        if len(several) > 1:
-            why = "of the present code" if present else "the one used last"
-            said.append(f"{taken[-1].key} ({why}; {len(several) - 1} others)")
+        if len(several) == 1:
+            taken += several
+            continue
+        present = [run for run in several if is_present(run)]
+        (first, *_), why = several, "the one used last"
+        if present:
+            (first, *_), why = present, "of the present code"
+        taken.append(first)
+        said.append(f"{first.key} ({why}; {len(several) - 1} others)")
     if said:
         say(f"several versions of a run: taken {some(said)}")
     return taken

@@ -296,7 +296,7 @@ def test_a_module_that_is_imported_while_a_run_goes_on_is_refused(plugin, tmp_pa
     importlib.import_module("imported_late")
     with pytest.raises(SteerbenchError, match="imported_late was imported while the run went on"):
         provenance.check_unchanged(loaded, thing)
-    del sys.modules["imported_late"]
+    assert "imported_late" not in sys.modules  # the next run imports it again, and is refused, too
 
 
 def test_what_may_have_changed_times_is_said(monkeypatch):

@@ -90,7 +90,7 @@ def test_runs_that_differ_in_no_setting_have_their_commits_and_times(several):
         store.remove(key)
     for key, commit in ((first, "one"), (second, "one-dirty")):
         rename(store, key, "m")
-        rewrite(store, key, repositories={"odd": commit}, stored=0.0)
+        rewrite(store, key, repositories={"odd": commit}, stored=0.0, made_of={"config": {}})
     rows = results(store)
     versions = rows.groupby("run")["version"].unique()
     for key, commit in ((first, "one"), (second, "one-dirty")):
