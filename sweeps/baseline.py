@@ -8,7 +8,6 @@ import re
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +17,11 @@ from bench.results import Store, existing_store
 from bench.sharing import whole
 from reports.regression import LIMITS, Assertion, Figures, Limit, changes, limited
 from reports.runs import unseeded
-from sweeps.measurement import PLACES, Failure
+from sweeps.measurement import Failure, failures, own_words, portable
 from sweeps.versions import is_present, standing
 
 SCHEMA = 3  # of baseline files
 SUBJECT = ("method", "scene", "split", "trajectory", "resolution", "protocol", "budget")
-ABSOLUTE = re.compile(r"""(?<![^\s=,'"\[])~?/(?:[^\s,'"\]]*/)?([^/\s,'"\]]+)/*""")
-portable = partial(ABSOLUTE.sub, r"\1")  # leaves of absolute paths the last part
 NOTHING = Assertion("every metric", math.nan, math.nan, math.nan, None, Limit(1), "missing")
 TYPED = re.compile(r"[+~]*([\w.@/]+)=")  # a setting among the words of a command
 
@@ -69,19 +66,13 @@ class Entry:
         return min(there, key=lambda each: len(self.differences(each)), default=None)
 
 
-def _words(command: str) -> list[str]:
-    """What determines a run among the words of its command."""
-    others = (*PLACES, "hydra.mode", "seed")
-    words = map(portable, shlex.split(command)[1:])
-    return [word for word in words if word.partition("=")[0] not in others]
-
-
 def _stored(store: Store, say: Callable[[str], object]) -> list[Entry]:
     """The runs of `store` that stand for their jobs, by entry; `say` gets a line on versions."""
     found: dict[str, Entry] = {}
     for run in standing(store, say):
         made_of = run.record["made_of"]
-        command = shlex.join(_words(str(run.record["command"])))
+        words, _ = _without_seed(own_words(str(run.record["command"])))
+        command = shlex.join(words)
         config = {
             **made_of.get("config", {"command": command}),
             "in_turns": "turns" in made_of,
@@ -182,7 +173,7 @@ def record(path: Path, outputs: Path, words: Sequence[str], say: Callable[[str],
         new.write_text(json.dumps(held, indent=1, default=asdict) + "\n", encoding="utf-8")
     say(f"{path}: {len(runs)} of the {len(stored)} runs in the store")
     _say_left_out(runs, limits, say)
-    for failure in _failures(outputs):
+    for failure in failures(outputs).values():
         say(f"left out: a run that failed: {failure.why}")
     store.rows(report=say)  # on those that cannot be read
 
@@ -208,12 +199,12 @@ def checked(
     a line on which of several versions of a run were taken."""
     limits, entries = read(path)
     store = existing_store(outputs)
-    stored, failures = _stored(store, say), list(_failures(outputs))
+    stored, failed = _stored(store, say), list(failures(outputs).values())
     found = []
     for old in entries:
         new = old.nearest(stored, entries)
         try:
-            if failure := _failure_of(old, new, failures, store):
+            if failure := _failure_of(old, new, failed, store):
                 raise SteerbenchError(f"failed with {failure.why}: {old.command}")
             rows, note = _compared(old, new, limits, outputs)
         except SteerbenchError as error:
@@ -264,25 +255,25 @@ def _notes(old: Entry, new: Entry, after: Sequence[Figures]) -> Iterator[str]:
 
 
 def _failure_of(
-    old: Entry, new: Entry | None, failures: Sequence[Failure], store: Store
+    old: Entry, new: Entry | None, failed: Sequence[Failure], store: Store
 ) -> Failure | None:
     """The failure of a job that one of the runs `old` or `new` stands for, since it last ended
     well: a job that asked for the run, or one of the same words."""
     runs = [new.seeds[seed] for seed in old.seeds if seed in new.seeds] if new else []
     jobs = {job for run in runs for job in store.used(run.key)[1]}
     commands = [sorted(shlex.split(one.command)) for one in (old, new) if one]
-    for failure in failures:
-        words = shlex.split(failure.command)
-        seeds = [word.removeprefix("seed=") for word in words if word.startswith("seed=")]
-        alike = sorted(_words(failure.command)) in commands
-        if failure.job in jobs or (alike and (seeds or ["0"])[-1] in old.seeds):
+    for failure in failed:
+        words, seed = _without_seed(own_words(failure.command))
+        alike = sorted(words) in commands and seed in old.seeds
+        if alike or failure.job in jobs:
             return failure
     return None
 
 
-def _failures(outputs: Path) -> Iterator[Failure]:
-    for file in sorted(outputs.glob("failures/*.json")):
-        yield made(Failure, read_record(file), str(file))
+def _without_seed(words: Sequence[str]) -> tuple[list[str], str]:
+    """The words of a command but for its seed, and this, 0 where none is given."""
+    seeds = ["0", *(word.removeprefix("seed=") for word in words if word.startswith("seed="))]
+    return [word for word in words if not word.startswith("seed=")], seeds[-1]
 
 
 def _name(one: Entry, of: Sequence[Entry]) -> str:

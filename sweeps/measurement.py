@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +51,9 @@ from sweeps.processes import device_lock
 
 PLACES = ("outputs", "report", "weights_dir", "store")
 """Settings that say where things are, and whether to measure, but change no row."""
+
+ABSOLUTE = re.compile(r"""(?<![^\s=,'"\[])~?/(?:[^\s,'"\]]*/)?([^/\s,'"\]]+)/*""")
+portable = partial(ABSOLUTE.sub, r"\1")  # leaves of absolute paths the last part
 
 AUTOMATIC = {"device": DEVICE, "backend": re.compile("reference|cpu|gpu")}
 """Settings that may be "auto", and what they can become in a key."""
@@ -96,6 +99,12 @@ def turns_of(name: str, config: DictConfig) -> str:
 def reason(error: BaseException) -> str:
     """The message of `error` in one line."""
     return " ".join(str(error).split()) or type(error).__name__
+
+
+def own_words(command: str) -> list[str]:
+    """What determines a run among the words of its `command`."""
+    words = map(portable, shlex.split(command)[1:])
+    return [word for word in words if word.partition("=")[0] not in (*PLACES, "hydra.mode")]
 
 
 @dataclass(frozen=True)
@@ -146,6 +155,14 @@ class Job:
             with whole(self.failure_file) as new:
                 new.write_text(json.dumps(asdict(held), indent=1) + "\n", encoding="utf-8")
 
+    def forget_failures(self) -> None:
+        """Forget how it failed, and how its command failed when it had other defaults."""
+        own = sorted(own_words(shlex.join(self.command)))
+        for file, failure in failures(self.outputs).items():
+            same = own and sorted(own_words(failure.command)) == own
+            if same or failure.job == self.key:
+                file.unlink(missing_ok=True)
+
 
 @dataclass(frozen=True)
 class Failure:
@@ -155,6 +172,12 @@ class Failure:
     command: str
     job: str  # its key
     unavailable: bool  # it needs what this machine lacks
+
+
+def failures(outputs: Path) -> dict[Path, Failure]:
+    """The last attempts of jobs that failed, by their files."""
+    files = sorted(outputs.glob("failures/*.json"))
+    return {file: made(Failure, read_record(file), str(file)) for file in files}
 
 
 class JobFailed(SteerbenchError):
@@ -366,7 +389,7 @@ def _told(ready: Sequence[_Ready], measured: bool, log: Log) -> list[str]:
             log.info(f"already measured: {each.run}; store=always measures again")
             if apart := conditions_apart(each.job.store.record(each.run)["machine"]):
                 log.info(f"its times are of other conditions: {apart}")
-        each.job.failure_file.unlink(missing_ok=True)
+        each.job.forget_failures()
     return [each.run for each in ready]
 
 

@@ -3,6 +3,7 @@
 import os
 import pickle
 from contextlib import nullcontext, suppress
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from unittest.mock import Mock
@@ -128,6 +129,20 @@ def test_a_failure_is_kept_for_its_job_until_that_succeeds(elsewhere):
     assert timed.failure is None  # in turns it is another job
     obtain([job])
     assert job.failure is None
+
+
+def test_a_command_that_succeeds_has_no_failure_left_of_other_defaults(elsewhere):
+    """As of code that is taken back; which job it was, is forgotten with its default."""
+    words = ["steerbench", "run", "method=grey"]
+    tried, (taken_back,) = (
+        Job(composed([*STAND_INS, "method.level=0.75"]), words),
+        in_turns(0.5, turns=""),
+    )
+    tried.keep_failure(RuntimeError("it diverged"))
+    obtain([taken_back])
+    assert tried.failure
+    obtain([replace(taken_back, command=[*words, "outputs=outputs"])])
+    assert tried.failure is None
 
 
 def test_a_training_after_one_that_spoilt_the_pictures_has_the_right_ones(monkeypatch, elsewhere):
