@@ -10,7 +10,7 @@ import pandas as pd
 
 from bench.rows import half_interval, path_interval
 from reports.comparison import shown_as
-from reports.runs import Repeated, Run
+from reports.runs import Repeated, Run, grouped
 from reports.tables import ABSENT, BOLD, Table, decimal
 
 AS, LARGER, SMALLER = "as in the paper", "larger", "smaller"
@@ -146,11 +146,10 @@ def gap(metric: str, one: Repeated, other: Repeated) -> Gap:
     ]
     if not pairs:
         return NOT_MEASURED
-    of_scenes: dict[object, list[float]] = {}
-    for run, twin in pairs:
-        of_scenes.setdefault(run.record["scene"]["digest"], []).append(_apart(metric, run, twin))
+    by_scene = grouped(pairs, lambda pair: pair[0].record["scene"]["digest"]).values()
+    of_scenes = [[_apart(metric, *pair) for pair in of_scene] for of_scene in by_scene]
     # The seeds of a scene share what is particular to it: of several scenes, each is one sample.
-    means = [float(np.mean(of)) for of in of_scenes.values()]
+    means = [float(np.mean(of_scene)) for of_scene in of_scenes]
     by = float(np.mean(means))
     if metric.startswith("size_bytes"):
         return Gap(by, 0.0, "computed, not sampled", True)
@@ -158,7 +157,7 @@ def gap(metric: str, one: Repeated, other: Repeated) -> Gap:
         return Gap(by, *_over_frames(metric, *pairs[0]), False)
     counts = {"scenes": len(means), "seeds": len({run.facts["seed"] for run, _ in pairs})}
     over = " × ".join(f"{count} {kind}" for kind, count in counts.items() if count > 1)
-    samples = means if len(means) > 1 else next(iter(of_scenes.values()))
+    samples = means if len(means) > 1 else of_scenes[0]
     return Gap(by, half_interval(np.array(samples)), over, True)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 
 from bench.results import COLUMNS, Store, content_key
-from reports.runs import Repeated, Run, over_common_frames, readable, unseeded
+from reports.runs import Repeated, Run, grouped, over_common_frames, readable, unseeded
 from reports.tables import QUALITY
 
 METHOD = "method"  # the first column
@@ -60,10 +60,9 @@ def as_lines(runs: Sequence[Run]) -> Lines:
 
     The label of a run is shown as its method.
     """
-    by_line: dict[str, dict[int, Run]] = {}
-    for run in over_common_frames(runs):
-        by_line.setdefault(_line_of(run), {})[run.facts["seed"]] = run  # a seed counts once
-    groups = [[*of_line.values()] for of_line in by_line.values()]
+    by_line = grouped(over_common_frames(runs), _line_of)
+    by_seed = ({run.facts["seed"]: run for run in of_line} for of_line in by_line.values())
+    groups = [[*of_line.values()] for of_line in by_seed]  # a seed counts once
     firsts = [of_line[0] for of_line in groups]
     settings = {METHOD: [run.label for run in firsts], **differing(firsts)}
     machines = [", ".join(run.computer) for run in firsts]

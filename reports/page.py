@@ -12,7 +12,7 @@ from reports.comparison import comparison, conditions_of, machines
 from reports.images import MOST_RENDERINGS, Part, Picture, frame_section, kept_frames
 from reports.lines import Lines, as_lines
 from reports.publish import publish
-from reports.runs import Run, load_runs, missing_figures
+from reports.runs import Run, grouped, load_runs, missing_figures
 from reports.tables import Table, run_tables
 
 
@@ -116,12 +116,10 @@ def _ablations(lines: Lines) -> Iterator[Part]:
 
 def _pictures(runs: Sequence[Run]) -> Iterator[Part]:
     """Images of the kept frames; runs that rendered the same frames share images."""
-    groups: dict[tuple[object, ...], list[Run]] = {}
-    for run in runs:
-        groups.setdefault(run.views, []).append(run)
+    groups = grouped(runs, lambda run: run.views).values()
     parts = [
         part
-        for number, group in enumerate(groups.values(), 1)
+        for number, group in enumerate(groups, 1)
         for frame in kept_frames(group)
         for part in frame_section(group, frame, f"frames-{number}")
     ]

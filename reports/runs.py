@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -25,6 +25,9 @@ from bench.scenes.images import contents, decode_bytes
 from bench.sharing import check_sums
 from bench.study import part_of
 from reports.tables import phases, run_tables
+
+T = TypeVar("T")
+K = TypeVar("K")
 
 STAGE = "stage_ms."  # prefix of the metrics of stages
 
@@ -266,6 +269,14 @@ def load_runs(store: Store, keys: Iterable[str]) -> list[Run]:
             store.record(key)  # raises if there is none
             raise SteerbenchError("; ".join(unread))
     return [runs[key] for key in wanted]
+
+
+def grouped(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
+    """The `items` that have the same `key`, by this key, in the order of the first of each."""
+    groups: dict[K, list[T]] = {}
+    for each in items:
+        groups.setdefault(key(each), []).append(each)
+    return groups
 
 
 def _label(command: object, rows: pd.DataFrame) -> str:

@@ -16,7 +16,7 @@ from bench.clock import OTHER
 from bench.convergence import observed_order
 from reports.figures import frontier_plot
 from reports.images import Part, Picture
-from reports.runs import Run
+from reports.runs import Run, grouped
 from reports.tables import BOLD, DENSE, Table, amount, decimal, megabytes, share
 
 WORK = "work."
@@ -80,21 +80,20 @@ def pooled(found: Sequence[Measured]) -> list[Measured]:
     line which all groups have, the last of several, takes as long in each as in their median. Lost
     is the PSNR of the first line less that of a line.
     """
-    groups: dict[str, dict[tuple[str, ...], Measured]] = {}
-    for each in found:
-        groups.setdefault(each.line.group, {})[each.line.settings] = each
+    by_group = grouped(found, lambda each: each.line.group).values()
+    groups = [{each.line.settings: each for each in group} for group in by_group]
     lines = dict.fromkeys(each.line.settings for each in found)
-    common = [line for line in lines if all(line in group for group in groups.values())]
+    common = [line for line in lines if all(line in group for group in groups)]
     if common:
-        usual = statistics.median_low(group[common[-1]].ms for group in groups.values())
-        for group in groups.values():
+        usual = statistics.median_low(group[common[-1]].ms for group in groups)
+        for group in groups:
             pace = usual / group[common[-1]].ms
             for line, x in group.items():
                 ms, fastest, slowest = pace * x.ms, pace * x.fastest, pace * x.slowest
                 group[line] = replace(x, ms=ms, fastest=fastest, slowest=slowest)
     once = {}
     for line in lines:
-        several = [group[line] for group in groups.values() if line in group]
+        several = [group[line] for group in groups if line in group]
         middle = statistics.median_low(each.ms for each in several)
         usual_one = next(each for each in several if each.ms == middle)
         ends = min(x.fastest for x in several), max(x.slowest for x in several)
@@ -104,9 +103,8 @@ def pooled(found: Sequence[Measured]) -> list[Measured]:
 
 
 def by_method(found: Iterable[Measured]) -> dict[str, list[Measured]]:
-    methods: dict[str, list[Measured]] = {}
-    for each in found:
-        methods.setdefault(each.line.method, []).append(each)
+    """The `pooled` lines of each method."""
+    methods = grouped(found, lambda each: each.line.method)
     return {name: pooled(of) for name, of in methods.items()}
 
 
@@ -212,14 +210,11 @@ def breakdown(found: Sequence[Measured]) -> list[Part]:
 def scaling(found: Sequence[Measured]) -> list[Part]:
     """How time, work and memory of a frame grow along each axis: all lines, and below those of an
     axis the exponent of each figure."""
-    methods: dict[str, dict[str, list[Measured]]] = {}
-    for each in found:
-        methods.setdefault(each.line.method, {}).setdefault(each.line.group, []).append(each)
-    return [_scaling_table(method, axes) for method, axes in methods.items()]
+    methods = grouped(found, lambda each: each.line.method)
+    return [_scaling_table(method, lines) for method, lines in methods.items()]
 
 
-def _scaling_table(method: str, axes: Mapping[str, Sequence[Measured]]) -> Table:
-    every = [line for lines in axes.values() for line in lines]
+def _scaling_table(method: str, every: Sequence[Measured]) -> Table:
     counters = dict.fromkeys(name for line in every for name in line.work)
     figures: dict[str, tuple[str, Callable[[float], str]]] = {
         "frame_ms": ("ms / frame ↓", partial(decimal, decimals=1)),
@@ -229,7 +224,7 @@ def _scaling_table(method: str, axes: Mapping[str, Sequence[Measured]]) -> Table
     }
     cells: list[tuple[str, ...]] = []
     sources: list[tuple[str, ...]] = []
-    for axis, lines in axes.items():
+    for axis, lines in grouped(every, lambda line: line.line.group).items():
         for line in lines:
             of_line = (write(line.figure(name)) for name, (_, write) in figures.items())
             cells.append((line.line.label, *of_line, _tail(line)))

@@ -31,7 +31,7 @@ from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
 from bench.results import content_key
 from bench.study import study_of
-from reports.runs import load_runs
+from reports.runs import grouped, load_runs
 from reports.tables import decimal
 from sweeps.configured import scene_folder, trained, training_threads
 from sweeps.measurement import Job, JobFailed, obtain, reason, stored
@@ -239,14 +239,14 @@ def _groups(jobs: Sequence[Job], look_up: bool) -> tuple[list[Group], dict[str, 
 
     With `look_up`, without those that the store has, which are returned as ended.
     """
-    together: dict[tuple[str, str], list[Job]] = {}
-    for job in jobs:
+
+    def together(job: Job) -> tuple[str, str]:
         shared = {name: of for name, of in job.settings.items() if name not in OF_METHOD}
-        with_others = content_key(shared) if job.turns else job.key
-        together.setdefault((job.turns, with_others), []).append(job)
+        return job.turns, content_key(shared) if job.turns else job.key
+
     groups: list[Group] = []
     ended: dict[str, Ended] = {}
-    for of_group in together.values():
+    for of_group in grouped(jobs, together).values():
         found: dict[str, Job] = {}
         with suppress(SteerbenchError):  # a job that cannot start says so when it is measured
             found = stored(of_group) if look_up else {}

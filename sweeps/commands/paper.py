@@ -14,7 +14,7 @@ from bench.results import Store, existing_store
 from reports import export
 from reports.paper_page import write_paper_page
 from reports.paper_tables import Place
-from reports.runs import Repeated, Run, over_common_frames, over_scenes
+from reports.runs import Repeated, Run, grouped, over_common_frames, over_scenes
 from sweeps.data_sets import DataSet, data_sets, find
 from sweeps.execute import Ended, divided, launcher_of, run_jobs
 from sweeps.measurement import of_scene
@@ -83,11 +83,9 @@ def gather(jobs: Sequence[Planned], runs: Mapping[str, Sequence[Run]]) -> dict[P
     With several scenes, a run of a line is the mean of one seed over the scenes that all lines of
     the block have. Lines without any measurement are ignored for this. `runs` are from `by_job`.
     """
-    blocks: dict[tuple[str, str], dict[Place, list[Outcome]]] = {}
-    for job in jobs:
-        of_block = blocks.setdefault(job.place[:2], {})
-        of_block.setdefault(job.place, []).append(_outcome(job, runs.get(job.key, ())))
-    return {place: line for block in blocks.values() for place, line in _lines(block).items()}
+    outcomes = [_outcome(job, runs.get(job.key, ())) for job in jobs]
+    blocks = grouped(outcomes, lambda each: each.job.place[:2]).values()
+    return {place: line for block in blocks for place, line in _lines(block).items()}
 
 
 def _outcome(job: Planned, runs: Sequence[Run]) -> Outcome:
@@ -101,13 +99,10 @@ def _outcome(job: Planned, runs: Sequence[Run]) -> Outcome:
     return Outcome(job, None, "not measured yet")
 
 
-def _lines(of_block: Mapping[Place, Sequence[Outcome]]) -> dict[Place, Repeated]:
-    every = [each for line in of_block.values() for each in line]
-    runs = iter(over_common_frames([each.run for each in every if each.run]))
-    lines = {
-        place: [each._replace(run=next(runs)) if each.run else each for each in line]
-        for place, line in of_block.items()
-    }
+def _lines(of_block: Sequence[Outcome]) -> dict[Place, Repeated]:
+    runs = iter(over_common_frames([each.run for each in of_block if each.run]))
+    comparable = [each._replace(run=next(runs)) if each.run else each for each in of_block]
+    lines = grouped(comparable, lambda each: each.job.place)
     measured = [{each.job.scene for each in line if each.run} for line in lines.values()]
     common = set.intersection(*filter(None, measured)) if any(measured) else set()
     return {place: _line(outcomes, common) for place, outcomes in lines.items()}
@@ -116,14 +111,18 @@ def _lines(of_block: Mapping[Place, Sequence[Outcome]]) -> dict[Place, Repeated]
 def _line(outcomes: Sequence[Outcome], common: set[str]) -> Repeated:
     """A line whose runs are means over the scenes `common`, one per seed that has all of them."""
     label = outcomes[0].job.label
-    by_seed: dict[int, list[Run]] = {}
-    by_scene: dict[str, list[Run]] = {}
-    for each in sorted(outcomes, key=lambda each: each.job.scene not in common):
-        if each.run:
-            by_scene.setdefault(each.job.scene, []).append(each.run)
-            if each.job.scene in common:
-                by_seed.setdefault(each.job.config.seed, []).append(each.run)
-    complete = [of_seed for of_seed in by_seed.values() if len(of_seed) == len(common)]
+    found = [(each.job, each.run) for each in outcomes if each.run]
+    found.sort(key=lambda pair: pair[0].scene not in common)
+    by_scene = {
+        scene: [run for _, run in of_scene]
+        for scene, of_scene in grouped(found, lambda pair: pair[0].scene).items()
+    }
+    shared = (pair for pair in found if pair[0].scene in common)
+    complete = [
+        [run for _, run in of_seed]
+        for of_seed in grouped(shared, lambda pair: pair[0].config.seed).values()
+        if len(of_seed) == len(common)
+    ]
     runs = [over_scenes(of_seed) for of_seed in complete]
     gaps = list(_gaps(outcomes))
     if by_scene and not common:
@@ -137,14 +136,12 @@ def _gaps(outcomes: Sequence[Outcome]) -> Iterator[str]:
     """Each reason for gaps once, with its seeds and scenes unless it concerns all of them."""
     seeds = {each.job.config.seed for each in outcomes}
     scenes = {each.job.scene for each in outcomes}
-    for why in dict.fromkeys(each.gap for each in outcomes if each.gap):
-        where: dict[int, list[str]] = {}
-        for each in outcomes:
-            if each.gap == why:
-                where.setdefault(each.job.config.seed, []).append(each.job.scene)
-        groups = list(where.items())
-        same = where.keys() == seeds and all(of == groups[0][1] for _, of in groups)
+    gaps = (each for each in outcomes if each.gap)
+    for why, of_why in grouped(gaps, lambda each: each.gap).items():
+        by_seed = grouped(of_why, lambda each: each.job.config.seed)
+        groups = [(seed, [each.job.scene for each in of]) for seed, of in by_seed.items()]
+        same = by_seed.keys() == seeds and all(of == groups[0][1] for _, of in groups)
         for seed, of_seed in groups[:1] if same else groups:
             words = [] if same else [f"seed {seed}"]
             words += [] if len(of_seed) == len(scenes) else [", ".join(of_seed)]
-            yield " ".join((*words, why))
+            yield " ".join((*words, str(why)))
