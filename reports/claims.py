@@ -236,7 +236,7 @@ def finding_table(comparisons: Sequence[Comparison]) -> Table:
         if each.claim.says and each.here is not NOT_MEASURED:
             first.setdefault((each.claim.says, *_figures(each), each.verdict), each)
     columns = ("quantity", "paper", "here", "95 % interval", "against the paper")
-    lines = tuple((_quantity(each), *figures) for (_, *figures), each in first.items())
+    lines = [(_quantity(each), *figures) for (_, *figures), each in first.items()]
     return Table("What the paper says, and what was found", columns, lines)
 
 

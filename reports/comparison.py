@@ -39,8 +39,8 @@ def comparison(lines: Lines, failures: Mapping[str, str]) -> list[Table]:
     where = f": {conditions_of(lines.runs, lines.settings)}" if lines.lines else ""
     tables = [_table(f"Comparison{where}", lines.settings, lines.lines, metrics)]
     blank = ("",) * (len(tables[0].columns) - 1)
-    failed = tuple((f"{label}: failed: {why}", *blank) for label, why in failures.items())
-    tables[0] = replace(tables[0], lines=tables[0].lines + failed)
+    failed = ((f"{label}: failed: {why}", *blank) for label, why in failures.items())
+    tables[0] = replace(tables[0], lines=[*tables[0].lines, *failed])
     cold = [replace(x, runs=[run.cold for run in x.runs if run.cold]) for x in lines.lines]
     if kept := [index for index, line in enumerate(cold) if line.runs]:
         settings = {name: [of[index] for index in kept] for name, of in lines.settings.items()}
@@ -69,8 +69,15 @@ def _table(
     for metric in metrics:
         texts = marked(lines, metric, BOLD[:1])
         columns[shown_as(metric).heading] = [text or NOT_AVAILABLE for text in texts]
-    cells = tuple(zip(*columns.values(), strict=True))
-    return Table(title, tuple(columns), cells, sources=tuple(line.keys for line in lines))
+    return line_table(title, columns, lines)
+
+
+def line_table(
+    title: str, columns: Mapping[str, Sequence[str]], lines: Sequence[Repeated]
+) -> Table:
+    """A table of `lines` from its `columns`, by their headings."""
+    cells = list(zip(*columns.values(), strict=True))
+    return Table(title, tuple(columns), cells, [line.keys for line in lines])
 
 
 def shown_as(metric: str) -> Metric:

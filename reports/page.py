@@ -130,7 +130,7 @@ def _figures(run: Run) -> Iterator[Part]:
     yield f"## {run.label}, run {run.key}"
     for table in run_tables(run.rows):
         yield f"### {table.title}"
-        yield replace(table, sources=((run.key,),) * len(table.lines))
+        yield replace(table, sources=[[run.key]] * len(table.lines))
 
 
 def _provenance(runs: Sequence[Run]) -> Iterator[Part]:
@@ -146,4 +146,4 @@ def _provenance(runs: Sequence[Run]) -> Iterator[Part]:
             lines += zip(names, values, strict=True)
     yield "## Provenance\n\nEvery figure and picture on this page was made by"
     yield f"```sh\n{commands}\n```"
-    yield Table("Provenance", ("", ""), tuple(lines))
+    yield Table("Provenance", ("", ""), lines)

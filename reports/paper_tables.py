@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from reports.claims import Claim, Comparison, apart, compare, gap, told
-from reports.comparison import conditions, machines, marked, shown_as, written
+from reports.comparison import conditions, line_table, machines, marked, shown_as, written
 from reports.lines import COMMON
 from reports.runs import Repeated, Run, missing_figures
 from reports.tables import ABSENT, BOLD, Table
@@ -239,8 +239,7 @@ def _of_columns(
     title: str, head: str, lines: Sequence[Repeated], columns: Mapping[str, Sequence[str | None]]
 ) -> Table:
     """A table of `lines`, labelled and with their gaps, and the cells of `columns` by metric."""
-    names = (": ".join((line.label, *line.gaps)) for line in lines)
-    cells = ([cell or ABSENT for cell in column] for column in columns.values())
-    heads = (head, *(shown_as(metric).heading for metric in columns))
-    rows = tuple(zip(names, *cells, strict=True))
-    return Table(title, heads, rows, sources=tuple(line.keys for line in lines))
+    of_table = {head: [": ".join((line.label, *line.gaps)) for line in lines]}
+    for metric, column in columns.items():
+        of_table[shown_as(metric).heading] = [cell or ABSENT for cell in column]
+    return line_table(title, of_table, lines)

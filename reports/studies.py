@@ -14,6 +14,7 @@ from typing import Any
 
 from bench.clock import OTHER
 from bench.convergence import observed_order
+from reports.comparison import Write
 from reports.figures import frontier_plot
 from reports.images import Part, Picture
 from reports.runs import Run, grouped
@@ -164,7 +165,7 @@ def parity(found: Sequence[Measured]) -> list[Part]:
         "p99 / p50 ↓": _tail,
         "worst pixel ↓": lambda line: decimal(line.figure("worst_to_first"), 4),
         "network, ms ↓": lambda line: decimal(line.run.parts.get("network"), 2),
-        "model, MB ↓": lambda line: megabytes(line.figure("size_bytes.total")),
+        "model, MB ↓": partial(_written, "size_bytes.total", megabytes),
     }
     return [
         _table(f"{method}: engines and precisions,", "engine, precision", columns, lines)
@@ -201,7 +202,7 @@ def breakdown(found: Sequence[Measured]) -> list[Part]:
     for line in found:
         if waits := line.run.record["waits"]:
             total = decimal(sum(each["waits"] for each in waits), 1)
-            rows = tuple((decimal(x["waits"], 1), x["line"], x["source"]) for x in waits)
+            rows = [(decimal(x["waits"], 1), x["line"], x["source"]) for x in waits]
             title = f"{line.line.label}: {total} waits for the GPU a frame"
             tables.append(Table(title, ("waits", "line", "source"), rows))
     return tables
@@ -216,25 +217,25 @@ def scaling(found: Sequence[Measured]) -> list[Part]:
 
 def _scaling_table(method: str, every: Sequence[Measured]) -> Table:
     counters = dict.fromkeys(name for line in every for name in line.work)
-    figures: dict[str, tuple[str, Callable[[float], str]]] = {
+    figures: dict[str, tuple[str, Write]] = {
         "frame_ms": ("ms / frame ↓", partial(decimal, decimals=1)),
         **{f"{WORK}{name}": (name.replace("_", " "), amount) for name in counters},
         "peak_bytes": ("peak, MB ↓", megabytes),
         "size_bytes.total": ("model, MB ↓", megabytes),
     }
-    cells: list[tuple[str, ...]] = []
-    sources: list[tuple[str, ...]] = []
+    columns: Columns = {
+        **{head: partial(_written, name, write) for name, (head, write) in figures.items()},
+        "p99 / p50 ↓": _tail,
+    }
+    cells: list[Sequence[str]] = []
+    sources: list[Sequence[str]] = []
     for axis, lines in grouped(every, lambda line: line.line.group).items():
-        for line in lines:
-            of_line = (write(line.figure(name)) for name, (_, write) in figures.items())
-            cells.append((line.line.label, *of_line, _tail(line)))
-            sources.append((line.run.key,))
-        values = [line.line.value for line in lines]
+        of_axis, values = _table("", "", columns, lines), [line.line.value for line in lines]
         powers = (growth(values, [line.figure(name) for line in lines]) for name in figures)
-        cells.append((f"exponent of {axis}", *(decimal(power, 2) for power in powers), ""))
-        sources.append(())
-    columns = ("", *(label for label, _ in figures.values()), "p99 / p50 ↓")
-    return Table(f"{method}: {_where(every)}", columns, tuple(cells), sources=tuple(sources))
+        exponents = (f"exponent of {axis}", *(decimal(power, 2) for power in powers), "")
+        cells += [*of_axis.lines, exponents]
+        sources += [*of_axis.sources, ()]
+    return replace(_table(f"{method}:", "", columns, every), lines=cells, sources=sources)
 
 
 VIEWS: Mapping[str, Callable[[Sequence[Measured]], list[Part]]] = {
@@ -251,10 +252,11 @@ def _table(
     best: Collection[StudyLine] = (),
 ) -> Table:
     """The `lines` below `head`, the `best` in bold, and what each of the `columns` says of them."""
-    labels = (BOLD[0] % x.line.label if x.line in best else x.line.label for x in lines)
-    figures = ((write(x) for write in columns.values()) for x in lines)
-    cells = tuple((label, *of) for label, of in zip(labels, figures, strict=True))
-    sources = tuple((line.run.key,) for line in lines)
+    cells = []
+    for each in lines:
+        label = BOLD[0] % each.line.label if each.line in best else each.line.label
+        cells.append([label, *(write(each) for write in columns.values())])
+    sources = [[each.run.key] for each in lines]
     return Table(f"{title} {_where(lines)}", (head, *columns), cells, sources)
 
 
@@ -262,6 +264,10 @@ def _apart(line: Measured) -> str:
     """The PSNR to the pictures of the first line."""
     apart = line.figure("psnr_to_first")
     return "the same" if apart == math.inf else decimal(apart, 1)
+
+
+def _written(metric: str, write: Write, line: Measured) -> str:
+    return write(line.figure(metric))
 
 
 def _psnr(line: Measured) -> str:

@@ -6,7 +6,7 @@ which have fewer preceding frames than the method can use, are listed separately
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -41,9 +41,9 @@ class Table:
     the runs behind each line, or is empty."""
 
     title: str
-    columns: tuple[str, ...]
-    lines: tuple[tuple[str, ...], ...]
-    sources: tuple[tuple[str, ...], ...] = ()
+    columns: Sequence[str]
+    lines: Sequence[Sequence[str]]
+    sources: Sequence[Sequence[str]] = ()
 
     def right(self, column: int) -> bool:
         """Whether the column is aligned right: at least half of what is in it are figures."""
@@ -145,7 +145,7 @@ def _quality(rows: pd.DataFrame, suffix: str) -> Table:
             interval = " – ".join(map(shown.write, (low, high))) if math.isfinite(low) else ""
             lines.append((shown.heading, shown.write(value), interval))
     title = f"Quality{suffix}, mean of {scored} frames"
-    return Table(title, ("metric", "mean", "95 % interval"), tuple(lines))
+    return Table(title, ("metric", "mean", "95 % interval"), lines)
 
 
 def _time(rows: pd.DataFrame, suffix: str) -> Table:
@@ -155,12 +155,12 @@ def _time(rows: pd.DataFrame, suffix: str) -> Table:
         lines = [(name, decimal(ms, 2), share(ms, total)) for name, ms in stages.items()]
         of_stages = share(sum(stages.values()), total) if stages else ""
         lines.append(("frame", decimal(total, 2), of_stages))
-        for each in ("p50", "p95", "p99"):
-            lines.append((f"frame, {each}", decimal(value[f"frame_ms.{each}"], 2), ""))
-        lines.append(("FPS", decimal(value["fps"], 2), ""))
-        if wall := value.get("wall_ms"):
-            lines.append(("frame, with the socket", decimal(wall, 2), ""))
-    return Table(f"Time of a frame{suffix}", ("stage", "mean ms", "share"), tuple(lines))
+        parts = {f"frame, {part}": f"frame_ms.{part}" for part in ("p50", "p95", "p99")}
+        others = {**parts, "FPS": "fps", "frame, with the socket": "wall_ms"}
+        for name, metric in others.items():
+            if metric in value:
+                lines.append((name, decimal(value[metric], 2), ""))
+    return Table(f"Time of a frame{suffix}", ("stage", "mean ms", "share"), lines)
 
 
 def _work(rows: pd.DataFrame, suffix: str) -> Table:
@@ -172,7 +172,7 @@ def _work(rows: pd.DataFrame, suffix: str) -> Table:
             saved = "" if dense is None else share(dense - done, dense)
             figures = ("" if x is None else decimal(x, 0 if x >= 100 else 1) for x in (done, dense))
             lines.append((name.replace("_", " "), *figures, saved))
-    return Table(f"Work of a frame{suffix}", ("work", "done", "dense", "saved"), tuple(lines))
+    return Table(f"Work of a frame{suffix}", ("work", "done", "dense", "saved"), lines)
 
 
 def _memory(rows: pd.DataFrame) -> Table:
@@ -182,5 +182,5 @@ def _memory(rows: pd.DataFrame) -> Table:
     for name, when in (("peak_bytes", "rendering"), ("train_peak_bytes", "training")):
         if math.isfinite(peak := _values(rows).get(name, math.nan)):
             sizes[f"peak, {when}"] = peak
-    lines = tuple((name, megabytes(size)) for name, size in sizes.items())
+    lines = [(name, megabytes(size)) for name, size in sizes.items()]
     return Table("Memory", ("component", "MB"), lines)

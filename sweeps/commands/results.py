@@ -30,8 +30,8 @@ def main(options: argparse.Namespace) -> int:
     own = [str(name) for name in rows if name not in COLUMNS]
     columns = [*SHOWN[:2], *own, *SHOWN[2:]]
     short = rows.assign(run=rows["run"].str[:8])[columns]
-    lines = tuple(tuple(map(_text, line)) for line in short.itertuples(index=False))
-    show(Table(str(options.outputs), tuple(columns), lines), rows, options.format)
+    lines = [list(map(_text, line)) for line in short.itertuples(index=False)]
+    show(Table(str(options.outputs), columns, lines), rows, options.format)
     return 0
 
 
