@@ -10,7 +10,7 @@ import numpy as np
 from bench.errors import SteerbenchError
 from bench.rows import UNITS, half_interval
 from reports.lines import COMMON, Lines
-from reports.runs import Repeated, Run
+from reports.runs import Repeated, Run, joined
 from reports.tables import BOLD, NOT_AVAILABLE, QUALITY, Metric, Table, decimal, megabytes
 
 Write = Callable[[float], str]
@@ -169,13 +169,12 @@ def _apart(one: Repeated, other: Repeated, metric: str, write: Write) -> bool:
 def machines(runs: Sequence[Run]) -> str:
     """On which machines `runs` were measured, with how many threads."""
     found = (run.record["machine"] for run in runs)
-    return " / ".join(dict.fromkeys(f"{x['cpu']} with {x['threads']} threads" for x in found))
+    return joined(f"{x['cpu']} with {x['threads']} threads" for x in found)
 
 
 def conditions(runs: Sequence[Run], names: Sequence[str]) -> dict[str, str]:
     """The facts `names` of `runs`, each with all of its values."""
-    facts = {name: dict.fromkeys(str(run.facts[name]) for run in runs) for name in names}
-    return {name: " / ".join(values) for name, values in facts.items()}
+    return {name: joined(run.facts[name] for run in runs) for name in names}
 
 
 def conditions_of(runs: Sequence[Run], without: Collection[str] = ()) -> str:

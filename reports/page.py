@@ -12,7 +12,7 @@ from reports.comparison import comparison, conditions_of, machines
 from reports.images import MOST_RENDERINGS, Part, Picture, frame_section, kept_frames
 from reports.lines import Lines, as_lines
 from reports.publish import publish
-from reports.runs import Run, grouped, load_runs, missing_figures
+from reports.runs import Run, grouped, joined, load_runs, missing_figures
 from reports.tables import Table, run_tables
 
 
@@ -56,8 +56,7 @@ def _heading(lines: Lines, failures: Mapping[str, str]) -> Iterator[Part]:
     scenes = ", ".join(dict.fromkeys(run.facts["scene"] for run in runs))
     first, *further = comparison(lines, failures)
     scored, timed = (
-        " / ".join(dict.fromkeys(str(run.headline["n"][metric]) for run in runs))
-        for metric in ("psnr", "frame_ms")
+        joined(run.headline["n"][metric] for run in runs) for metric in ("psnr", "frame_ms")
     )
     reading = f"Arrows point to better. Quality is a mean over {scored} frames, time over {timed}."
     if any(len(line.runs) > 1 for line in lines.lines):
@@ -105,9 +104,9 @@ def _tradeoffs(lines: Lines) -> Iterator[Part]:
 
 def _ablations(lines: Lines) -> Iterator[Part]:
     """Plots of quality over the settings with several numbers."""
-    scored = [number for number, line in enumerate(lines.lines) if line.mean("psnr") is not None]
-    for name, values in lines.settings.items():
-        if len({figures.as_number(values[number]) for number in scored} - {None}) > 2:
+    scored = lines.frame(["psnr"]).dropna(subset=["psnr"])
+    for name in lines.settings:
+        if scored[name].map(figures.as_number).nunique() > 2:
             shows = f"PSNR in dB over {name}"
             yield f"## Quality over {name}"
             yield Picture(f"psnr-{name}", shows, partial(figures.quality_along, lines, name))

@@ -223,9 +223,8 @@ class Repeated:
     @property
     def parts(self) -> dict[str, float]:
         """The mean ms of each part of a frame; see `Run.parts`."""
-        of_runs = [run.parts for run in self.runs]
-        names = dict.fromkeys(name for of_run in of_runs for name in of_run)
-        return {name: float(np.mean([of.get(name, 0.0) for of in of_runs])) for name in names}
+        of_runs = pd.DataFrame([run.parts for run in self.runs]).fillna(0.0)
+        return {str(part): float(ms) for part, ms in of_runs.mean().items()}
 
     def _figures(self, metric: str) -> list[float]:
         figures = (run.figure(metric) for run in self.runs)
@@ -340,7 +339,7 @@ def _over(run: Run, kept: Collection[int]) -> Run:
 
 
 def over_scenes(runs: Sequence[Run]) -> Run:
-    """Average runs of different scenes into one run.
+    """Average runs of one seed and different scenes into one run.
 
     Its rows are means of their headline rows, for the metrics that all of them have; its frames are
     the frames of all. A stage or a work that a run lacks did not occur in it and counts as 0.
@@ -357,8 +356,9 @@ def over_scenes(runs: Sequence[Run]) -> Run:
         n=("n", "sum"),
     )
     names = map(str, runs[0].facts.index)
-    facts = {name: _joined([run.facts[name] for run in runs]) for name in names}
+    facts: dict[str, Any] = {name: joined(run.facts[name] for run in runs) for name in names}
     facts["scene"] = f"mean of {', '.join(str(run.facts['scene']) for run in runs)}"
+    facts["seed"] = runs[0].facts["seed"]
     key = facts["run"] = content_key({"mean of": [run.key for run in runs]})[:16]
     if "fps" in rows.index:  # of the mean time, as in a run
         rows.loc["fps", "value"] = 1000 / rows["value"]["frame_ms"]
@@ -380,7 +380,7 @@ def _record(runs: Sequence[Run]) -> dict[str, Any]:
     """The record of the first run, with the scenes, machines and missing figures of all."""
     records = [run.record for run in runs]
     machines = [record["machine"] for record in records]
-    machine = {name: _joined([of[name] for of in machines]) for name in ("cpu", "threads")}
+    machine = {name: joined(of[name] for of in machines) for name in ("cpu", "threads")}
     gpus = list(dict.fromkeys(gpu for of in machines for gpu in of["gpus"]))
     digest = content_key({"mean of": [record["scene"]["digest"] for record in records]})
     return {
@@ -397,10 +397,9 @@ def read_picture(path: Path) -> np.ndarray:
     return decode_bytes(contents(path), path)[..., :3].numpy()
 
 
-def _joined(values: Sequence[Any]) -> Any:
-    """The value if all are equal, otherwise all of them as text."""
-    distinct = list(dict.fromkeys(values))
-    return distinct[0] if len(distinct) == 1 else " / ".join(map(str, distinct))
+def joined(values: Iterable[object]) -> str:
+    """All different `values`, as text."""
+    return " / ".join(dict.fromkeys(map(str, values)))
 
 
 def _listed(values: Mapping[str, Any]) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 
 from bench.clock import OTHER
 from bench.convergence import observed_order
-from reports.comparison import Write
+from reports.comparison import Write, conditions
 from reports.figures import frontier_plot
 from reports.images import Part, Picture
 from reports.runs import Run, grouped
@@ -303,9 +303,8 @@ COMPARED: Columns = {
 
 def _where(lines: Sequence[Measured]) -> str:
     """Scene, path and size of the frames."""
-    facts = ("scene", "trajectory", "resolution")
-    several = [dict.fromkeys(str(line.run.facts[name]) for line in lines) for name in facts]
-    return ", ".join(next(iter(of)) for of in several if len(of) == 1)
+    facts = conditions([line.run for line in lines], ("scene", "trajectory", "resolution"))
+    return ", ".join(fact for fact in facts.values() if " / " not in fact)
 
 
 def growth(values: Sequence[float], figures: Sequence[float]) -> float:
