@@ -8,7 +8,7 @@ import pkgutil
 import re
 import shlex
 import traceback
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from importlib import metadata, util
@@ -84,12 +84,22 @@ def settled(config: DictConfig, folders: Sequence[Path]) -> DictConfig:
     return config
 
 
-def changed(config: DictConfig, words: Sequence[str]) -> DictConfig:
-    """A copy of `config` with values changed as Hydra would; faster than composing it again."""
-    copy = config.copy()
-    for override in OverridesParser.create().parse_overrides(list(words)):
-        OmegaConf.update(copy, override.get_key_element(), override.value())
-    return copy
+def variants(words: Sequence[str]) -> Callable[[Sequence[str]], DictConfig]:
+    """A function that makes the configuration of `words` with further settings.
+
+    Each set of choices is composed once; values are set afterwards as Hydra would, which is faster.
+    """
+    with_choices = cache(lambda *chosen: composed([*words, *chosen]))
+
+    def varied(settings: Sequence[str]) -> DictConfig:
+        chosen = [x for x in settings if x[0] == "+" or choices(x.partition("=")[0], words)]
+        values = [word for word in settings if word not in chosen]
+        config = with_choices(*chosen).copy()
+        for override in OverridesParser.create().parse_overrides(values):
+            OmegaConf.update(config, override.get_key_element(), override.value())
+        return config
+
+    return varied
 
 
 def swept(words: Sequence[str]) -> dict[str, list[str]]:
@@ -109,6 +119,13 @@ def swept(words: Sequence[str]) -> dict[str, list[str]]:
         for name, override in last.items()
         if override.is_discrete_sweep()
     }
+
+
+def taken(words: Sequence[str], name: str) -> tuple[list[str], list[str]]:
+    """The words without those that set `name`, and the different values that they give it."""
+    named = [word for word in words if word.lstrip("+").partition("=")[0] == name]
+    values = swept(named).get(name) or [word.partition("=")[2] for word in named[-1:]]
+    return [word for word in words if word not in named], list(dict.fromkeys(values))
 
 
 def setting(name: str, text: str) -> str:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from itertools import chain
 from typing import Any
 
@@ -18,12 +18,12 @@ from sweeps.measurement import Job
 from sweeps.overrides import (
     CONFIGS,
     beside,
-    changed,
     composed,
     engine_kinds,
     folder_words,
-    swept,
+    taken,
     target_of,
+    variants,
 )
 
 AS_IT_IS = Variant("as it is")  # the settings as typed
@@ -74,16 +74,6 @@ class Subject:
             ]
             for engine, kind in engine_kinds(self.words).items()
         }
-
-    def varied(self, settings: Sequence[str]) -> DictConfig:
-        """The configuration with further settings; values are set without composing it again."""
-        plain = [word for word in settings if not word.startswith(("+", "engine="))]
-        return changed(self._with(*(word for word in settings if word not in plain)), plain)
-
-    @cached_property
-    def _with(self) -> Callable[..., DictConfig]:
-        """The configuration with further choices; each is composed once."""
-        return cache(lambda *words: composed([*self.words, *words]))
 
     def axes(self) -> dict[str, Axis]:
         """What tables vary of the method, and what it declares itself."""
@@ -193,12 +183,10 @@ def subjects(study: str, words: Sequence[str]) -> list[Subject]:
     With several, what the words set of a method is left out for one that lacks it. SteerbenchError
     if one of them has nothing that the study could vary; of the usual ones, it is left out.
     """
-    typed = [word for word in words if word.partition("=")[0] == "method"]
+    others, typed = taken(words, "method")
     folders = folder_words(words)
-    others = (word for word in words if word not in (*typed, *folders))
-    rest = [*folders, f"+experiment={study}", *others]
-    usual = OmegaConf.load(CONFIGS / "experiment" / f"{study}.yaml").study.methods
-    names = swept(words).get("method") or [word.partition("=")[2] for word in typed[-1:]] or usual
+    rest = [*folders, f"+experiment={study}", *(word for word in others if word not in folders)]
+    names = typed or OmegaConf.load(CONFIGS / "experiment" / f"{study}.yaml").study.methods
     alone = len(names) == 1
     found = [
         Subject(name, [*rest, f"method={name}"] if alone else beside(name, rest)) for name in names
@@ -236,9 +224,10 @@ def jobs_of(study: str, found: Sequence[Subject], options: Mapping[str, Any]) ->
     """The jobs of all lines; those of a group in turns, if the study compares times."""
     jobs = []
     for subject in found:
+        varied = variants(subject.words)
         for line in LINES[study](subject, **options):
             words = [*subject.words, *line.settings]
-            config = subject.varied(line.settings)
+            config = varied(line.settings)
             whose = [] if study == "breakdown" else [subject.name]  # all methods in turns
             turns = "" if study == "scaling" else ", ".join((study, *whose, line.group))
             name = f"{study}: {subject.name}, {line.group}: {line.label}"
