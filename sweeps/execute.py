@@ -35,7 +35,7 @@ from reports.runs import grouped, load_runs
 from reports.tables import decimal
 from sweeps.configured import scene_folder, trained, training_threads
 from sweeps.measurement import Job, JobFailed, obtain, reason, stored
-from sweeps.overrides import CONFIGS, composed, explain, setting, target_of
+from sweeps.overrides import CONFIGS, composed, explain, folder_words, setting, target_of
 from sweeps.processes import on_gpu, processes, set_up
 from sweeps.terminal import time_left
 
@@ -89,13 +89,6 @@ class Launcher:
             if isinstance(result, Exception):
                 raise result
         return results
-
-
-def launcher_of(words: Sequence[str], outputs: Path) -> Launcher:
-    """The launcher that `words` choose among those of a command (`hydra/launcher=joblib`), which
-    may name folders with further choices. Notes on the work go below `outputs`."""
-    words = [*words, setting("outputs", str(outputs))]
-    return Launcher(composed(words, return_hydra_config=True), words)
 
 
 def own_folder(config: DictConfig) -> None:
@@ -231,6 +224,14 @@ def run_jobs(jobs: Sequence[Job], launcher: Launcher) -> list[Ended]:
         for of_group in (found, *launcher.run(work, groups)):
             ended |= of_group
     return [ended[job.key] for job in jobs]
+
+
+def run_all(jobs: Sequence[Job], words: Sequence[str]) -> list[Ended]:
+    """Run the jobs, see `run_jobs`, with the launcher that `words` of a command choose
+    (`hydra/launcher=joblib`). Notes on the work go below the outputs of the jobs."""
+    place = setting("outputs", str(jobs[0].outputs))
+    words = [*folder_words(words), *divided(words)[1], place]
+    return run_jobs(jobs, Launcher(composed(words, return_hydra_config=True), words))
 
 
 def _groups(jobs: Sequence[Job], look_up: bool) -> tuple[list[Group], dict[str, Ended]]:

@@ -6,7 +6,6 @@ import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 from bench.errors import SteerbenchError
@@ -16,7 +15,7 @@ from reports.paper_page import write_paper_page
 from reports.paper_tables import Place
 from reports.runs import Repeated, Run, grouped, over_common_frames, over_scenes
 from sweeps.data_sets import DataSet, data_sets, find
-from sweeps.execute import Ended, divided, launcher_of, run_jobs
+from sweeps.execute import divided, run_all
 from sweeps.measurement import of_scene
 from sweeps.overrides import unquoted
 from sweeps.plan import Planned, plan, scenes_of
@@ -31,7 +30,7 @@ def main(options: argparse.Namespace) -> int:
 
     Returns 1 if a job failed that can run here.
     """
-    settings, of_hydra = divided(options.overrides)
+    settings, _ = divided(options.overrides)
     words, data = data_set(settings)
     missing = data.missing if data else {}
     for name, why in missing.items():
@@ -40,10 +39,8 @@ def main(options: argparse.Namespace) -> int:
     one = getattr(options, "table", None)
     tables = chosen(one, words, options.beside, shown)
     jobs = [job for table in tables for job in plan(table, words, data)]
-    outputs = Path(jobs[0].config.outputs)
-    ended: list[Ended] = []
-    if options.command != "report":
-        ended = run_jobs(jobs, launcher_of([*options.config_dir, *of_hydra], outputs))
+    outputs = jobs[0].outputs
+    ended = [] if options.command == "report" else run_all(jobs, options.overrides)
     store = existing_store(outputs) if options.command == "report" else Store(outputs)
     runs = by_job(store, lambda line: print(line, file=sys.stderr))
     folder = options.report or outputs / (one or "paper")

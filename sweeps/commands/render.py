@@ -31,7 +31,7 @@ QUALITY = "18"  # H.264's constant rate factor: the video hardly differs from th
 
 def main(options: argparse.Namespace) -> int:
     """Render; write `0000.png` and so on, the path and the video; print where they are."""
-    words = [*words_of_run(options.run, options.overrides), *options.overrides]
+    words = words_of_run(options.run, options.overrides)
     if options.path:
         replaced = re.compile(r"[+~]*(trajectory(?!\.transforms=)\b|split=)")
         words = [word for word in words if not replaced.match(word)]
@@ -126,11 +126,11 @@ def recorded(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
 
 
 def words_of_run(key: str | None, words: Sequence[str]) -> list[str]:
-    """The words of the command that measured the run `key` of the store."""
+    """The words of the command that measured the run `key` of the store, and `words` after them."""
     if key is None:
-        return []
+        return list(words)
     store = existing_store(Path(composed(words).outputs))
     _, command, *rest = shlex.split(str(store.record(store.whole_key(key))["command"]))
     if command != "run":
         raise SteerbenchError(f"run {key}: expected one of `steerbench run`, got {command}")
-    return [word for word in rest if not word.startswith("hydra.")]
+    return [*(word for word in rest if not word.startswith("hydra.")), *words]

@@ -8,7 +8,6 @@ import re
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 from bench.errors import unexpected
 from bench.provenance import commit, machine
@@ -17,7 +16,7 @@ from reports.publish import publish
 from reports.runs import load_runs
 from reports.studies import VIEWS, Measured, by_method
 from reports.tables import Table
-from sweeps.execute import divided, launcher_of, run_jobs
+from sweeps.execute import divided, run_all
 from sweeps.studies import StudyJob, jobs_of, subjects
 from sweeps.terminal import say, show
 
@@ -28,12 +27,11 @@ def main(options: argparse.Namespace) -> int:
     study = options.command
     limit = getattr(options, "within", None)
     within = None if limit is None else decibels(limit)
-    words, of_hydra = divided(options.overrides)
+    words, _ = divided(options.overrides)
     given = {name: getattr(options, name) for name in ("only", "trained") if name in options}
     found = subjects(study, words)
     jobs = jobs_of(study, found, given)
-    outputs = Path(jobs[0].config.outputs)
-    ended = run_jobs(jobs, launcher_of([*options.config_dir, *of_hydra], outputs))
+    ended = run_all(jobs, options.overrides)
     done = [(job.line, end.run) for job, end in zip(jobs, ended, strict=True) if end.run]
     runs = load_runs(jobs[0].store, (key for _, key in done))
     lines = [Measured.of(line, run) for (line, _), run in zip(done, runs, strict=True)]
@@ -46,7 +44,7 @@ def main(options: argparse.Namespace) -> int:
     if within is not None:
         for text in _recommended(lines, jobs, within):
             say(text)
-    folder = options.report or outputs / study
+    folder = options.report or jobs[0].outputs / study
     page = publish(_page(options, parts), folder, [line.run for line in lines])
     print(f"report: {page}", file=sys.stderr)
     return int(any(each.failed for each in ended))

@@ -71,7 +71,7 @@ def main(options: argparse.Namespace) -> int:
 
 def opened(options: argparse.Namespace) -> Viewer:
     """Open the viewer that the command describes, and print its address."""
-    words = [*words_of_run(options.run, options.overrides), *options.overrides]
+    words = words_of_run(options.run, options.overrides)
     wanted = [words, *([beside(options.beside, words)] if options.beside else [])]
     viewer = Viewer(wanted, options.host, options.port)
     port = viewer.server.get_port()  # the next free one if the requested one is taken
