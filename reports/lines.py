@@ -144,8 +144,7 @@ def _line_of(run: Run) -> str:
     """Equal for runs that differ only in their seed."""
     if "config" not in run.record["made_of"]:
         return run.key
-    settings = {x: of for x, of in unseeded(run.record["made_of"]["config"]) if x not in HIDDEN}
-    return content_key({"settings": settings, "where": list(map(str, run.conditions))})
+    return content_key({"settings": _settings(run), "where": list(map(str, run.conditions))})
 
 
 def _settings(run: Run) -> dict[str, str]:
