@@ -10,10 +10,10 @@ import numpy as np
 from bench.errors import SteerbenchError
 from bench.rows import UNITS, half_interval
 from reports.lines import COMMON, Lines
-from reports.runs import Repeated, Run, joined
+from reports.runs import Repeated, Run, grouped, joined
 from reports.tables import BOLD, NOT_AVAILABLE, QUALITY, Metric, Table, decimal, megabytes
 
-Write = Callable[[float], str]
+Write = Callable[[str, float], str]  # writes a figure of a metric
 
 COST = {
     "frame_ms": Metric("ms / frame", "↓", partial(decimal, decimals=1)),
@@ -97,20 +97,21 @@ def shown_as(metric: str) -> Metric:
     return Metric(f"{rest or family}, {unit}", "↓", partial(decimal, decimals=decimals))
 
 
-def written(line: Repeated, metric: str, write: Write | None = None) -> str | None:
-    """The mean of a metric as text, with half its 95 % interval if known; None without a mean.
+def usual(metric: str, figure: float) -> str:
+    """A figure as pages show it."""
+    return shown_as(metric).write(figure)
 
-    Numbers are written by `write`, or in the usual format.
-    """
+
+def written(line: Repeated, metric: str, write: Write = usual) -> str | None:
+    """The mean of a metric as text, with half its 95 % interval if known; None without a mean."""
     mean, half = line.mean(metric), line.half(metric)
-    write = write or shown_as(metric).write
     if mean is None:
         return None
-    return f"{write(mean)} ± {write(half)}" if half > 0 else write(mean)
+    return f"{write(metric, mean)} ± {write(metric, half)}" if half > 0 else write(metric, mean)
 
 
 def marked(
-    lines: Sequence[Repeated], metric: str, marks: Sequence[str], write: Write | None = None
+    lines: Sequence[Repeated], metric: str, marks: Sequence[str], write: Write = usual
 ) -> list[str | None]:
     """A column: what `written` returns for each line, the best and the second best with `marks`.
 
@@ -122,7 +123,7 @@ def marked(
     return [text and forms.get(places.get(n, 0), "%s") % text for n, text in enumerate(texts)]
 
 
-def ranks(lines: Sequence[Repeated], metric: str, write: Write | None = None) -> dict[int, int]:
+def ranks(lines: Sequence[Repeated], metric: str, write: Write = usual) -> dict[int, int]:
     """The rank, from 1, of each of `lines` among those under the same conditions, by its index.
 
     Figures share the rank of a better one from which they differ by no more than the interval over
@@ -130,23 +131,19 @@ def ranks(lines: Sequence[Repeated], metric: str, write: Write | None = None) ->
     neither lines that are all alike or alone under their conditions have one, nor the second of
     two. No line has one in a metric without a better side.
     """
-    shown = shown_as(metric)
-    if not shown.better:
+    better = shown_as(metric).better
+    if not better:
         return {}
-    write = write or shown.write
-    known: dict[tuple[object, ...], dict[int, float]] = {}
-    for row, line in enumerate(lines):
-        mean = line.mean(metric)
-        if mean is not None and not math.isnan(mean):
-            known.setdefault(line.conditions, {})[row] = mean
+    means = ((row, line.mean(metric)) for row, line in enumerate(lines))
+    known = {row: mean for row, mean in means if mean is not None and not math.isnan(mean)}
     places: dict[int, int] = {}
-    for figures in known.values():
+    for rows in grouped(known, lambda row: lines[row].conditions).values():
         of_rank: list[list[int]] = []  # the best of a rank comes first
-        for row in sorted(figures, key=figures.__getitem__, reverse=shown.better == "↑"):
+        for row in sorted(rows, key=known.__getitem__, reverse=better == "↑"):
             if not of_rank or _apart(lines[of_rank[-1][0]], lines[row], metric, write):
                 of_rank.append([])
             of_rank[-1].append(row)
-        places |= {row: rank for rank, rows in enumerate(of_rank[:-1], 1) for row in rows}
+        places |= {row: rank for rank, alike in enumerate(of_rank[:-1], 1) for row in alike}
     return places
 
 
@@ -158,7 +155,7 @@ def _apart(one: Repeated, other: Repeated, metric: str, write: Write) -> bool:
         for x in (one, other)
     )
     means = [float(np.mean([*of.values()])) for of in (low, high)]
-    if write(means[0]) == write(means[1]):
+    if write(metric, means[0]) == write(metric, means[1]):
         return False
     interval = math.hypot(*(half for x in (one, other) if (half := x.half(metric)) > 0))
     if low.keys() == high.keys() and len(low) > 1:

@@ -2,11 +2,10 @@
 
 import re
 from collections.abc import Sequence
-from functools import partial
 
 import pandas as pd
 
-from reports.comparison import conditions_of, marked, shown_as
+from reports.comparison import conditions_of, marked, shown_as, usual
 from reports.paper_tables import Measured, PaperTable, Shown, figure_table
 from reports.tables import Table, decimal
 
@@ -107,7 +106,7 @@ def _tabular(
 def _rows(block: Shown) -> list[list[str]]:
     """The cells of a block; labels of a further one also have its data set."""
     lines, metrics = list(block.measured.values()), block.table.metrics
-    columns = [marked(lines, metric, MARKS, partial(_written, metric)) for metric in metrics]
+    columns = [marked(lines, metric, MARKS, _written) for metric in metrics]
     where = f" ({block.title})" if block.title else ""
     return [
         [escaped(line.label + where), *((text or "--").replace("±", r"$\pm$") for text in row)]
@@ -143,7 +142,7 @@ def _written(metric: str, value: float) -> str:
     """A figure with the paper's number of decimals, sizes in MB."""
     family = re.split(r"[._]", metric)[0]
     if family not in DECIMALS:
-        return shown_as(metric).write(value)
+        return usual(metric, value)
     return decimal(value / 1e6 if family == "size" else value, DECIMALS[family])
 
 

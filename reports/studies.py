@@ -14,11 +14,11 @@ from typing import Any
 
 from bench.clock import OTHER
 from bench.convergence import observed_order
-from reports.comparison import Write, conditions
+from reports.comparison import conditions
 from reports.figures import frontier_plot
 from reports.images import Part, Picture
 from reports.runs import Run, grouped
-from reports.tables import BOLD, DENSE, Table, amount, decimal, megabytes, share
+from reports.tables import BOLD, DENSE, Table, Write, amount, decimal, megabytes, share
 
 WORK = "work."
 

@@ -21,6 +21,9 @@ DENSE = ".dense"  # suffix of a work counter for the work of a method that skips
 NETS = ("alex", "vgg")  # of LPIPS
 
 
+Write = Callable[[float], str]
+
+
 @dataclass(frozen=True)
 class Metric:
     """How a metric is shown: its `name` with the unit, an arrow to `better` values, "" if neither
@@ -28,7 +31,7 @@ class Metric:
 
     name: str
     better: str
-    write: Callable[[float], str]
+    write: Write
 
     @property
     def heading(self) -> str:
