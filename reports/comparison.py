@@ -9,7 +9,7 @@ import numpy as np
 
 from bench.errors import SteerbenchError
 from bench.rows import UNITS, half_interval
-from reports.lines import COMMON, Lines
+from reports.lines import COMMON, Lines, Settings
 from reports.runs import Repeated, Run, grouped, joined
 from reports.tables import BOLD, NOT_AVAILABLE, QUALITY, Metric, Table, decimal, megabytes
 
@@ -56,7 +56,7 @@ def columns_of(lines: Lines) -> list[str]:
 
 def _table(
     title: str,
-    settings: Mapping[str, Sequence[str]],
+    settings: Settings,
     lines: Sequence[Repeated],
     metrics: Sequence[str],
 ) -> Table:

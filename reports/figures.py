@@ -22,7 +22,7 @@ from bench.clock import OTHER
 from bench.results import COLD
 from reports.comparison import written
 from reports.images import Picture
-from reports.lines import METHOD, Lines
+from reports.lines import METHOD, Lines, Settings
 from reports.runs import Repeated, Run
 from reports.tables import NOT_AVAILABLE
 
@@ -140,7 +140,7 @@ def quality_against(
 
 
 def _legend(
-    settings: Mapping[str, Sequence[str]],
+    settings: Settings,
 ) -> tuple[Sequence[Mapping[str, Any]], Sequence[Line2D]]:
     """The style of each line by its settings, and what a legend says of them: the first setting
     that differs has colours, the others markers."""

@@ -13,6 +13,8 @@ from reports.tables import QUALITY
 
 METHOD = "method"  # the first column
 
+Settings = Mapping[str, Sequence[str]]  # the value of each line, by setting
+
 COMMON = ("scene", "resolution", "trajectory", "budget", "protocol", "device")
 """Facts that a heading lists."""
 
@@ -37,7 +39,7 @@ class Lines:
     """
 
     lines: Sequence[Repeated]
-    settings: Mapping[str, Sequence[str]]
+    settings: Settings
 
     @property
     def runs(self) -> list[Run]:

@@ -139,13 +139,12 @@ def _values(rows: pd.DataFrame, prefix: str = "") -> dict[str, float]:
 
 
 def _quality(rows: pd.DataFrame, suffix: str) -> Table:
-    columns = (rows[name] for name in ("metric", "value", "lo", "hi", "n"))
-    figures = {metric: of for metric, *of in zip(*columns, strict=True)}
-    scored, lines = figures["psnr"][-1], []
+    figures = rows.set_index("metric")
+    scored, lines = figures["n"]["psnr"], []
     for metric, shown in QUALITY.items():
-        if scored and metric in figures:
-            value, low, high, _ = figures[metric]
-            interval = " – ".join(map(shown.write, (low, high))) if math.isfinite(low) else ""
+        if scored and metric in figures.index:
+            value, *ends = map(float, figures.loc[metric, ["value", "lo", "hi"]])
+            interval = " – ".join(map(shown.write, ends)) if math.isfinite(ends[0]) else ""
             lines.append((shown.heading, shown.write(value), interval))
     title = f"Quality{suffix}, mean of {scored} frames"
     return Table(title, ("metric", "mean", "95 % interval"), lines)
