@@ -8,7 +8,7 @@ import pickle
 import sys
 import time
 import uuid
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import as_completed
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from datetime import datetime
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from hydra import initialize_config_dir
 from hydra._internal.callbacks import Callbacks
@@ -47,8 +47,23 @@ OF_METHOD = ("method", "engine", "precision")
 
 Group = list[tuple[int, Job]]  # jobs that are measured together, each with its number among all
 
-W = TypeVar("W")
-R = TypeVar("R")
+
+@dataclass(frozen=True)
+class Ended:
+    """How a job ended: with the key of its `run`, which was `measured` unless the store had it, or
+    with an `error`."""
+
+    run: str | None = None
+    measured: bool = False
+    error: Exception | None = None
+
+    @property
+    def failed(self) -> bool:
+        """Whether it failed, and can run here."""
+        return self.error is not None and not isinstance(self.error, Unavailable)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Ended, (self.run, self.measured, self.error and picklable(self.error))
 
 
 @dataclass(frozen=True)
@@ -58,13 +73,13 @@ class Launcher:
     config: DictConfig
     words: Sequence[str]
 
-    def run(self, work: Callable[[W], R], on: Sequence[W]) -> list[R]:
-        """The results of `work` on each of the things in `on`.
+    def run(self, groups: Sequence[Group]) -> list[dict[str, Ended]]:
+        """How the jobs of each group ended, by their keys.
 
-        Raises what `work` raised first, once all is done; SteerbenchError if a setting of the
-        launcher is wrong.
+        Raises what was raised first beside them, once all is done; SteerbenchError if a setting of
+        the launcher is wrong.
         """
-        if not on:
+        if not groups:
             return []
         with initialize_config_dir(str(CONFIGS), version_base="1.3"):
             loader = GlobalHydra.instance().config_loader()
@@ -78,12 +93,12 @@ class Launcher:
         try:
             launcher = Plugins.instance().instantiate_launcher(
                 hydra_context=HydraContext(config_loader=loader, callbacks=Callbacks()),
-                task_function=partial(_numbered, work, on),
+                task_function=partial(_measured, groups, time.time()),
                 config=config,
             )
         except InstantiationException as error:
             raise explain(error, self.words) from error
-        jobs = launcher.launch([[] for _ in on], initial_job_idx=0)
+        jobs = launcher.launch([[] for _ in groups], initial_job_idx=0)
         results = [job.return_value for job in jobs]
         for result in results:
             if isinstance(result, Exception):
@@ -107,12 +122,17 @@ def divided(words: Sequence[str]) -> tuple[list[str], list[str]]:
     return [word for word in words if word not in of_hydra], of_hydra
 
 
-def _numbered(work: Callable[[W], R], on: Sequence[W], config: Any) -> R | Exception:
-    """The task of a launcher's job: the job's number says what it works on. An exception is
-    returned, because Hydra would print it in its own way."""
+def _measured(
+    groups: Sequence[Group], begun: float, config: DictConfig
+) -> dict[str, Ended] | Exception:
+    """The task of a launcher's job, whose number says which of the `groups` it measures. An
+    exception is returned, because Hydra would print it in its own way."""
     set_up()
+    hydra, total = HydraConfig.get(), sum(map(len, groups))
     try:
-        return work(on[HydraConfig.get().job.num])
+        for number, job in groups[hydra.job.num]:
+            print(f"{number + 1} of {total}, {job.name}", file=sys.stderr)
+        return attempt(groups[hydra.job.num], total, Path(hydra.runtime.output_dir), begun)
     except Exception as error:
         return picklable(error)
 
@@ -124,24 +144,6 @@ def picklable(error: Exception) -> Exception:
         return error
     except Exception:
         return SteerbenchError(f"{type(error).__name__}: {reason(error)}")
-
-
-@dataclass(frozen=True)
-class Ended:
-    """How a job ended: with the key of its `run`, which was `measured` unless the store had it, or
-    with an `error`."""
-
-    run: str | None = None
-    measured: bool = False
-    error: Exception | None = None
-
-    @property
-    def failed(self) -> bool:
-        """Whether it failed, and can run here."""
-        return self.error is not None and not isinstance(self.error, Unavailable)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return Ended, (self.run, self.measured, self.error and picklable(self.error))
 
 
 def attempt(group: Group, total: int, folder: Path, begun: float) -> dict[str, Ended]:
@@ -220,8 +222,7 @@ def run_jobs(jobs: Sequence[Job], launcher: Launcher) -> list[Ended]:
         groups, found = _groups(some, look_up=ahead)
         if ahead:
             train_ahead(some, found)
-        work = partial(_attempted, total=sum(map(len, groups)), begun=time.time())
-        for of_group in (found, *launcher.run(work, groups)):
+        for of_group in (found, *launcher.run(groups)):
             ended |= of_group
     return [ended[job.key] for job in jobs]
 
@@ -257,12 +258,6 @@ def _groups(jobs: Sequence[Job], look_up: bool) -> tuple[list[Group], dict[str, 
         if left := [job for job in of_group if job.key not in ended]:
             groups.append(list(enumerate(left, sum(map(len, groups)))))
     return groups, ended
-
-
-def _attempted(group: Group, total: int, begun: float) -> dict[str, Ended]:
-    for number, job in group:
-        print(f"{number + 1} of {total}, {job.name}", file=sys.stderr)
-    return attempt(group, total, Path(HydraConfig.get().runtime.output_dir), begun)
 
 
 def train_ahead(jobs: Sequence[Job], measured: Collection[str]) -> None:
