@@ -264,8 +264,8 @@ def frontier_plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     left_out = (f"{row.setting}, {row.ms:,.0f} ms" for row in every[far].itertuples())
     if text := "; ".join(left_out):
         figure.suptitle(f"not shown: {text}", size="small")
-    for axes, column in ((truth, "psnr"), (off, "psnr_to_first")):
-        _error_against_time(axes, table, column)
+    _error_against_time(truth, table, "psnr")
+    _error_against_time(off, table, "psnr_to_first")
     fastest, slowest = truth.get_xlim()
     truth.set_xlim(fastest * (fastest / slowest) ** 0.2, slowest)  # room for names on the left
     truth.step(

@@ -363,17 +363,8 @@ def over_scenes(runs: Sequence[Run]) -> Run:
     if "fps" in rows.index:  # of the mean time, as in a run
         rows.loc["fps", "value"] = 1000 / rows["value"]["frame_ms"]
     rows = rows.reset_index().assign(lo=math.nan, hi=math.nan, **facts)
-    frames = cache(partial(_frames, runs))
+    frames = cache(lambda: pd.concat([run.frames for run in runs], ignore_index=True))
     return Run(key, runs[0].label, rows, frames, _record(runs), runs[0].pictures)
-
-
-def _frames(runs: Sequence[Run]) -> pd.DataFrame:
-    """The frames of all scenes, with the scene's name added to their names."""
-    named = (
-        run.frames.assign(name=f"{run.facts['scene']}/" + run.frames["name"].fillna(""))
-        for run in runs
-    )
-    return pd.concat(named, ignore_index=True)
 
 
 def _record(runs: Sequence[Run]) -> dict[str, Any]:

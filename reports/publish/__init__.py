@@ -84,14 +84,20 @@ def markdown(parts: Sequence[Part], folder: Path) -> str:
 
 def _shown(picture: Picture, folder: Path) -> str:
     """Draw `picture` into `folder`, named after its content; return the Markdown that shows it."""
-    with tempfile.TemporaryDirectory() as place, matplotlib.rc_context({"text.parse_math": False}):
-        picture.draw(drawn := Path(place) / f"{picture.stem}.png")
-        content = drawn.read_bytes()
+    content = _drawn(picture, "png")
     name = f"pictures/{picture.stem}-{hashlib.sha256(content).hexdigest()[:12]}.png"
     (folder / "pictures").mkdir(exist_ok=True)
     with whole(folder / name) as new:
         new.write_bytes(content)
     return f"![{picture.shows}]({name})"
+
+
+def _drawn(picture: Picture, form: str) -> bytes:
+    """The content of `picture` as a file of the `form` "png" or "svg"."""
+    style: Any = {"svg.fonttype": "none", "svg.hashsalt": picture.stem, "text.parse_math": False}
+    with tempfile.TemporaryDirectory() as place, matplotlib.rc_context(style):
+        picture.draw(drawn := Path(place) / f"picture.{form}")
+        return drawn.read_bytes()
 
 
 def html_page(parts: Sequence[Part], runs: Sequence[Run]) -> str:
@@ -146,10 +152,7 @@ def _html(part: Part, origins: dict[str, dict[str, str]], headings: dict[str, st
 
 def _svg(plot: Picture) -> str:
     """`plot` as SVG; its marks can be focused and have descriptions."""
-    style: Any = {"svg.fonttype": "none", "svg.hashsalt": plot.stem, "text.parse_math": False}
-    with tempfile.TemporaryDirectory() as place, matplotlib.rc_context(style):
-        plot.draw(drawn := Path(place) / "plot.svg")
-        content = drawn.read_text(encoding="utf-8")
+    content = _drawn(plot, "svg").decode()
     root = ElementTree.fromstring(content)
     used = set(re.findall(r"#([\w-]+)", content))
     for element in root.iter():
