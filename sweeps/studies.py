@@ -62,6 +62,11 @@ class Subject:
         return study_of(target)
 
     @property
+    def off(self) -> dict[str, str]:
+        """By what is skipped, the word that switches this skipping off."""
+        return {name: f"{setting}=false" for name, setting in self.study.skips.items()}
+
+    @property
     def engine(self) -> str:
         return str(self.config.hydra.runtime.choices.engine)
 
@@ -95,8 +100,7 @@ def accuracy(subject: Subject, only: Sequence[str], trained: bool) -> Iterator[S
     knobs: dict[str, Sequence[Variant]] = {**study.knobs, **({"engine": others} if others else {})}
     if trained:
         for name, axis in subject.axes().items():
-            values = [Variant(axis.label.format(x), (f"{axis.setting}={x}",)) for x in axis.values]
-            knobs[f"{name}, trained"] = values
+            knobs[f"{name}, trained"] = [variant for _, variant in _points(axis)]
         knobs |= study.trained
     for knob in chosen(knobs, only, "knob") or [AS_IT_IS.name]:
         yield from subject.lines(knob, [*first, *knobs.get(knob, ())])
@@ -112,13 +116,10 @@ def parity(subject: Subject) -> Iterator[StudyLine]:
 
 def skips(subject: Subject) -> Iterator[StudyLine]:
     """All skips, further savings on top, all skips but each one, nothing skipped."""
-    study = subject.study
-    off = {name: f"{setting}=false" for name, setting in study.skips.items()}
-    each = [Variant(f"all but {name}", (word,)) for name, word in off.items()]
-    ends = Variant("all"), Variant(NOTHING, tuple(off.values()))
-    yield from subject.lines(
-        "skips", [ends[0], *study.savings, *(each if len(off) > 1 else ()), ends[1]]
-    )
+    off = subject.off
+    each = [Variant(f"all but {name}", (word,)) for name, word in off.items() if len(off) > 1]
+    nothing = Variant(NOTHING, tuple(off.values()))
+    yield from subject.lines("skips", [Variant("all"), *subject.study.savings, *each, nothing])
 
 
 def breakdown(subject: Subject) -> Iterator[StudyLine]:
@@ -127,40 +128,42 @@ def breakdown(subject: Subject) -> Iterator[StudyLine]:
     if subject.has_engine:
         own = subject.engines().get(subject.engine, ())
         variants = [Variant(f"{subject.name}, {each.name}", each.settings) for each in own]
-    off = tuple(f"{setting}=false" for setting in subject.study.skips.values())
-    if off:
+    if off := subject.off.values():
         variants += [Variant(f"{x.name}, {NOTHING} skipped", (*x.settings, *off)) for x in variants]
     yield from subject.lines("parts", variants)
 
 
 def scaling(subject: Subject, only: Sequence[str]) -> Iterator[StudyLine]:
     """Frame sizes, numbers of threads and the axes of the method, each measured alone."""
-    axes = subject.axes()
-    wanted = chosen(("pixels", "threads", *axes), only, "axis")
     config = subject.config
+    most = config.budget.threads or torch.get_num_threads()
+    counts = Axis("{} threads", "threads", tuple(range(1, most + 1)))
+    points: dict[str, list[tuple[float, Variant]]] = {
+        "pixels": [(w * h, Variant(f"{w} x {h}", (f"frame_size=[{w},{h}]",))) for w, h in SIZES],
+        "threads": _points(counts),
+        **{name: _points(axis) for name, axis in subject.axes().items()},
+    }
+    wanted = chosen(points, only, "axis")
     if "threads" in wanted and subject.has_engine and subject.engine != "torch":
-        others = ", ".join(("pixels", *axes))
+        others = ", ".join(name for name in points if name != "threads")
         raise SteerbenchError(
             "threads: expected engine=torch, whose threads can be chosen afterwards; for another "
             f"engine choose from {others} with --only"
         )
     # A 2D renderer costs the same however long it was trained; its own steps would win.
     short = ("method.steps=null",) if config.method.get("steps") else ()
-    most = config.budget.threads or torch.get_num_threads()
     for name in wanted:
-        points: list[tuple[float, str, tuple[str, ...]]] = []
-        if name == "pixels":
-            points = [(w * h, f"{w} x {h}", (f"frame_size=[{w},{h}]",)) for w, h in SIZES]
-        elif name == "threads":  # of the frames; all have the same training
-            trained = f"budget.threads={most}"
-            counts = range(1, most + 1)
-            points = [(n, f"{n} threads", (f"threads={n}", trained)) for n in counts]
-        else:
-            axis = axes[name]
-            words_of = {value: (f"{axis.setting}={value}",) for value in axis.values}
-            points = [(axis.size(x), axis.label.format(x), of) for x, of in words_of.items()]
-        for value, label, words in points:
-            yield StudyLine(subject.name, name, label, (*short, *words), value)
+        # The threads are those of the frames; all have the same training.
+        trained = (f"budget.threads={most}",) if name == "threads" else ()
+        for value, each in points[name]:
+            settings = (*short, *each.settings, *trained)
+            yield StudyLine(subject.name, name, each.name, settings, value)
+
+
+def _points(axis: Axis) -> list[tuple[float, Variant]]:
+    """A variant for each value of an axis, beside the size of the value."""
+    words = {value: f"{axis.setting}={value}" for value in axis.values}
+    return [(axis.size(x), Variant(axis.label.format(x), (of,))) for x, of in words.items()]
 
 
 def chosen(names: Sequence[str] | Mapping[str, Any], parts: Sequence[str], kind: str) -> list[str]:
