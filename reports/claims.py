@@ -183,8 +183,13 @@ def _apart(metric: str, run: Run, twin: Run) -> float:
 
 
 def _frame_pairs(metric: str, run: Run, twin: Run) -> np.ndarray:
-    """The figures [N, 2] of the frames that both runs have."""
-    both = (_of_frames(metric, each) for each in (run, twin))
+    """The figures [N, 2] of the steady frames that both runs have; those of a stage include the
+    stages inside it."""
+    both = []
+    for frames in (run.steady.set_index("frame"), twin.steady.set_index("frame")):
+        names = map(str, frames)
+        parts = [name for name in names if name == metric or name.startswith(f"{metric}/")]
+        both.append(frames[parts].sum(axis=1, min_count=1).dropna())
     return pd.concat(both, axis=1, join="inner").to_numpy()
 
 
@@ -201,13 +206,6 @@ def _over_frames(metric: str, run: Run, twin: Run) -> tuple[float, str]:
     else:
         by_frame = np.array([apart(metric, *pair) for pair in pairs])
     return path_interval(by_frame), f"{len(pairs)} frames of one seed"
-
-
-def _of_frames(metric: str, run: Run) -> pd.Series:
-    """The figures of the steady frames of a run; those of a stage include the stages inside it."""
-    frames = run.steady.set_index("frame")
-    parts = [name for name in map(str, frames) if name == metric or name.startswith(f"{metric}/")]
-    return frames[parts].sum(axis=1, min_count=1).dropna()
 
 
 def by_ratio(metric: str) -> bool:
