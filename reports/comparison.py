@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
+import pandas as pd
 
 from bench.errors import SteerbenchError
 from bench.rows import UNITS, half_interval
@@ -151,16 +151,15 @@ def _apart(one: Repeated, other: Repeated, metric: str, write: Write) -> bool:
     """Whether two means differ when written, and by more than the interval of their difference:
     over pairs of the same seed or, if the seeds are others, from the intervals of both."""
     low, high = (
-        {run.facts["seed"]: figure for run in x.runs if (figure := run.figure(metric)) is not None}
+        pd.Series({run.facts["seed"]: run.figure(metric) for run in x.runs}, dtype=float).dropna()
         for x in (one, other)
     )
-    means = [float(np.mean([*of.values()])) for of in (low, high)]
-    if write(metric, means[0]) == write(metric, means[1]):
+    if write(metric, low.mean()) == write(metric, high.mean()):
         return False
     interval = math.hypot(*(half for x in (one, other) if (half := x.half(metric)) > 0))
-    if low.keys() == high.keys() and len(low) > 1:
-        interval = half_interval(np.array([high[seed] - low[seed] for seed in low]))
-    return not abs(means[1] - means[0]) <= interval  # nan: of a perfect seed
+    if {*low.index} == {*high.index} and len(low) > 1:
+        interval = half_interval((high - low).to_numpy())
+    return not abs(high.mean() - low.mean()) <= interval  # nan: of a perfect seed
 
 
 def machines(runs: Sequence[Run]) -> str:

@@ -111,11 +111,10 @@ def varied(runs: Sequence[Run]) -> dict[str, list[str]]:
         if len(set(values := [str(run.facts[fact]) for run in runs])) > 1
     }
     methods = [run.label for run in runs]
-    settings = [_settings(run) for run in runs]
+    settings = pd.DataFrame([_settings(run) for run in runs]).fillna("")
     typed = dict.fromkeys(word for run in runs for word in _typed(run))
-    names = dict.fromkeys(name for of_run in settings for name in of_run)
-    for name in dict.fromkeys((*(name for name in typed if name in names), *names)):
-        values = [of_run.get(name, "") for of_run in settings]
+    for name in dict.fromkeys((*(name for name in typed if name in settings), *settings)):
+        values = settings[name].tolist()
         shown = columns if name not in typed or name.partition(".")[0] in columns else {}
         if not _follows([methods, *shown.values()], values):
             columns[name] = values
