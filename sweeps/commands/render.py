@@ -37,16 +37,16 @@ def main(options: argparse.Namespace) -> int:
         words = [word for word in words if not replaced.match(word)]
         place = setting("trajectory.path", str(options.path.resolve()))
         words = [*words, "trajectory=path", place]
-    config = composed(words)
-    others = [composed(beside(name, words)) for name in options.beside]
+    configs = [composed(of) for of in (words, *(beside(name, words) for name in options.beside))]
+    config = configs[0]
     log = ConsoleLog(Path(config.outputs))
-    scene = seen(options.path, words, [config, *others]) or scene_of(config)
+    scene = seen(options.path, words, configs) or scene_of(config)
     trajectory = trajectory_of(config, scene, log)
     if options.video:
         if trajectory.resolution == MIXED:
             raise SteerbenchError("--video: expected frames of one size, the path has several")
         library_of(options.video)  # before any training
-    methods = [trained(each, log, scene) for each in (config, *others)]
+    methods = [trained(each, log, scene) for each in configs]
     cameras = [step.camera for step in trajectory.steps]
     drawn = "-".join(filter(None, [scene.name, *(one.name for one in methods), trajectory.name]))
     folder = options.to or Path(config.outputs) / "render" / drawn
