@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
-from itertools import groupby
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -208,17 +208,14 @@ def run_jobs(jobs: Sequence[Job], launcher: Launcher) -> list[Ended]:
     for job in jobs:  # of a folder, a key has the last part
         if (one := scene_folder(first[job.key].config)) != (other := scene_folder(job.config)):
             raise SteerbenchError(f"scene.path: {one}, {other}: expected folders with other names")
-    distinct = [job for job in jobs if first[job.key] is job]
-    scenes, seeds = ([job.settings[name] for job in distinct] for name in ("scene", "seed"))
-
-    def place(job: Job) -> tuple[int, int]:
-        return scenes.index(job.settings["scene"]), seeds.index(job.settings["seed"])
-
-    distinct.sort(key=place)
+    distinct = (job for job in jobs if first[job.key] is job)
+    of_scenes = [
+        list(chain(*grouped(of_scene, lambda job: job.settings["seed"]).values()))
+        for of_scene in grouped(distinct, lambda job: str(job.settings["scene"])).values()
+    ]
     in_process = launcher.config.hydra.runtime.choices["hydra/launcher"] == "basic"
     ahead, ended = in_process and room(jobs) > 1, dict[str, Ended]()
-    of_scenes = [list(some) for _, some in groupby(distinct, lambda job: place(job)[0])]
-    for some in of_scenes if ahead else [distinct]:
+    for some in of_scenes if ahead else [[*chain(*of_scenes)]]:
         groups, found = _groups(some, look_up=ahead)
         if ahead:
             train_ahead(some, found)
