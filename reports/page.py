@@ -59,9 +59,10 @@ def _heading(lines: Lines, failures: Mapping[str, str]) -> Iterator[Part]:
         joined(run.headline["n"][metric] for run in runs) for metric in ("psnr", "frame_ms")
     )
     reading = f"Arrows point to better. Quality is a mean over {scored} frames, time over {timed}."
-    if any(len(line.runs) > 1 for line in lines.lines):
+    seeds = {len(line.runs) for line in lines.lines}
+    if max(seeds) > 1:
         reading += " Figures are means over seeds, ± half their 95 % interval (t-distribution)."
-    if any(len(line.runs) == 2 for line in lines.lines):
+    if 2 in seeds:
         reading += " With two seeds it is 12.7 standard errors: use three or more."
     if "frames" in first.columns:
         reading += (

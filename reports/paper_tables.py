@@ -97,10 +97,11 @@ class PaperTable:
 
     def _shown(self, data_set: str, measured: Measured) -> Shown:
         """With the line that `instead` has for one that was not measured, and a note about it."""
-        lines, found = dict(self.blocks[data_set]), dict[str, Repeated]()
-        for key, line in lines.items():
-            place = Place(self.name, data_set, key)
-            found[key] = measured.get(place, Repeated(line.label, ()))
+        lines = dict(self.blocks[data_set])
+        found = {
+            key: measured.get(Place(self.name, data_set, key), Repeated(line.label, ()))
+            for key, line in lines.items()
+        }
         called = {key: line.called or line.label for key, line in self.lines.items()}
         there = {key for key, line in found.items() if line.runs}
         notes, standing = list(self.notes), {}
