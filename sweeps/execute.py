@@ -5,7 +5,6 @@ Jobs in other processes share with this one only the store, and a folder in whic
 
 import os
 import pickle
-import sys
 import time
 import uuid
 from collections.abc import Collection, Sequence
@@ -37,7 +36,7 @@ from sweeps.configured import scene_folder, trained, training_threads
 from sweeps.measurement import Job, JobFailed, obtain, reason, stored
 from sweeps.overrides import CONFIGS, composed, explain, folder_words, setting, target_of
 from sweeps.processes import on_gpu, processes, set_up
-from sweeps.terminal import time_left
+from sweeps.terminal import note, time_left
 
 OF_MEASUREMENT = ("engine", "precision", "protocol", "pictures", "exclusive")
 """Settings of run.yaml that no training depends on."""
@@ -131,7 +130,7 @@ def _measured(
     hydra, total = HydraConfig.get(), sum(map(len, groups))
     try:
         for number, job in groups[hydra.job.num]:
-            print(f"{number + 1} of {total}, {job.name}", file=sys.stderr)
+            note(f"{number + 1} of {total}, {job.name}")
         return attempt(groups[hydra.job.num], total, Path(hydra.runtime.output_dir), begun)
     except Exception as error:
         return picklable(error)
@@ -170,7 +169,7 @@ def attempt(group: Group, total: int, folder: Path, begun: float) -> dict[str, E
             cause = error.__cause__ if alone and isinstance(error.__cause__, Exception) else error
             failed = [each for each in left if alone is None or each[1] is alone]
             for number, job in failed:
-                print(f"steerbench: failed: {job.name}: {cause}", file=sys.stderr)
+                note(f"steerbench: failed: {job.name}: {cause}")
                 ended[job.key] = Ended(error=cause)
                 _count(folder, number)
             left = [each for each in left if each not in failed]
@@ -181,7 +180,7 @@ def say(job: Job, run: str, more: str = "") -> None:
     """Print the figures of a job's run in one line, and `more` after them."""
     (loaded,) = load_runs(job.store, [run])
     psnr, ms = decimal(loaded.values.get("psnr"), 2), decimal(loaded.values["frame_ms"], 1)
-    print(f"{job.name}: {psnr} dB, {ms} ms a frame{more}", file=sys.stderr)
+    note(f"{job.name}: {psnr} dB, {ms} ms a frame{more}")
 
 
 def _count(folder: Path, number: int, measured: bool = False) -> None:
@@ -280,7 +279,7 @@ def train_ahead(jobs: Sequence[Job], measured: Collection[str]) -> None:
             left = time_left(time.monotonic() - begun, number, len(todo) - number)
             error = ended.exception()
             how = f"failed: {reason(error)}" if error else f"trained in {ended.result():.0f} s"
-            print(f"{how}: {names[ended]}{left}", file=sys.stderr)
+            note(f"{how}: {names[ended]}{left}")
 
 
 def room(jobs: Sequence[Job]) -> int:

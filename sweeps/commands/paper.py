@@ -3,7 +3,6 @@ them; `steerbench report` writes the same page from the store alone."""
 
 import argparse
 import re
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -20,6 +19,7 @@ from sweeps.measurement import of_scene
 from sweeps.overrides import unquoted
 from sweeps.plan import Planned, plan, scenes_of
 from sweeps.tables import chosen
+from sweeps.terminal import note
 from sweeps.versions import by_job
 
 DATA = "data="  # prefix of the word that names the folder of a data set
@@ -34,7 +34,7 @@ def main(options: argparse.Namespace) -> int:
     words, data = data_set(settings)
     missing = data.missing if data else {}
     for name, why in missing.items():
-        print(f"missing: {name}: {why}", file=sys.stderr)
+        note(f"missing: {name}: {why}")
     shown = data_sets(scenes_of(words, data))
     one = getattr(options, "table", None)
     tables = chosen(one, words, options.beside, shown)
@@ -42,13 +42,13 @@ def main(options: argparse.Namespace) -> int:
     outputs = jobs[0].outputs
     ended = [] if options.command == "report" else run_all(jobs, options.overrides)
     store = existing_store(outputs) if options.command == "report" else Store(outputs)
-    runs = by_job(store, lambda line: print(line, file=sys.stderr))
+    runs = by_job(store, note)
     folder = options.report or outputs / (one or "paper")
     measured = gather(jobs, runs)
     page = write_paper_page(tables, measured, folder, missing)
     if options.format or options.command == "table":
         print(export.exported_tables(tables, measured, options.format or "markdown"), end="")
-    print(f"report: {page}", file=sys.stderr)
+    note(f"report: {page}")
     return int(any(each.failed for each in ended))
 
 

@@ -6,7 +6,6 @@ The lines of a study are runs in the store, as those of a sweep; a study shows t
 import argparse
 import re
 import shlex
-import sys
 from collections.abc import Iterator, Sequence
 
 from bench.errors import unexpected
@@ -18,7 +17,7 @@ from reports.studies import VIEWS, Measured, by_method
 from reports.tables import Table
 from sweeps.execute import divided, run_all
 from sweeps.studies import StudyJob, jobs_of, subjects
-from sweeps.terminal import say, show
+from sweeps.terminal import note, say, show
 
 
 def main(options: argparse.Namespace) -> int:
@@ -46,7 +45,7 @@ def main(options: argparse.Namespace) -> int:
             say(text)
     folder = options.report or jobs[0].outputs / study
     page = publish(_page(options, parts), folder, [line.run for line in lines])
-    print(f"report: {page}", file=sys.stderr)
+    note(f"report: {page}")
     return int(any(each.failed for each in ended))
 
 
