@@ -294,14 +294,15 @@ def _circle(axes: Axes, rows: pd.DataFrame, column: str) -> None:
 
 
 def _error_against_time(axes: Axes, rows: pd.DataFrame, column: str) -> None:
-    for number, (knob, of_knob) in enumerate(rows.groupby("knob", sort=False)):
-        some = of_knob[np.isfinite(of_knob[column])]
+    finite = rows[np.isfinite(rows[column])]
+    for number, knob in enumerate(rows["knob"].unique()):
+        some = finite[finite["knob"] == knob]
         bars = some["ms"] - some["ms_lo"], some["ms_hi"] - some["ms"]
         style = {**_style(number), "alpha": 0.8, "elinewidth": 0.6, "label": knob}
         axes.errorbar(some["ms"], _rms(some[column]), xerr=bars, **style)
     axes.loglog()
     axes.margins(0.15, 0.12)
-    errors = _rms(rows[column][np.isfinite(rows[column])])
+    errors = _rms(finite[column])
     if len(errors) and errors.max() < 1.01 * errors.min():  # autoscale needs a range to work with
         axes.set_autoscaley_on(False)
         axes.set_ylim(errors.min() / 2, errors.max() * 2)
