@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -157,23 +157,24 @@ def measured_where(runs: Sequence[Run]) -> dict[str, str]:
     return {**conditions(runs, (*COMMON, "seed", "commit")), "machine": machines(runs)}
 
 
-def section(table: PaperTable, measured: Measured, said: Collection[str] = ()) -> list[str | Table]:
+def section(
+    table: PaperTable, measured: Measured, said: Collection[str] = ()
+) -> Iterator[str | Table]:
     """A table as parts of a page: the lines of its blocks, and those of each scene.
 
     The page has `said` some of where they were measured already.
     """
     heading = table.title if table.number is None else f"{table.called}: {table.title}"
-    parts: list[str | Table] = []
     for block in table.shown(measured):
-        parts.append(f"### {block.title}" if block.title else f"## {heading}")
-        parts += _block(block, said)
+        yield f"### {block.title}" if block.title else f"## {heading}"
+        yield from _block(block, said)
     own = [line for key in table.lines if (line := table.measured(key, measured))]
     if table.scenes and len({scene for line in own for scene in line.by_scene}) > 1:
-        parts += ["### Each scene", _scenes(table.scenes, own)]
-    return parts
+        yield "### Each scene"
+        yield _scenes(table.scenes, own)
 
 
-def _block(block: Shown, said: Collection[str]) -> list[str | Table]:
+def _block(block: Shown, said: Collection[str]) -> Iterator[str | Table]:
     """What was measured, under which conditions; distances, here and in the paper; notes.
 
     All figures are shown where lines are methods, or where there are no distances. Notes are those
@@ -181,15 +182,16 @@ def _block(block: Shown, said: Collection[str]) -> list[str | Table]:
     """
     table, runs = block.table, [run for line in block.measured.values() for run in line.runs]
     facts = {name: value for name, value in measured_where(runs).items() if name not in said}
-    where = ", ".join(map(" ".join, facts.items())) if runs else ""
+    if runs and facts:
+        yield f"Measured: {', '.join(map(' '.join, facts.items()))}."
     published = any(line.published.get(block.data_set) for line in block.lines.values())
-    parts: list[str | Table] = [where and f"Measured: {where}."]
     if not published or any(METHOD in line.job for line in block.lines.values()):
-        parts.append(figure_table(block))
+        yield figure_table(block)
     if published:
-        parts += [f"Paper: {table.published_on[block.data_set]}.", distance_table(block)]
-    notes = dict.fromkeys((*(() if block.title else block.notes), *missing_figures(runs)))
-    return [part for part in (*parts, "\n".join(f"- {note}" for note in notes)) if part]
+        yield f"Paper: {table.published_on[block.data_set]}."
+        yield distance_table(block)
+    if notes := dict.fromkeys((*(() if block.title else block.notes), *missing_figures(runs))):
+        yield "\n".join(f"- {note}" for note in notes)
 
 
 def figure_table(block: Shown) -> Table:

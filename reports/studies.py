@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -109,7 +109,7 @@ def by_method(found: Iterable[Measured]) -> dict[str, list[Measured]]:
     return {name: pooled(of) for name, of in methods.items()}
 
 
-def accuracy(found: Sequence[Measured]) -> list[Part]:
+def accuracy(found: Sequence[Measured]) -> Iterator[Part]:
     """Run time against error of all settings of a method, fastest first; the frontier is bold."""
     columns: Columns = {
         "ms / frame ↓": lambda line: decimal(line.ms, 1),
@@ -119,18 +119,16 @@ def accuracy(found: Sequence[Measured]) -> list[Part]:
         "PSNR to the first, dB ↑": _apart,
         "better at no more time": lambda line: line.better.label if line.better else "— (frontier)",
     }
-    parts: list[Part] = []
     for method, lines in by_method(found).items():
         rated = on_frontier(lines)
         fastest_first = sorted(rated, key=lambda line: line.ms)
         best = [line.line for line in rated if line.better is None]
         title = f"{method}: run time against error of a frame,"
-        parts.append(_table(title, "setting", columns, fastest_first, best))
+        yield _table(title, "setting", columns, fastest_first, best)
         if sum(math.isfinite(line.figure("psnr")) for line in rated) > 1:
             plot = partial(frontier_plot, list(map(_point, rated)))
             shows = f"{method}: error of a frame against its time, one point a setting"
-            parts.append(Picture(f"frontier-{method}", shows, plot))
-    return parts
+            yield Picture(f"frontier-{method}", shows, plot)
 
 
 def on_frontier(lines: Sequence[Measured]) -> list[Measured]:
@@ -158,7 +156,7 @@ def _point(line: Measured) -> dict[str, Any]:
     }
 
 
-def parity(found: Sequence[Measured]) -> list[Part]:
+def parity(found: Sequence[Measured]) -> Iterator[Part]:
     """Every engine and precision beside the first, torch in fp32."""
     columns: Columns = {
         **COMPARED,
@@ -167,25 +165,21 @@ def parity(found: Sequence[Measured]) -> list[Part]:
         "network, ms ↓": lambda line: decimal(line.run.parts.get("network"), 2),
         "model, MB ↓": partial(_written, "size_bytes.total", megabytes),
     }
-    return [
-        _table(f"{method}: engines and precisions,", "engine, precision", columns, lines)
-        for method, lines in by_method(found).items()
-    ]
+    for method, lines in by_method(found).items():
+        yield _table(f"{method}: engines and precisions,", "engine, precision", columns, lines)
 
 
-def skips(found: Sequence[Measured]) -> list[Part]:
+def skips(found: Sequence[Measured]) -> Iterator[Part]:
     """A frame without each of the skips: how it differs, and its work as a share of all work, that
     of the last line."""
-    parts: list[Part] = []
     for method, lines in by_method(found).items():
         every = lines[-1].work.items()
         shares = {name.replace("_", " "): partial(_shared, name, of) for name, of in every}
         title = f"{method}: mean work of a frame, and its share of all;"
-        parts.append(_table(title, "skipped", {**COMPARED, **shares}, lines))
-    return parts
+        yield _table(title, "skipped", {**COMPARED, **shares}, lines)
 
 
-def breakdown(found: Sequence[Measured]) -> list[Part]:
+def breakdown(found: Sequence[Measured]) -> Iterator[Part]:
     """The ms of a frame that each of its parts takes itself, and where the host waits for a GPU."""
     there = dict.fromkeys(part for line in found for part in line.run.parts)
     columns: Columns = {
@@ -198,21 +192,20 @@ def breakdown(found: Sequence[Measured]) -> list[Part]:
         "PSNR, dB ↑": _psnr,
     }
     title = "ms of a frame, and what of it each part takes itself;"
-    tables: list[Part] = [_table(title, "", columns, found)]
+    yield _table(title, "", columns, found)
     for line in found:
         if waits := line.run.record["waits"]:
             total = decimal(sum(each["waits"] for each in waits), 1)
             rows = [(decimal(x["waits"], 1), x["line"], x["source"]) for x in waits]
             title = f"{line.line.label}: {total} waits for the GPU a frame"
-            tables.append(Table(title, ("waits", "line", "source"), rows))
-    return tables
+            yield Table(title, ("waits", "line", "source"), rows)
 
 
-def scaling(found: Sequence[Measured]) -> list[Part]:
+def scaling(found: Sequence[Measured]) -> Iterator[Part]:
     """How time, work and memory of a frame grow along each axis: all lines, and below those of an
     axis the exponent of each figure."""
-    methods = grouped(found, lambda each: each.line.method)
-    return [_scaling_table(method, lines) for method, lines in methods.items()]
+    for method, lines in grouped(found, lambda each: each.line.method).items():
+        yield _scaling_table(method, lines)
 
 
 def _scaling_table(method: str, every: Sequence[Measured]) -> Table:
@@ -238,7 +231,7 @@ def _scaling_table(method: str, every: Sequence[Measured]) -> Table:
     return replace(_table(f"{method}:", "", columns, every), lines=cells, sources=sources)
 
 
-VIEWS: Mapping[str, Callable[[Sequence[Measured]], list[Part]]] = {
+VIEWS: Mapping[str, Callable[[Sequence[Measured]], Iterator[Part]]] = {
     view.__name__: view for view in (accuracy, parity, skips, breakdown, scaling)
 }
 """What each study shows of the lines that were measured, by the name of the study."""

@@ -36,7 +36,7 @@ def main(options: argparse.Namespace) -> int:
     lines = [Measured.of(line, run) for (line, _), run in zip(done, runs, strict=True)]
     if not lines:
         return 1
-    parts = VIEWS[study](lines)
+    parts = list(VIEWS[study](lines))
     for part in parts:
         if isinstance(part, Table):
             show(part)
