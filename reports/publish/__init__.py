@@ -12,7 +12,7 @@ import re
 import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -68,28 +68,22 @@ def publish(parts: Sequence[Part], folder: Path, runs: Sequence[Run] = ()) -> Pa
 
 def markdown(parts: Sequence[Part], folder: Path) -> str:
     """`parts` in GitHub's Markdown; writes their pictures below `folder`."""
-    texts: list[str] = []
-    for part in parts:
-        match part:
-            case Table():
-                texts.append(part.markdown())
-            case ComparedFrame():
-                texts += [_shown(picture, folder) for picture in still_images(part)]
-            case Picture():
-                texts.append(_shown(part, folder))
-            case _:
-                texts.append(part)
-    return "\n\n".join(texts)
+    still = (still_images(part) if isinstance(part, ComparedFrame) else [part] for part in parts)
+    return "\n\n".join(_markdown(part, folder) for part in chain(*still))
 
 
-def _shown(picture: Picture, folder: Path) -> str:
-    """Draw `picture` into `folder`, named after its content; return the Markdown that shows it."""
-    content = _drawn(picture, "png")
-    name = f"pictures/{picture.stem}-{hashlib.sha256(content).hexdigest()[:12]}.png"
+def _markdown(part: str | Table | Picture, folder: Path) -> str:
+    """A part in Markdown; a picture is drawn into `folder`, and named after its content."""
+    if isinstance(part, str):
+        return part
+    if isinstance(part, Table):
+        return part.markdown()
+    content = _drawn(part, "png")
+    name = f"pictures/{part.stem}-{hashlib.sha256(content).hexdigest()[:12]}.png"
     (folder / "pictures").mkdir(exist_ok=True)
     with whole(folder / name) as new:
         new.write_bytes(content)
-    return f"![{picture.shows}]({name})"
+    return f"![{part.shows}]({name})"
 
 
 def _drawn(picture: Picture, form: str) -> bytes:
