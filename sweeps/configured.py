@@ -207,12 +207,12 @@ def _current(read: Any, config: DictConfig) -> _Read:
 def _stamps(files: Iterable[Path]) -> dict[str, tuple[int, ...]]:
     """The `stamp` of each file, and of all files beside it: pictures may be added, lists of names
     changed."""
-    stamps: dict[str, tuple[int, ...]] = {}
     folders = {file.parent for file in files}
-    for folder in filter(Path.is_dir, folders):
-        for path in folder.iterdir():
-            stamps[str(path)] = stamp(path) if path.is_file() else ()
-    return stamps
+    return {
+        str(path): stamp(path) if path.is_file() else ()
+        for folder in filter(Path.is_dir, folders)
+        for path in folder.iterdir()
+    }
 
 
 def build(config: DictConfig, group: str, *args: Any, **extra: Any) -> Any:

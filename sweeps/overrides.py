@@ -314,14 +314,12 @@ def further(words: Sequence[str]) -> list[Path]:
     return [*_typed(words), *(x for x in plug_ins().values() if isinstance(x, Path))]
 
 
-def _typed(words: Sequence[str]) -> list[Path]:
+def _typed(words: Sequence[str]) -> Iterator[Path]:
     """The folders named in `words` by `--config-dir=DIR` or by its form in two words."""
-    folders = []
     for word, after in pairwise([*words, ""]):
         name, equals, value = word.partition("=")
         if name in FLAGS:
-            folders.append(Path(value if equals else after).resolve())
-    return folders
+            yield Path(value if equals else after).resolve()
 
 
 @cache

@@ -223,9 +223,8 @@ class StudyJob(Job):
     line: StudyLine
 
 
-def jobs_of(study: str, found: Sequence[Subject], options: Mapping[str, Any]) -> list[StudyJob]:
+def jobs_of(study: str, found: Sequence[Subject], options: Mapping[str, Any]) -> Iterator[StudyJob]:
     """The jobs of all lines; those of a group in turns, if the study compares times."""
-    jobs = []
     for subject in found:
         varied = variants(subject.words)
         for line in LINES[study](subject, **options):
@@ -235,5 +234,4 @@ def jobs_of(study: str, found: Sequence[Subject], options: Mapping[str, Any]) ->
             turns = "" if study == "scaling" else ", ".join((study, *whose, line.group))
             name = f"{study}: {subject.name}, {line.group}: {line.label}"
             command = ["steerbench", "run", *words]
-            jobs.append(StudyJob(config, command, name, turns, line=line))
-    return jobs
+            yield StudyJob(config, command, name, turns, line=line)

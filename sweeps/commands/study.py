@@ -29,7 +29,7 @@ def main(options: argparse.Namespace) -> int:
     words, _ = divided(options.overrides)
     given = {name: getattr(options, name) for name in ("only", "trained") if name in options}
     found = subjects(study, words)
-    jobs = jobs_of(study, found, given)
+    jobs = list(jobs_of(study, found, given))
     ended = run_all(jobs, options.overrides)
     done = [(job.line, end.run) for job, end in zip(jobs, ended, strict=True) if end.run]
     runs = load_runs(jobs[0].store, (key for _, key in done))
@@ -44,18 +44,19 @@ def main(options: argparse.Namespace) -> int:
         for text in _recommended(lines, jobs, within):
             say(text)
     folder = options.report or jobs[0].outputs / study
-    page = publish(_page(options, parts), folder, [line.run for line in lines])
+    page = publish([*_page(options, parts)], folder, [line.run for line in lines])
     note(f"report: {page}")
     return int(any(each.failed for each in ended))
 
 
-def _page(options: argparse.Namespace, parts: Sequence[Part]) -> list[Part]:
+def _page(options: argparse.Namespace, parts: Sequence[Part]) -> Iterator[Part]:
     typed = shlex.join(["steerbench", *options.typed])
-    made = f"```sh\n{typed}\n```\n\nCommit {commit()}, {machine()['cpu']}."
-    page: list[Part] = [f"# {options.command.capitalize()}", made]
+    yield f"# {options.command.capitalize()}"
+    yield f"```sh\n{typed}\n```\n\nCommit {commit()}, {machine()['cpu']}."
     for part in parts:
-        page += [f"## {part.title}", part] if isinstance(part, Table) else [part]
-    return page
+        if isinstance(part, Table):
+            yield f"## {part.title}"
+        yield part
 
 
 def decibels(text: str) -> float:
