@@ -173,14 +173,9 @@ def _frame(frame: ComparedFrame) -> str:
     height, width = frame.truth.shape[:2]
     left, top, right, bottom = frame.box
     box = (left / width, top / height, (right - left) / width, (bottom - top) / height)
-    views = [{"titles": ("ground truth",), "rendering": _uri(frame.truth)}]
-    views += [
-        {"titles": view.titles, "rendering": _uri(view.rendering), "error": _uri(view.error)}
-        for view in frame.views
-    ]
     return TEMPLATES.get_template("frame.html").render(
         frame=frame,
-        views=views,
+        views=[{"titles": ("ground truth",), "rendering": frame.truth}, *frame.views],
         width=width,
         height=height,
         box=" ".join(f"{edge:.4f}" for edge in box),
@@ -197,3 +192,6 @@ def _uri(picture: np.ndarray) -> str:
     how: dict[str, Any] = {"quality": LOSSY_QUALITY} if large else quick
     Image.fromarray(picture).save(content, "webp", **how)
     return f"data:image/webp;base64,{base64.b64encode(content.getvalue()).decode()}"
+
+
+TEMPLATES.filters["uri"] = _uri
