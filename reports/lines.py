@@ -127,12 +127,11 @@ def results(store: Store, report: Callable[[str], object] = lambda line: None) -
     `report` gets a line on those that cannot be read, for each reason.
     """
     runs = readable(store, report=report)
-    own = {name: values for name, values in varied(runs).items() if name not in (*FACTS, *COLUMNS)}
-    rows = [
-        run.rows.assign(**{name: values[index] for name, values in own.items()})
-        for index, run in enumerate(runs)
-    ]
-    return pd.concat(rows, ignore_index=True) if rows else store.rows()
+    if not runs:
+        return store.rows()
+    differ = pd.DataFrame(varied(runs), index=[run.key for run in runs])
+    own = differ.drop(columns=[*FACTS, *COLUMNS], errors="ignore")
+    return pd.concat([run.rows for run in runs], ignore_index=True).join(own, on="run")
 
 
 def _follows(known: Sequence[Sequence[str]], values: Sequence[str]) -> bool:

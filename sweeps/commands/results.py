@@ -29,7 +29,7 @@ def main(options: argparse.Namespace) -> int:
     own = [str(name) for name in rows if name not in COLUMNS]
     columns = [*SHOWN[:2], *own, *SHOWN[2:]]
     short = rows.assign(run=rows["run"].str[:8])[columns]
-    lines = [list(map(_text, line)) for line in short.itertuples(index=False)]
+    lines = short.map(_text).to_numpy().tolist()
     show(Table(str(options.outputs), columns, lines), rows, options.format)
     return 0
 
