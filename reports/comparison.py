@@ -10,7 +10,7 @@ import pandas as pd
 from bench.errors import SteerbenchError
 from bench.rows import UNITS, half_interval
 from reports.lines import COMMON, Lines, Settings
-from reports.runs import Repeated, Run, grouped, joined
+from reports.runs import Repeated, Run, grouped, joined, listed
 from reports.tables import BOLD, NOT_AVAILABLE, QUALITY, Metric, Table, decimal, megabytes
 
 Write = Callable[[str, float], str]  # writes a figure of a metric
@@ -176,4 +176,4 @@ def conditions(runs: Sequence[Run], names: Sequence[str]) -> dict[str, str]:
 def conditions_of(runs: Sequence[Run], without: Collection[str] = ()) -> str:
     """Scene, resolution, trajectory and so on of `runs`, as text, `without` some of them."""
     names = [name for name in COMMON if name not in without]
-    return ", ".join(map(" ".join, conditions(runs, names).items()))
+    return listed(conditions(runs, names))

@@ -64,7 +64,7 @@ def stage_bars(runs: Sequence[Run | Repeated], path: Path) -> None:
     figure = Figure(figsize=(8, 0.7 + 0.25 * legend_lines + 0.5 * len(runs)), layout="constrained")
     axes = figure.subplots()
     for number, (part, width) in enumerate(widths.items()):
-        colour = "lightgrey" if part == OTHER else COLOURS[number % len(COLOURS)]
+        colour = "lightgrey" if part == OTHER else _style(number)["color"]
         axes.barh(
             widths.index, width, left=ends[part] - width, height=0.6, label=part, color=colour
         )
@@ -184,7 +184,7 @@ def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
     figure, axes = _of_quality("frame of the path", height=3.5)
     for number, run in enumerate(runs):
         scored = run.frames.dropna(subset=["psnr"])
-        colour, cold = COLOURS[number % len(COLOURS)], scored[scored["phase"] == COLD]
+        colour, cold = _style(number)["color"], scored[scored["phase"] == COLD]
         axes.plot(scored["frame"], scored["psnr"], marker="o", color=colour, label=run.label)
         axes.plot(cold["frame"], cold["psnr"], "o", color=colour, markerfacecolor="white")
     figure.legend(loc="outside upper center", ncols=LEGEND_COLUMNS, frameon=False)

@@ -16,7 +16,7 @@ from reports.claims import NOT_MEASURED, claim_table, finding_table
 from reports.images import Part, Picture, frame_section, kept_frames
 from reports.paper_tables import Measured, PaperTable, comparisons, measured_where, section
 from reports.publish import publish
-from reports.runs import Repeated, Run
+from reports.runs import Repeated, Run, listed
 
 PAGE: Any = OmegaConf.to_container(OmegaConf.load(Path(__file__).parent / "paper" / "page.yaml"))
 
@@ -58,13 +58,13 @@ def _parts(
     facts = measured_where(runs).items() if runs else ()
     said = {name: value for name, value in facts if " / " not in value}  # once for all tables
     if said:
-        yield f"Measured: {', '.join(map(' '.join, said.items()))}."
+        yield f"Measured: {listed(said)}."
     for table in tables:
         yield from section(table, measured, said)
     for plot in shown["plots"]:
-        yield from _plot(plot, tables, measured)
+        yield from _plot(plot, _chosen(plot["lines"], tables, measured))
     for images in shown["images"]:
-        yield from _images(images, tables, measured)
+        yield from _images(images["title"], _chosen(images["lines"], tables, measured))
     if concluded:
         yield f"## {PAGE['comparisons']}"
         yield claim_table(compared)
@@ -83,30 +83,26 @@ def _of_own(tables: Sequence[PaperTable]) -> Mapping[str, Any]:
     }
 
 
-def _plot(
-    plot: Mapping[str, Any], tables: Sequence[PaperTable], measured: Measured
-) -> Iterator[Part]:
-    """A plot with heading and caption, if any of its lines was measured."""
-    some: Sequence[Any] = _chosen(plot["lines"], tables, measured)
+def _plot(plot: Mapping[str, Any], lines: Sequence[Repeated]) -> Iterator[Part]:
+    """A plot of `lines` with heading and caption, if any was measured."""
     if "metric" in plot:
-        drawn = figures.quality_plot(some, plot["metric"])
+        drawn = figures.quality_plot(lines, plot["metric"])
     else:
-        some = _first_runs(some, one_scene=plot.get("one_scene", False))
-        draw = partial(getattr(figures, plot["draw"]), some)
+        runs = _first_runs(lines, one_scene=plot.get("one_scene", False))
+        draw = partial(getattr(figures, plot["draw"]), runs)
         drawn = Picture(plot["file"], plot["title"], draw)
-    if some and (drawn.marks or "draw" in plot):
-        yield from (f"## {plot['title']}", drawn, plot["caption"].strip())
+    if lines and (drawn.marks or "draw" in plot):
+        yield f"## {plot['title']}"
+        yield drawn
+        yield plot["caption"].strip()
 
 
-def _images(
-    images: Mapping[str, Any], tables: Sequence[PaperTable], measured: Measured
-) -> Iterator[Part]:
-    runs = _first_runs(_chosen(images["lines"], tables, measured), one_scene=True)
+def _images(title: str, lines: Sequence[Repeated]) -> Iterator[Part]:
+    runs = _first_runs(lines, one_scene=True)
     runs = [run for run in runs if run.views == runs[0].views]
     if runs and (frames := kept_frames(runs)):
-        title, stem = images["title"], f"frames-{images['title'].lower()}"
         yield f"## {title}\n\nA frame that all runs kept."
-        yield from frame_section(runs, frames[len(frames) // 2], stem)
+        yield from frame_section(runs, frames[len(frames) // 2], f"frames-{title.lower()}")
 
 
 def _chosen(

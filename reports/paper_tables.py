@@ -11,7 +11,7 @@ from typing import NamedTuple
 from reports.claims import Claim, Comparison, apart, compare, gap, told
 from reports.comparison import conditions, line_table, machines, marked, shown_as, written
 from reports.lines import COMMON
-from reports.runs import Repeated, Run, missing_figures
+from reports.runs import Repeated, Run, listed, missing_figures
 from reports.tables import ABSENT, BOLD, Table
 
 METHOD = "method"  # the setting of a line that is another method
@@ -183,7 +183,7 @@ def _block(block: Shown, said: Collection[str]) -> Iterator[str | Table]:
     table, runs = block.table, [run for line in block.measured.values() for run in line.runs]
     facts = {name: value for name, value in measured_where(runs).items() if name not in said}
     if runs and facts:
-        yield f"Measured: {', '.join(map(' '.join, facts.items()))}."
+        yield f"Measured: {listed(facts)}."
     published = any(line.published.get(block.data_set) for line in block.lines.values())
     if not published or any(METHOD in line.job for line in block.lines.values()):
         yield figure_table(block)

@@ -155,11 +155,11 @@ class Run:
             "run": self.key,
             "scene": f"{row['scene']}, digest {record['scene']['digest'][:16]}",
             "frames": f"{row['trajectory']} at {row['resolution']}",
-            "protocol": _listed(record["protocol"]),
-            "budget": _listed(record["budget"]),
+            "protocol": listed(record["protocol"]),
+            "budget": listed(record["budget"]),
             "seed": str(row["seed"]),
             "commit": row["commit"],
-            "computed on": _listed(computed),
+            "computed on": listed(computed),
             "times": record.get("times", "not recorded"),
             "doubts": "; ".join(record.get("doubts", ())) or "none",
             "peak memory": record["peak_bytes"],
@@ -167,7 +167,7 @@ class Run:
             "beside it": str(Neighbours(**seen)) if seen else "not recorded",
             "GPU": ", ".join(machine["gpus"]) or "none",
             "system": f"{machine['system']}, Python {machine['python']}",
-            "versions": _listed(record["made_of"].get("libraries", {})),
+            "versions": listed(record["made_of"].get("libraries", {})),
         }
 
     @property
@@ -393,7 +393,8 @@ def joined(values: Iterable[object]) -> str:
     return " / ".join(dict.fromkeys(map(str, values)))
 
 
-def _listed(values: Mapping[str, Any]) -> str:
+def listed(values: Mapping[str, Any]) -> str:
+    """Names with their values, as text."""
     return ", ".join(
         f"{name} {' + '.join(value) or 'none' if isinstance(value, list) else value}"
         for name, value in values.items()
