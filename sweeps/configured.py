@@ -140,8 +140,7 @@ def scene_of(config: DictConfig) -> Scene:
     If its trajectory renders held-out training pictures, these, one in eight, are removed from the
     training split, so that a model is never scored on pictures that it was trained on.
     """
-    scene: Scene = _current(_scene, config).value
-    return scene
+    return _current(_scene, config)
 
 
 def forget_scene() -> None:
@@ -158,8 +157,7 @@ def trajectory_of(config: DictConfig, scene: Scene, log: Log) -> Trajectory:
 
 
 def scene_digest(config: DictConfig) -> str:
-    digest: str = _current(_digest, config).value
-    return digest
+    return _current(_digest, config)
 
 
 def scene_folder(config: DictConfig) -> str | None:
@@ -192,16 +190,16 @@ def _scene(node: str, root: Path, held_out: bool) -> _Read:
     return _Read(scene, scene.files, _stamps(scene.files))
 
 
-def _current(read: Any, config: DictConfig) -> _Read:
+def _current(read: Any, config: DictConfig) -> Any:
     """What the cached function `read` has of a scene; read again if a file has changed since."""
     node, outputs = OmegaConf.to_yaml(config.scene, resolve=True), Path(config.outputs)
     held_out = OmegaConf.select(config, "trajectory.split") == VALIDATION
-    found: _Read = read(node, outputs, held_out)
+    found = read(node, outputs, held_out)
     if found.stamps != _stamps(found.files):
         read.cache_clear()
         _scene.cache_clear()
         found = read(node, outputs, held_out)
-    return found
+    return found.value
 
 
 def _stamps(files: Iterable[Path]) -> dict[str, tuple[int, ...]]:
