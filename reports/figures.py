@@ -144,8 +144,9 @@ def _legend(
 ) -> tuple[Sequence[Mapping[str, Any]], Sequence[Line2D]]:
     """The style of each line by its settings, and what a legend says of them: the first setting
     that differs has colours, the others markers."""
-    differ = {name: of for name, of in settings.items() if len(set(of)) > 1}
-    first, *rest = ([f"{name}={value}" for value in of] for name, of in differ.items())
+    first, *rest = (
+        [f"{name}={value}" for value in of] for name, of in settings.items() if len(set(of)) > 1
+    )
     others = list(map(", ".join, zip(*rest, strict=True))) if rest else [""] * len(first)
     colours = dict(zip(dict.fromkeys(first), cycle(COLOURS), strict=False))
     markers = dict(zip(dict.fromkeys(others), cycle(MARKERS), strict=False))

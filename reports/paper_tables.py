@@ -91,9 +91,9 @@ class PaperTable:
 
     def shown(self, measured: Measured) -> list[Shown]:
         """The first block, and those further ones of which any line is in `measured`."""
-        first, *further = self.data_sets
         there = {place.block for place in measured if place.table == self.name}
-        return [self._shown(x, measured) for x in (first, *(x for x in further if x in there))]
+        there.add(self.data_sets[0])
+        return [self._shown(x, measured) for x in self.data_sets if x in there]
 
     def _shown(self, data_set: str, measured: Measured) -> Shown:
         """With the line that `instead` has for one that was not measured, and a note about it."""
