@@ -140,7 +140,8 @@ def ranks(lines: Sequence[Repeated], metric: str, write: Write = usual) -> dict[
     for rows in grouped(known, lambda row: lines[row].conditions).values():
         of_rank: list[list[int]] = []  # the best of a rank comes first
         for row in sorted(rows, key=known.__getitem__, reverse=better == "↑"):
-            if not of_rank or _apart(lines[of_rank[-1][0]], lines[row], metric, write):
+            best = lines[of_rank[-1][0]] if of_rank else None
+            if best is None or _apart(best, lines[row], metric, write):
                 of_rank.append([])
             of_rank[-1].append(row)
         places |= {row: rank for rank, alike in enumerate(of_rank[:-1], 1) for row in alike}

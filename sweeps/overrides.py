@@ -124,8 +124,11 @@ def swept(words: Sequence[str]) -> dict[str, list[str]]:
 def taken(words: Sequence[str], name: str) -> tuple[list[str], list[str]]:
     """The words without those that set `name`, and the different values that they give it."""
     named = [word for word in words if word.lstrip("+").partition("=")[0] == name]
-    values = swept(named).get(name) or [word.partition("=")[2] for word in named[-1:]]
-    return [word for word in words if word not in named], list(dict.fromkeys(values))
+    others = [word for word in words if word not in named]
+    values = swept(named).get(name)
+    if values is None:  # a single one, if any
+        values = [word.partition("=")[2] for word in named[-1:]]
+    return others, list(dict.fromkeys(values))
 
 
 def setting(name: str, text: str) -> str:
@@ -207,9 +210,9 @@ def explain(error: Exception, words: Sequence[str]) -> SteerbenchError:
         group, _, name = word.lstrip("+").partition("=")
         if file := choices(group, words).get(name):
             loaded(file)
-    causes = [error, error.__cause__] if error.__cause__ else [error]
+    causes = filter(None, (error, error.__cause__))
     lines = [line.strip() for cause in causes for line in str(cause).splitlines()]
-    return SteerbenchError("; ".join(line for line in lines if line))
+    return SteerbenchError("; ".join(filter(None, lines)))
 
 
 def hint(word: str) -> str:

@@ -162,8 +162,10 @@ def scaling(subject: Subject, only: Sequence[str]) -> Iterator[StudyLine]:
 
 def _points(axis: Axis) -> list[tuple[float, Variant]]:
     """A variant for each value of an axis, beside the size of the value."""
-    words = {value: f"{axis.setting}={value}" for value in axis.values}
-    return [(axis.size(x), Variant(axis.label.format(x), (of,))) for x, of in words.items()]
+    return [
+        (axis.size(value), Variant(axis.label.format(value), (f"{axis.setting}={value}",)))
+        for value in axis.values
+    ]
 
 
 def chosen(names: Sequence[str] | Mapping[str, Any], parts: Sequence[str], kind: str) -> list[str]:

@@ -68,8 +68,12 @@ def publish(parts: Sequence[Part], folder: Path, runs: Sequence[Run] = ()) -> Pa
 
 def markdown(parts: Sequence[Part], folder: Path) -> str:
     """`parts` in GitHub's Markdown; writes their pictures below `folder`."""
-    still = (still_images(part) if isinstance(part, ComparedFrame) else [part] for part in parts)
-    return "\n\n".join(_markdown(part, folder) for part in chain(*still))
+    still = (
+        still_images(part) if isinstance(part, ComparedFrame) else [part]  # each image is a part
+        for part in parts
+    )
+    texts = [_markdown(part, folder) for part in chain(*still)]
+    return "\n\n".join(texts)
 
 
 def _markdown(part: str | Table | Picture, folder: Path) -> str:

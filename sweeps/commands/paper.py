@@ -97,12 +97,16 @@ def _outcome(job: Planned, runs: Sequence[Run]) -> Outcome:
 
 
 def _lines(of_block: Sequence[Outcome]) -> dict[Place, Repeated]:
-    runs = iter(over_common_frames([each.run for each in of_block if each.run]))
-    comparable = [each._replace(run=next(runs)) if each.run else each for each in of_block]
-    lines = grouped(comparable, lambda each: each.job.place)
+    runs = [each.run for each in of_block if each.run]
+    comparable = iter(over_common_frames(runs))
+    outcomes = [
+        each._replace(run=next(comparable)) if each.run else each  # over the same frames
+        for each in of_block
+    ]
+    lines = grouped(outcomes, lambda each: each.job.place)
     measured = [{each.job.scene for each in line if each.run} for line in lines.values()]
     common = set.intersection(*filter(None, measured)) if any(measured) else set()
-    return {place: _line(outcomes, common) for place, outcomes in lines.items()}
+    return {place: _line(of_line, common) for place, of_line in lines.items()}
 
 
 def _line(outcomes: Sequence[Outcome], common: set[str]) -> Repeated:
@@ -136,8 +140,12 @@ def _gaps(outcomes: Sequence[Outcome]) -> Iterator[str]:
     gaps = (each for each in outcomes if each.gap)
     for why, of_why in grouped(gaps, lambda each: each.gap).items():
         by_seed = grouped(of_why, lambda each: each.job.config.seed)
-        groups = [(seed, [each.job.scene for each in of]) for seed, of in by_seed.items()]
-        same = by_seed.keys() == seeds and all(of == groups[0][1] for _, of in groups)
+        groups = [
+            (seed, [each.job.scene for each in of_seed])  # where it is the reason
+            for seed, of_seed in by_seed.items()
+        ]
+        alike = all(of_seed == groups[0][1] for _, of_seed in groups)
+        same = alike and by_seed.keys() == seeds
         for seed, of_seed in groups[:1] if same else groups:
             words = [] if same else [f"seed {seed}"]
             words += [] if len(of_seed) == len(scenes) else [", ".join(of_seed)]
