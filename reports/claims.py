@@ -10,7 +10,7 @@ import pandas as pd
 
 from bench.rows import half_interval, path_interval
 from reports.comparison import shown_as
-from reports.runs import Repeated, Run
+from reports.runs import Repeated, Run, grouped
 from reports.tables import ABSENT, BOLD, Table, decimal
 
 AS, LARGER, SMALLER = "as in the paper", "larger", "smaller"
@@ -146,11 +146,10 @@ def gap(metric: str, one: Repeated, other: Repeated) -> Gap:
     ]
     if not pairs:
         return NOT_MEASURED
-    of_scenes: dict[object, list[float]] = {}
-    for run, twin in pairs:
-        of_scenes.setdefault(run.record["scene"]["digest"], []).append(_apart(metric, run, twin))
+    by_scene = grouped(pairs, lambda pair: pair[0].record["scene"]["digest"]).values()
+    of_scenes = [[_apart(metric, *pair) for pair in of_scene] for of_scene in by_scene]
     # The seeds of a scene share what is particular to it: of several scenes, each is one sample.
-    means = [float(np.mean(of)) for of in of_scenes.values()]
+    means = [float(np.mean(of_scene)) for of_scene in of_scenes]
     by = float(np.mean(means))
     if metric.startswith("size_bytes"):
         return Gap(by, 0.0, "computed, not sampled", True)
@@ -158,7 +157,7 @@ def gap(metric: str, one: Repeated, other: Repeated) -> Gap:
         return Gap(by, *_over_frames(metric, *pairs[0]), False)
     counts = {"scenes": len(means), "seeds": len({run.facts["seed"] for run, _ in pairs})}
     over = " × ".join(f"{count} {kind}" for kind, count in counts.items() if count > 1)
-    samples = means if len(means) > 1 else next(iter(of_scenes.values()))
+    samples = means if len(means) > 1 else of_scenes[0]
     return Gap(by, half_interval(np.array(samples)), over, True)
 
 
@@ -184,8 +183,13 @@ def _apart(metric: str, run: Run, twin: Run) -> float:
 
 
 def _frame_pairs(metric: str, run: Run, twin: Run) -> np.ndarray:
-    """The figures [N, 2] of the frames that both runs have."""
-    both = (_of_frames(metric, each) for each in (run, twin))
+    """The figures [N, 2] of the steady frames that both runs have; those of a stage include the
+    stages inside it."""
+    both = []
+    for frames in (run.steady.set_index("frame"), twin.steady.set_index("frame")):
+        names = map(str, frames)
+        parts = [name for name in names if name == metric or name.startswith(f"{metric}/")]
+        both.append(frames[parts].sum(axis=1, min_count=1).dropna())
     return pd.concat(both, axis=1, join="inner").to_numpy()
 
 
@@ -202,13 +206,6 @@ def _over_frames(metric: str, run: Run, twin: Run) -> tuple[float, str]:
     else:
         by_frame = np.array([apart(metric, *pair) for pair in pairs])
     return path_interval(by_frame), f"{len(pairs)} frames of one seed"
-
-
-def _of_frames(metric: str, run: Run) -> pd.Series:
-    """The figures of the steady frames of a run; those of a stage include the stages inside it."""
-    frames = run.steady.set_index("frame")
-    parts = [name for name in map(str, frames) if name == metric or name.startswith(f"{metric}/")]
-    return frames[parts].sum(axis=1, min_count=1).dropna()
 
 
 def by_ratio(metric: str) -> bool:
@@ -237,7 +234,7 @@ def finding_table(comparisons: Sequence[Comparison]) -> Table:
         if each.claim.says and each.here is not NOT_MEASURED:
             first.setdefault((each.claim.says, *_figures(each), each.verdict), each)
     columns = ("quantity", "paper", "here", "95 % interval", "against the paper")
-    lines = tuple((_quantity(each), *figures) for (_, *figures), each in first.items())
+    lines = [(_quantity(each), *figures) for (_, *figures), each in first.items()]
     return Table("What the paper says, and what was found", columns, lines)
 
 

@@ -5,15 +5,15 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
+import pandas as pd
 
 from bench.errors import SteerbenchError
 from bench.rows import UNITS, half_interval
-from reports.lines import COMMON, Lines
-from reports.runs import Repeated, Run
+from reports.lines import COMMON, Lines, Settings
+from reports.runs import Repeated, Run, grouped, joined, listed
 from reports.tables import BOLD, NOT_AVAILABLE, QUALITY, Metric, Table, decimal, megabytes
 
-Write = Callable[[float], str]
+Write = Callable[[str, float], str]  # writes a figure of a metric
 
 COST = {
     "frame_ms": Metric("ms / frame", "↓", partial(decimal, decimals=1)),
@@ -39,8 +39,8 @@ def comparison(lines: Lines, failures: Mapping[str, str]) -> list[Table]:
     where = f": {conditions_of(lines.runs, lines.settings)}" if lines.lines else ""
     tables = [_table(f"Comparison{where}", lines.settings, lines.lines, metrics)]
     blank = ("",) * (len(tables[0].columns) - 1)
-    failed = tuple((f"{label}: failed: {why}", *blank) for label, why in failures.items())
-    tables[0] = replace(tables[0], lines=tables[0].lines + failed)
+    failed = ((f"{label}: failed: {why}", *blank) for label, why in failures.items())
+    tables[0] = replace(tables[0], lines=[*tables[0].lines, *failed])
     cold = [replace(x, runs=[run.cold for run in x.runs if run.cold]) for x in lines.lines]
     if kept := [index for index, line in enumerate(cold) if line.runs]:
         settings = {name: [of[index] for index in kept] for name, of in lines.settings.items()}
@@ -56,7 +56,7 @@ def columns_of(lines: Lines) -> list[str]:
 
 def _table(
     title: str,
-    settings: Mapping[str, Sequence[str]],
+    settings: Settings,
     lines: Sequence[Repeated],
     metrics: Sequence[str],
 ) -> Table:
@@ -69,8 +69,15 @@ def _table(
     for metric in metrics:
         texts = marked(lines, metric, BOLD[:1])
         columns[shown_as(metric).heading] = [text or NOT_AVAILABLE for text in texts]
-    cells = tuple(zip(*columns.values(), strict=True))
-    return Table(title, tuple(columns), cells, sources=tuple(line.keys for line in lines))
+    return line_table(title, columns, lines)
+
+
+def line_table(
+    title: str, columns: Mapping[str, Sequence[str]], lines: Sequence[Repeated]
+) -> Table:
+    """A table of `lines` from its `columns`, by their headings."""
+    cells = list(zip(*columns.values(), strict=True))
+    return Table(title, tuple(columns), cells, [line.keys for line in lines])
 
 
 def shown_as(metric: str) -> Metric:
@@ -90,20 +97,21 @@ def shown_as(metric: str) -> Metric:
     return Metric(f"{rest or family}, {unit}", "↓", partial(decimal, decimals=decimals))
 
 
-def written(line: Repeated, metric: str, write: Write | None = None) -> str | None:
-    """The mean of a metric as text, with half its 95 % interval if known; None without a mean.
+def usual(metric: str, figure: float) -> str:
+    """A figure as pages show it."""
+    return shown_as(metric).write(figure)
 
-    Numbers are written by `write`, or in the usual format.
-    """
+
+def written(line: Repeated, metric: str, write: Write = usual) -> str | None:
+    """The mean of a metric as text, with half its 95 % interval if known; None without a mean."""
     mean, half = line.mean(metric), line.half(metric)
-    write = write or shown_as(metric).write
     if mean is None:
         return None
-    return f"{write(mean)} ± {write(half)}" if half > 0 else write(mean)
+    return f"{write(metric, mean)} ± {write(metric, half)}" if half > 0 else write(metric, mean)
 
 
 def marked(
-    lines: Sequence[Repeated], metric: str, marks: Sequence[str], write: Write | None = None
+    lines: Sequence[Repeated], metric: str, marks: Sequence[str], write: Write = usual
 ) -> list[str | None]:
     """A column: what `written` returns for each line, the best and the second best with `marks`.
 
@@ -115,7 +123,7 @@ def marked(
     return [text and forms.get(places.get(n, 0), "%s") % text for n, text in enumerate(texts)]
 
 
-def ranks(lines: Sequence[Repeated], metric: str, write: Write | None = None) -> dict[int, int]:
+def ranks(lines: Sequence[Repeated], metric: str, write: Write = usual) -> dict[int, int]:
     """The rank, from 1, of each of `lines` among those under the same conditions, by its index.
 
     Figures share the rank of a better one from which they differ by no more than the interval over
@@ -123,23 +131,20 @@ def ranks(lines: Sequence[Repeated], metric: str, write: Write | None = None) ->
     neither lines that are all alike or alone under their conditions have one, nor the second of
     two. No line has one in a metric without a better side.
     """
-    shown = shown_as(metric)
-    if not shown.better:
+    better = shown_as(metric).better
+    if not better:
         return {}
-    write = write or shown.write
-    known: dict[tuple[object, ...], dict[int, float]] = {}
-    for row, line in enumerate(lines):
-        mean = line.mean(metric)
-        if mean is not None and not math.isnan(mean):
-            known.setdefault(line.conditions, {})[row] = mean
+    means = ((row, line.mean(metric)) for row, line in enumerate(lines))
+    known = {row: mean for row, mean in means if mean is not None and not math.isnan(mean)}
     places: dict[int, int] = {}
-    for figures in known.values():
+    for rows in grouped(known, lambda row: lines[row].conditions).values():
         of_rank: list[list[int]] = []  # the best of a rank comes first
-        for row in sorted(figures, key=figures.__getitem__, reverse=shown.better == "↑"):
-            if not of_rank or _apart(lines[of_rank[-1][0]], lines[row], metric, write):
+        for row in sorted(rows, key=known.__getitem__, reverse=better == "↑"):
+            best = lines[of_rank[-1][0]] if of_rank else None
+            if best is None or _apart(best, lines[row], metric, write):
                 of_rank.append([])
             of_rank[-1].append(row)
-        places |= {row: rank for rank, rows in enumerate(of_rank[:-1], 1) for row in rows}
+        places |= {row: rank for rank, alike in enumerate(of_rank[:-1], 1) for row in alike}
     return places
 
 
@@ -147,31 +152,29 @@ def _apart(one: Repeated, other: Repeated, metric: str, write: Write) -> bool:
     """Whether two means differ when written, and by more than the interval of their difference:
     over pairs of the same seed or, if the seeds are others, from the intervals of both."""
     low, high = (
-        {run.facts["seed"]: figure for run in x.runs if (figure := run.figure(metric)) is not None}
+        pd.Series({run.facts["seed"]: run.figure(metric) for run in x.runs}, dtype=float).dropna()
         for x in (one, other)
     )
-    means = [float(np.mean([*of.values()])) for of in (low, high)]
-    if write(means[0]) == write(means[1]):
+    if write(metric, low.mean()) == write(metric, high.mean()):
         return False
     interval = math.hypot(*(half for x in (one, other) if (half := x.half(metric)) > 0))
-    if low.keys() == high.keys() and len(low) > 1:
-        interval = half_interval(np.array([high[seed] - low[seed] for seed in low]))
-    return not abs(means[1] - means[0]) <= interval  # nan: of a perfect seed
+    if {*low.index} == {*high.index} and len(low) > 1:
+        interval = half_interval((high - low).to_numpy())
+    return not abs(high.mean() - low.mean()) <= interval  # nan: of a perfect seed
 
 
 def machines(runs: Sequence[Run]) -> str:
     """On which machines `runs` were measured, with how many threads."""
     found = (run.record["machine"] for run in runs)
-    return " / ".join(dict.fromkeys(f"{x['cpu']} with {x['threads']} threads" for x in found))
+    return joined(f"{x['cpu']} with {x['threads']} threads" for x in found)
 
 
 def conditions(runs: Sequence[Run], names: Sequence[str]) -> dict[str, str]:
     """The facts `names` of `runs`, each with all of its values."""
-    facts = {name: dict.fromkeys(str(run.facts[name]) for run in runs) for name in names}
-    return {name: " / ".join(values) for name, values in facts.items()}
+    return {name: joined(run.facts[name] for run in runs) for name in names}
 
 
 def conditions_of(runs: Sequence[Run], without: Collection[str] = ()) -> str:
     """Scene, resolution, trajectory and so on of `runs`, as text, `without` some of them."""
     names = [name for name in COMMON if name not in without]
-    return ", ".join(map(" ".join, conditions(runs, names).items()))
+    return listed(conditions(runs, names))

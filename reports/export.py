@@ -2,11 +2,10 @@
 
 import re
 from collections.abc import Sequence
-from functools import partial
 
 import pandas as pd
 
-from reports.comparison import conditions_of, marked, shown_as
+from reports.comparison import conditions_of, marked, shown_as, usual
 from reports.paper_tables import Measured, PaperTable, Shown, figure_table
 from reports.tables import Table, decimal
 
@@ -46,7 +45,7 @@ def exported(table: Table, figures: pd.DataFrame, form: str) -> str:
         for line in table.lines
     ]
     sides = "".join("lr"[table.right(column)] for column in range(len(table.columns)))
-    return _tabular(f"{table.title}.", "", sides, table.columns, [rows])
+    return _tabular(f"{table.title}.", "", sides, table.columns, rows)
 
 
 def exported_tables(tables: Sequence[PaperTable], measured: Measured, form: str) -> str:
@@ -76,7 +75,8 @@ def _latex(table: PaperTable, measured: Measured) -> str:
     caption = f"{table.title}. {where[:1].upper()}{where[1:]}"
     heads = ["", *(shown_as(metric).heading for metric in table.metrics)]
     sides = f"l{'r' * len(table.metrics)}"
-    return _tabular(caption.strip(), table.name, sides, heads, list(map(_rows, blocks)))
+    rows = [row for block in blocks for row in _rows(block)]
+    return _tabular(caption.strip(), table.name, sides, heads, rows)
 
 
 def _tabular(
@@ -84,35 +84,30 @@ def _tabular(
     name: str,
     sides: str,
     heads: Sequence[str],
-    blocks: Sequence[Sequence[Sequence[str]]],
+    rows: Sequence[Sequence[str]],
 ) -> str:
-    """A table for the package booktabs; the cells of `blocks` are LaTeX already."""
-    parts = ([list(map(escaped, heads))], *blocks)
-    rows = ("\n".join(" & ".join(row) + r" \\" for row in part) for part in parts)
-    return "\n".join(
-        (
-            r"\begin{table}",
-            rf"\caption{{{escaped(caption)}}}",
-            *([rf"\label{{tab:{name}}}"] if name else []),
-            rf"\begin{{tabular}}{{{sides}}}",
-            r"\toprule",
-            "\n\\midrule\n".join(rows),
-            r"\bottomrule",
-            r"\end{tabular}",
-            "\\end{table}\n",
-        )
+    """A table for the package booktabs; the cells of `rows` are LaTeX already."""
+    return pd.DataFrame(rows, columns=list(map(escaped, heads))).to_latex(
+        index=False,
+        caption=escaped(caption),
+        label=f"tab:{name}" if name else None,
+        column_format=sides,
+        escape=False,
     )
 
 
 def _rows(block: Shown) -> list[list[str]]:
-    """The cells of a block; labels of a further one also have its data set."""
+    """The cells of a block; a further one is below a rule, and labels also have its data set."""
     lines, metrics = list(block.measured.values()), block.table.metrics
-    columns = [marked(lines, metric, MARKS, partial(_written, metric)) for metric in metrics]
+    columns = [marked(lines, metric, MARKS, _written) for metric in metrics]
     where = f" ({block.title})" if block.title else ""
-    return [
+    rows = [
         [escaped(line.label + where), *((text or "--").replace("±", r"$\pm$") for text in row)]
         for line, *row in zip(lines, *columns, strict=True)
     ]
+    if block.title:
+        rows[0][0] = f"\\midrule\n{rows[0][0]}"
+    return rows
 
 
 def _figures(blocks: Sequence[Shown]) -> pd.DataFrame:
@@ -143,7 +138,7 @@ def _written(metric: str, value: float) -> str:
     """A figure with the paper's number of decimals, sizes in MB."""
     family = re.split(r"[._]", metric)[0]
     if family not in DECIMALS:
-        return shown_as(metric).write(value)
+        return usual(metric, value)
     return decimal(value / 1e6 if family == "size" else value, DECIMALS[family])
 
 

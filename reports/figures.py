@@ -22,7 +22,7 @@ from bench.clock import OTHER
 from bench.results import COLD
 from reports.comparison import written
 from reports.images import Picture
-from reports.lines import METHOD, Lines
+from reports.lines import METHOD, Lines, Settings
 from reports.runs import Repeated, Run
 from reports.tables import NOT_AVAILABLE
 
@@ -57,22 +57,21 @@ NAME_SIZE = (160, 13)  # width and height in pixels of the name of a setting on 
 def stage_bars(runs: Sequence[Run | Repeated], path: Path) -> None:
     """Write a PNG: one bar per run or line, its mean frame time in ms split into parts; time
     outside all stages is grey and comes last."""
-    of_runs = [run.parts for run in runs]
-    there = dict.fromkeys(part for of in of_runs for part in of)
-    parts = [*(part for part in there if part != OTHER), OTHER]
-    legend_lines = -(-len(parts) // LEGEND_COLUMNS)
+    widths = pd.DataFrame([run.parts for run in runs]).fillna(0.0)
+    widths[OTHER] = widths.pop(OTHER)
+    ends = widths.cumsum(axis=1)
+    legend_lines = -(-len(widths.columns) // LEGEND_COLUMNS)
     figure = Figure(figsize=(8, 0.7 + 0.25 * legend_lines + 0.5 * len(runs)), layout="constrained")
     axes = figure.subplots()
-    ends = np.zeros(len(runs))
-    for number, part in enumerate(parts):
-        widths = np.array([of.get(part, 0.0) for of in of_runs])
-        colour = "lightgrey" if part == OTHER else COLOURS[number % len(COLOURS)]
-        axes.barh(range(len(runs)), widths, left=ends, height=0.6, label=part, color=colour)
-        ends = ends + widths
-    for line, end in enumerate(ends):
+    for number, (part, width) in enumerate(widths.items()):
+        colour = "lightgrey" if part == OTHER else _style(number)["color"]
+        axes.barh(
+            widths.index, width, left=ends[part] - width, height=0.6, label=part, color=colour
+        )
+    for line, end in enumerate(ends[OTHER]):
         axes.text(end, line, f" {end:.1f}", va="center")
-    axes.set_xlim(0, 1.12 * max(ends))
-    axes.set_yticks(range(len(runs)), [run.label for run in runs])
+    axes.set_xlim(0, 1.12 * max(ends[OTHER]))
+    axes.set_yticks(widths.index, [run.label for run in runs])
     axes.invert_yaxis()
     axes.set_xlabel("mean ms of a frame")
     axes.spines[["top", "right"]].set_visible(False)
@@ -141,12 +140,13 @@ def quality_against(
 
 
 def _legend(
-    settings: Mapping[str, Sequence[str]],
+    settings: Settings,
 ) -> tuple[Sequence[Mapping[str, Any]], Sequence[Line2D]]:
     """The style of each line by its settings, and what a legend says of them: the first setting
     that differs has colours, the others markers."""
-    differ = {name: of for name, of in settings.items() if len(set(of)) > 1}
-    first, *rest = ([f"{name}={value}" for value in of] for name, of in differ.items())
+    first, *rest = (
+        [f"{name}={value}" for value in of] for name, of in settings.items() if len(set(of)) > 1
+    )
     others = list(map(", ".join, zip(*rest, strict=True))) if rest else [""] * len(first)
     colours = dict(zip(dict.fromkeys(first), cycle(COLOURS), strict=False))
     markers = dict(zip(dict.fromkeys(others), cycle(MARKERS), strict=False))
@@ -185,7 +185,7 @@ def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
     figure, axes = _of_quality("frame of the path", height=3.5)
     for number, run in enumerate(runs):
         scored = run.frames.dropna(subset=["psnr"])
-        colour, cold = COLOURS[number % len(COLOURS)], scored[scored["phase"] == COLD]
+        colour, cold = _style(number)["color"], scored[scored["phase"] == COLD]
         axes.plot(scored["frame"], scored["psnr"], marker="o", color=colour, label=run.label)
         axes.plot(cold["frame"], cold["psnr"], "o", color=colour, markerfacecolor="white")
     figure.legend(loc="outside upper center", ncols=LEGEND_COLUMNS, frameon=False)
@@ -195,21 +195,24 @@ def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
 def quality_along(lines: Lines, name: str, path: Path) -> None:
     """Write a PNG: PSNR over the numbers that the setting `name` has, a curve for each choice of
     the others, with intervals over seeds. Lines that lack the setting are dashed, all across."""
-    others = {x: of for x, of in lines.settings.items() if x != name and len(set(of)) > 1}
-    curves: dict[str, dict[float, tuple[float, float]]] = {}
+    table = lines.frame(["psnr"])
+    others = [x for x in lines.settings if x != name and table[x].nunique() > 1]
+    words = [
+        ", ".join(f"{x}={row[x]}".removeprefix(f"{METHOD}=") for x in others)
+        for row in table.to_dict("records")
+    ]
+    across, scored = table[name].map(as_number), table["psnr"].notna()
     figure, axes = _of_quality(name)
-    for number, line in enumerate(lines.lines):
-        across, psnr = as_number(lines.settings[name][number]), line.mean("psnr")
-        if psnr is not None and across is not None:
-            words = (f"{x}={of[number]}".removeprefix(f"{METHOD}=") for x, of in others.items())
-            curves.setdefault(", ".join(words), {})[across] = psnr, line.half("psnr")
-        elif psnr is not None:
-            axes.axhline(psnr, **{**_style(number), "linestyle": "--"}, label=line.label)
-    for number, (label, curve) in enumerate(curves.items()):
-        means, bars = np.nan_to_num([curve[point] for point in sorted(curve)], posinf=math.nan).T
+    for number in table.index[scored & across.isna()]:
+        style = {**_style(number), "linestyle": "--", "label": lines.lines[number].label}
+        axes.axhline(table["psnr"][number], **style)
+    points = table[scored & across.notna()].groupby(pd.Series(words), sort=False)
+    for number, (label, of_curve) in enumerate(points):
+        curve = of_curve.set_index(across[of_curve.index]).sort_index()
+        means, bars = curve["psnr"].replace(math.inf, math.nan), curve["psnr.half"].fillna(0)
         style = {**_style(number), "capsize": 3, "label": label, "linestyle": "-"}
-        axes.errorbar(sorted(curve), means, yerr=bars if bars.any() else None, **style)
-    ticks = sorted({point for curve in curves.values() for point in curve})
+        axes.errorbar(curve.index, means, yerr=bars if bars.any() else None, **style)
+    ticks = sorted(across[scored].dropna().unique())
     if ticks[0] > 0 and ticks[-1] > 10 * ticks[0]:
         axes.set_xscale("log")
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
@@ -262,8 +265,8 @@ def frontier_plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     left_out = (f"{row.setting}, {row.ms:,.0f} ms" for row in every[far].itertuples())
     if text := "; ".join(left_out):
         figure.suptitle(f"not shown: {text}", size="small")
-    for axes, column in ((truth, "psnr"), (off, "psnr_to_first")):
-        _error_against_time(axes, table, column)
+    _error_against_time(truth, table, "psnr")
+    _error_against_time(off, table, "psnr_to_first")
     fastest, slowest = truth.get_xlim()
     truth.set_xlim(fastest * (fastest / slowest) ** 0.2, slowest)  # room for names on the left
     truth.step(
@@ -292,14 +295,15 @@ def _circle(axes: Axes, rows: pd.DataFrame, column: str) -> None:
 
 
 def _error_against_time(axes: Axes, rows: pd.DataFrame, column: str) -> None:
-    for number, (knob, of_knob) in enumerate(rows.groupby("knob", sort=False)):
-        some = of_knob[np.isfinite(of_knob[column])]
+    finite = rows[np.isfinite(rows[column])]
+    for number, knob in enumerate(rows["knob"].unique()):
+        some = finite[finite["knob"] == knob]
         bars = some["ms"] - some["ms_lo"], some["ms_hi"] - some["ms"]
         style = {**_style(number), "alpha": 0.8, "elinewidth": 0.6, "label": knob}
         axes.errorbar(some["ms"], _rms(some[column]), xerr=bars, **style)
     axes.loglog()
     axes.margins(0.15, 0.12)
-    errors = _rms(rows[column][np.isfinite(rows[column])])
+    errors = _rms(finite[column])
     if len(errors) and errors.max() < 1.01 * errors.min():  # autoscale needs a range to work with
         axes.set_autoscaley_on(False)
         axes.set_ylim(errors.min() / 2, errors.max() * 2)

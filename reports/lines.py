@@ -9,10 +9,12 @@ from typing import Any
 import pandas as pd
 
 from bench.results import COLUMNS, Store, content_key
-from reports.runs import Repeated, Run, over_common_frames, readable, unseeded
+from reports.runs import Repeated, Run, grouped, over_common_frames, readable, unseeded
 from reports.tables import QUALITY
 
 METHOD = "method"  # the first column
+
+Settings = Mapping[str, Sequence[str]]  # the value of each line, by setting
 
 COMMON = ("scene", "resolution", "trajectory", "budget", "protocol", "device")
 """Facts that a heading lists."""
@@ -38,7 +40,7 @@ class Lines:
     """
 
     lines: Sequence[Repeated]
-    settings: Mapping[str, Sequence[str]]
+    settings: Settings
 
     @property
     def runs(self) -> list[Run]:
@@ -61,10 +63,9 @@ def as_lines(runs: Sequence[Run]) -> Lines:
 
     The label of a run is shown as its method.
     """
-    by_line: dict[str, dict[int, Run]] = {}
-    for run in over_common_frames(runs):
-        by_line.setdefault(_line_of(run), {})[run.facts["seed"]] = run  # a seed counts once
-    groups = [[*of_line.values()] for of_line in by_line.values()]
+    by_line = grouped(over_common_frames(runs), _line_of)
+    by_seed = ({run.facts["seed"]: run for run in of_line} for of_line in by_line.values())
+    groups = [[*of_line.values()] for of_line in by_seed]  # a seed counts once
     firsts = [of_line[0] for of_line in groups]
     settings = {METHOD: [run.label for run in firsts], **differing(firsts)}
     machines = [", ".join(run.computer) for run in firsts]
@@ -111,11 +112,10 @@ def varied(runs: Sequence[Run]) -> dict[str, list[str]]:
         if len(set(values := [str(run.facts[fact]) for run in runs])) > 1
     }
     methods = [run.label for run in runs]
-    settings = [_settings(run) for run in runs]
+    settings = pd.DataFrame([_settings(run) for run in runs]).fillna("")
     typed = dict.fromkeys(word for run in runs for word in _typed(run))
-    names = dict.fromkeys(name for of_run in settings for name in of_run)
-    for name in dict.fromkeys((*(name for name in typed if name in names), *names)):
-        values = [of_run.get(name, "") for of_run in settings]
+    for name in dict.fromkeys((*(name for name in typed if name in settings), *settings)):
+        values = settings[name].tolist()
         shown = columns if name not in typed or name.partition(".")[0] in columns else {}
         if not _follows([methods, *shown.values()], values):
             columns[name] = values
@@ -131,16 +131,12 @@ def results(store: Store, report: Callable[[str], object] = lambda line: None) -
     runs = readable(store, report=report)
     if not runs:
         return store.rows()
-    shown = varied(runs)
-    own = {name: shown[name] for name in shown if name not in (*FACTS, *COLUMNS)}
+    differ = pd.DataFrame(varied(runs), index=[run.key for run in runs])
+    own = differ.drop(columns=[*FACTS, *COLUMNS], errors="ignore")
     jobs = {(_line_of(run), run.facts["seed"]) for run in runs}
     if len(jobs) < len(runs):
         own["version"] = [f"{run.commit}, {_when(run)}" for run in runs]
-    tables = []
-    for index, run in enumerate(runs):
-        columns = {name: values[index] for name, values in own.items()}
-        tables.append(run.rows.assign(**columns))
-    return pd.concat(tables, ignore_index=True)
+    return pd.concat([run.rows for run in runs], ignore_index=True).join(own, on="run")
 
 
 def _when(run: Run) -> str:
@@ -158,8 +154,7 @@ def _line_of(run: Run) -> str:
     """Equal for runs that differ only in their seed."""
     if "config" not in run.record["made_of"]:
         return run.key
-    settings = {x: of for x, of in unseeded(run.record["made_of"]["config"]) if x not in HIDDEN}
-    return content_key({"settings": settings, "where": list(map(str, run.conditions))})
+    return content_key({"settings": _settings(run), "where": list(map(str, run.conditions))})
 
 
 def _settings(run: Run) -> dict[str, str]:

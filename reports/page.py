@@ -12,7 +12,7 @@ from reports.comparison import comparison, conditions_of, machines
 from reports.images import MOST_RENDERINGS, Part, Picture, frame_section, kept_frames
 from reports.lines import Lines, as_lines
 from reports.publish import publish
-from reports.runs import Run, load_runs, missing_figures
+from reports.runs import Run, grouped, joined, load_runs, missing_figures
 from reports.tables import Table, run_tables
 
 
@@ -56,13 +56,13 @@ def _heading(lines: Lines, failures: Mapping[str, str]) -> Iterator[Part]:
     scenes = ", ".join(dict.fromkeys(run.facts["scene"] for run in runs))
     first, *further = comparison(lines, failures)
     scored, timed = (
-        " / ".join(dict.fromkeys(str(run.headline["n"][metric]) for run in runs))
-        for metric in ("psnr", "frame_ms")
+        joined(run.headline["n"][metric] for run in runs) for metric in ("psnr", "frame_ms")
     )
     reading = f"Arrows point to better. Quality is a mean over {scored} frames, time over {timed}."
-    if any(len(line.runs) > 1 for line in lines.lines):
+    seeds = {len(line.runs) for line in lines.lines}
+    if max(seeds) > 1:
         reading += " Figures are means over seeds, ± half their 95 % interval (t-distribution)."
-    if any(len(line.runs) == 2 for line in lines.lines):
+    if 2 in seeds:
         reading += " With two seeds it is 12.7 standard errors: use three or more."
     if "frames" in first.columns:
         reading += (
@@ -105,9 +105,9 @@ def _tradeoffs(lines: Lines) -> Iterator[Part]:
 
 def _ablations(lines: Lines) -> Iterator[Part]:
     """Plots of quality over the settings with several numbers."""
-    scored = [number for number, line in enumerate(lines.lines) if line.mean("psnr") is not None]
-    for name, values in lines.settings.items():
-        if len({figures.as_number(values[number]) for number in scored} - {None}) > 2:
+    scored = lines.frame(["psnr"]).dropna(subset=["psnr"])
+    for name in lines.settings:
+        if scored[name].map(figures.as_number).nunique() > 2:
             shows = f"PSNR in dB over {name}"
             yield f"## Quality over {name}"
             yield Picture(f"psnr-{name}", shows, partial(figures.quality_along, lines, name))
@@ -116,12 +116,10 @@ def _ablations(lines: Lines) -> Iterator[Part]:
 
 def _pictures(runs: Sequence[Run]) -> Iterator[Part]:
     """Images of the kept frames; runs that rendered the same frames share images."""
-    groups: dict[tuple[object, ...], list[Run]] = {}
-    for run in runs:
-        groups.setdefault(run.views, []).append(run)
+    groups = grouped(runs, lambda run: run.views).values()
     parts = [
         part
-        for number, group in enumerate(groups.values(), 1)
+        for number, group in enumerate(groups, 1)
         for frame in kept_frames(group)
         for part in frame_section(group, frame, f"frames-{number}")
     ]
@@ -132,7 +130,7 @@ def _figures(run: Run) -> Iterator[Part]:
     yield f"## {run.label}, run {run.key}"
     for table in run_tables(run.rows):
         yield f"### {table.title}"
-        yield replace(table, sources=((run.key,),) * len(table.lines))
+        yield replace(table, sources=[[run.key]] * len(table.lines))
 
 
 def _provenance(runs: Sequence[Run]) -> Iterator[Part]:
@@ -148,4 +146,4 @@ def _provenance(runs: Sequence[Run]) -> Iterator[Part]:
             lines += zip(names, values, strict=True)
     yield "## Provenance\n\nEvery figure and picture on this page was made by"
     yield f"```sh\n{commands}\n```"
-    yield Table("Provenance", ("", ""), tuple(lines))
+    yield Table("Provenance", ("", ""), lines)

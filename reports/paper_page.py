@@ -16,7 +16,7 @@ from reports.claims import NOT_MEASURED, claim_table, finding_table
 from reports.images import Part, Picture, frame_section, kept_frames
 from reports.paper_tables import Measured, PaperTable, comparisons, measured_where, section
 from reports.publish import publish
-from reports.runs import Repeated, Run
+from reports.runs import Repeated, Run, listed
 
 PAGE: Any = OmegaConf.to_container(OmegaConf.load(Path(__file__).parent / "paper" / "page.yaml"))
 
@@ -30,71 +30,79 @@ def write_paper_page(
     left out, by name. Raises SteerbenchError if `folder` cannot be written to.
     """
     runs = list({run.key: run for line in measured.values() for run in line.measured}.values())
-    left_out = "\n".join(f"- missing: {name}: {why}" for name, why in missing.items())
-    sources = "\n".join(f"{run.key}  {run.record['command']}" for run in runs)
+    return publish([*_parts(tables, measured, runs, missing)], folder, runs)
+
+
+def _parts(
+    tables: Sequence[PaperTable],
+    measured: Measured,
+    runs: Sequence[Run],
+    missing: Mapping[str, str],
+) -> Iterator[Part]:
+    shown = PAGE if any(table.number is not None for table in tables) else _of_own(tables)
+    yield f"# {shown['title']}"
     compared = [each for table in tables for each in comparisons(table, measured)]
-    findings, every = list[Part](), list[Part]()
-    if any(each.here is not NOT_MEASURED for each in compared):
+    concluded = any(each.here is not NOT_MEASURED for each in compared)
+    if concluded:
         sampled = sum(each.here.proves and each.here.half > 0 for each in compared)
-        verdicts = PAGE["verdicts"].format(sampled=sampled, count=len(compared)).strip()
-        findings += [f"## {PAGE['conclusions']}", finding_table(compared), verdicts]
-        every += [f"## {PAGE['comparisons']}", claim_table(compared)]
-    of_paper = any(table.number is not None for table in tables)
-    shown = PAGE if of_paper else _of_own(tables)
-    title = PAGE["title"] if of_paper else ", ".join(table.title for table in tables)
-    published = any(line.published for table in tables for line in table.lines.values())
-    reading = [PAGE["distances"].strip()] if published else []
+        yield f"## {PAGE['conclusions']}"
+        yield finding_table(compared)
+        yield PAGE["verdicts"].format(sampled=sampled, count=len(compared)).strip()
+    if missing:
+        yield "## Scenes that are left out"
+        yield "\n".join(f"- missing: {name}: {why}" for name, why in missing.items())
+    yield "## The tables"
+    if any(line.published for table in tables for line in table.lines.values()):
+        yield PAGE["distances"].strip()
+    yield PAGE["reading"].strip()
     facts = measured_where(runs).items() if runs else ()
     said = {name: value for name, value in facts if " / " not in value}  # once for all tables
-    parts: list[Part] = [
-        f"# {title}",
-        *findings,
-        *([f"## Scenes that are left out\n\n{left_out}"] if left_out else []),
-        "## The tables",
-        *reading,
-        PAGE["reading"].strip(),
-        *([f"Measured: {', '.join(map(' '.join, said.items()))}."] if said else []),
-        *(part for table in tables for part in section(table, measured, said)),
-        *(part for plot in shown["plots"] for part in _plot(plot, tables, measured)),
-        *(part for images in shown["images"] for part in _images(images, tables, measured)),
-        *every,
-        f"## Runs\n\nTheir keys in the store, and the commands:\n\n```\n{sources}\n```",
-    ]
-    return publish(parts, folder, runs)
+    if said:
+        yield f"Measured: {listed(said)}."
+    for table in tables:
+        yield from section(table, measured, said)
+    for plot in shown["plots"]:
+        yield from _plot(plot, _chosen(plot["lines"], tables, measured))
+    for images in shown["images"]:
+        yield from _images(images["title"], _chosen(images["lines"], tables, measured))
+    if concluded:
+        yield f"## {PAGE['comparisons']}"
+        yield claim_table(compared)
+    sources = "\n".join(f"{run.key}  {run.record['command']}" for run in runs)
+    yield f"## Runs\n\nTheir keys in the store, and the commands:\n\n```\n{sources}\n```"
 
 
 def _of_own(tables: Sequence[PaperTable]) -> Mapping[str, Any]:
-    """Plots and images of all lines, for tables that are not the paper's."""
+    """Title, plots and images of all lines, for tables that are not the paper's."""
     every = ((table.name, key, line) for table in tables for key, line in table.lines.items())
     lines = {line.label: (name, key) for name, key, line in every}
-    plots = [{**plot, "lines": lines} for plot in PAGE["plots"] if "metric" in plot]
-    return {"plots": plots, "images": [{"title": "Pictures", "lines": lines}]}
+    return {
+        "title": ", ".join(table.title for table in tables),
+        "plots": [{**plot, "lines": lines} for plot in PAGE["plots"] if "metric" in plot],
+        "images": [{"title": "Pictures", "lines": lines}],
+    }
 
 
-def _plot(
-    plot: Mapping[str, Any], tables: Sequence[PaperTable], measured: Measured
-) -> Iterator[Part]:
-    """A plot with heading and caption, if any of its lines was measured."""
-    some: Sequence[Any] = _chosen(plot["lines"], tables, measured)
+def _plot(plot: Mapping[str, Any], lines: Sequence[Repeated]) -> Iterator[Part]:
+    """A plot of `lines` with heading and caption, if any was measured."""
     if "metric" in plot:
-        drawn = figures.quality_plot(some, plot["metric"])
+        drawn = figures.quality_plot(lines, plot["metric"])
     else:
-        some = _first_runs(some, one_scene=plot.get("one_scene", False))
-        draw = partial(getattr(figures, plot["draw"]), some)
+        runs = _first_runs(lines, one_scene=plot.get("one_scene", False))
+        draw = partial(getattr(figures, plot["draw"]), runs)
         drawn = Picture(plot["file"], plot["title"], draw)
-    if some and (drawn.marks or "draw" in plot):
-        yield from (f"## {plot['title']}", drawn, plot["caption"].strip())
+    if lines and (drawn.marks or "draw" in plot):
+        yield f"## {plot['title']}"
+        yield drawn
+        yield plot["caption"].strip()
 
 
-def _images(
-    images: Mapping[str, Any], tables: Sequence[PaperTable], measured: Measured
-) -> Iterator[Part]:
-    runs = _first_runs(_chosen(images["lines"], tables, measured), one_scene=True)
+def _images(title: str, lines: Sequence[Repeated]) -> Iterator[Part]:
+    runs = _first_runs(lines, one_scene=True)
     runs = [run for run in runs if run.views == runs[0].views]
     if runs and (frames := kept_frames(runs)):
-        title, stem = images["title"], f"frames-{images['title'].lower()}"
         yield f"## {title}\n\nA frame that all runs kept."
-        yield from frame_section(runs, frames[len(frames) // 2], stem)
+        yield from frame_section(runs, frames[len(frames) // 2], f"frames-{title.lower()}")
 
 
 def _chosen(

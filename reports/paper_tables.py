@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from reports.claims import Claim, Comparison, apart, compare, gap, told
-from reports.comparison import conditions, machines, marked, shown_as, written
+from reports.comparison import conditions, line_table, machines, marked, shown_as, written
 from reports.lines import COMMON
-from reports.runs import Repeated, Run, missing_figures
+from reports.runs import Repeated, Run, listed, missing_figures
 from reports.tables import ABSENT, BOLD, Table
 
 METHOD = "method"  # the setting of a line that is another method
@@ -91,16 +91,17 @@ class PaperTable:
 
     def shown(self, measured: Measured) -> list[Shown]:
         """The first block, and those further ones of which any line is in `measured`."""
-        first, *further = self.data_sets
         there = {place.block for place in measured if place.table == self.name}
-        return [self._shown(x, measured) for x in (first, *(x for x in further if x in there))]
+        there.add(self.data_sets[0])
+        return [self._shown(x, measured) for x in self.data_sets if x in there]
 
     def _shown(self, data_set: str, measured: Measured) -> Shown:
         """With the line that `instead` has for one that was not measured, and a note about it."""
-        lines, found = dict(self.blocks[data_set]), dict[str, Repeated]()
-        for key, line in lines.items():
-            place = Place(self.name, data_set, key)
-            found[key] = measured.get(place, Repeated(line.label, ()))
+        lines = dict(self.blocks[data_set])
+        found = {
+            key: measured.get(Place(self.name, data_set, key), Repeated(line.label, ()))
+            for key, line in lines.items()
+        }
         called = {key: line.called or line.label for key, line in self.lines.items()}
         there = {key for key, line in found.items() if line.runs}
         notes, standing = list(self.notes), {}
@@ -156,23 +157,24 @@ def measured_where(runs: Sequence[Run]) -> dict[str, str]:
     return {**conditions(runs, (*COMMON, "seed", "commit")), "machine": machines(runs)}
 
 
-def section(table: PaperTable, measured: Measured, said: Collection[str] = ()) -> list[str | Table]:
+def section(
+    table: PaperTable, measured: Measured, said: Collection[str] = ()
+) -> Iterator[str | Table]:
     """A table as parts of a page: the lines of its blocks, and those of each scene.
 
     The page has `said` some of where they were measured already.
     """
     heading = table.title if table.number is None else f"{table.called}: {table.title}"
-    parts: list[str | Table] = []
     for block in table.shown(measured):
-        parts.append(f"### {block.title}" if block.title else f"## {heading}")
-        parts += _block(block, said)
+        yield f"### {block.title}" if block.title else f"## {heading}"
+        yield from _block(block, said)
     own = [line for key in table.lines if (line := table.measured(key, measured))]
     if table.scenes and len({scene for line in own for scene in line.by_scene}) > 1:
-        parts += ["### Each scene", _scenes(table.scenes, own)]
-    return parts
+        yield "### Each scene"
+        yield _scenes(table.scenes, own)
 
 
-def _block(block: Shown, said: Collection[str]) -> list[str | Table]:
+def _block(block: Shown, said: Collection[str]) -> Iterator[str | Table]:
     """What was measured, under which conditions; distances, here and in the paper; notes.
 
     All figures are shown where lines are methods, or where there are no distances. Notes are those
@@ -180,15 +182,16 @@ def _block(block: Shown, said: Collection[str]) -> list[str | Table]:
     """
     table, runs = block.table, [run for line in block.measured.values() for run in line.runs]
     facts = {name: value for name, value in measured_where(runs).items() if name not in said}
-    where = ", ".join(map(" ".join, facts.items())) if runs else ""
+    if runs and facts:
+        yield f"Measured: {listed(facts)}."
     published = any(line.published.get(block.data_set) for line in block.lines.values())
-    parts: list[str | Table] = [where and f"Measured: {where}."]
     if not published or any(METHOD in line.job for line in block.lines.values()):
-        parts.append(figure_table(block))
+        yield figure_table(block)
     if published:
-        parts += [f"Paper: {table.published_on[block.data_set]}.", distance_table(block)]
-    notes = dict.fromkeys((*(() if block.title else block.notes), *missing_figures(runs)))
-    return [part for part in (*parts, "\n".join(f"- {note}" for note in notes)) if part]
+        yield f"Paper: {table.published_on[block.data_set]}."
+        yield distance_table(block)
+    if notes := dict.fromkeys((*(() if block.title else block.notes), *missing_figures(runs))):
+        yield "\n".join(f"- {note}" for note in notes)
 
 
 def figure_table(block: Shown) -> Table:
@@ -239,8 +242,7 @@ def _of_columns(
     title: str, head: str, lines: Sequence[Repeated], columns: Mapping[str, Sequence[str | None]]
 ) -> Table:
     """A table of `lines`, labelled and with their gaps, and the cells of `columns` by metric."""
-    names = (": ".join((line.label, *line.gaps)) for line in lines)
-    cells = ([cell or ABSENT for cell in column] for column in columns.values())
-    heads = (head, *(shown_as(metric).heading for metric in columns))
-    rows = tuple(zip(names, *cells, strict=True))
-    return Table(title, heads, rows, sources=tuple(line.keys for line in lines))
+    of_table = {head: [": ".join((line.label, *line.gaps)) for line in lines]}
+    for metric, column in columns.items():
+        of_table[shown_as(metric).heading] = [cell or ABSENT for cell in column]
+    return line_table(title, of_table, lines)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -25,6 +25,9 @@ from bench.scenes.images import contents, decode_bytes
 from bench.sharing import check_sums
 from bench.study import part_of
 from reports.tables import phases, run_tables
+
+T = TypeVar("T")
+K = TypeVar("K")
 
 STAGE = "stage_ms."  # prefix of the metrics of stages
 
@@ -152,11 +155,11 @@ class Run:
             "run": self.key,
             "scene": f"{row['scene']}, digest {record['scene']['digest'][:16]}",
             "frames": f"{row['trajectory']} at {row['resolution']}",
-            "protocol": _listed(record["protocol"]),
-            "budget": _listed(record["budget"]),
+            "protocol": listed(record["protocol"]),
+            "budget": listed(record["budget"]),
             "seed": str(row["seed"]),
             "commit": self.commit,
-            "computed on": _listed(computed),
+            "computed on": listed(computed),
             "times": record.get("times", "not recorded"),
             "doubts": "; ".join(record.get("doubts", ())) or "none",
             "peak memory": record["peak_bytes"],
@@ -164,7 +167,7 @@ class Run:
             "beside it": str(Neighbours(**seen)) if seen else "not recorded",
             "GPU": ", ".join(machine["gpus"]) or "none",
             "system": f"{machine['system']}, Python {machine['python']}",
-            "versions": _listed(record["made_of"].get("libraries", {})),
+            "versions": listed(record["made_of"].get("libraries", {})),
         }
 
     @property
@@ -226,9 +229,8 @@ class Repeated:
     @property
     def parts(self) -> dict[str, float]:
         """The mean ms of each part of a frame; see `Run.parts`."""
-        of_runs = [run.parts for run in self.runs]
-        names = dict.fromkeys(name for of_run in of_runs for name in of_run)
-        return {name: float(np.mean([of.get(name, 0.0) for of in of_runs])) for name in names}
+        of_runs = pd.DataFrame([run.parts for run in self.runs]).fillna(0.0)
+        return {str(part): float(ms) for part, ms in of_runs.mean().items()}
 
     def _figures(self, metric: str) -> list[float]:
         figures = (run.figure(metric) for run in self.runs)
@@ -272,6 +274,14 @@ def load_runs(store: Store, keys: Iterable[str]) -> list[Run]:
             store.record(key)  # raises if there is none
             raise SteerbenchError("; ".join(unread))
     return [runs[key] for key in wanted]
+
+
+def grouped(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
+    """The `items` that have the same `key`, by this key, in the order of the first of each."""
+    groups: dict[K, list[T]] = {}
+    for each in items:
+        groups.setdefault(key(each), []).append(each)
+    return groups
 
 
 def _label(command: object, rows: pd.DataFrame) -> str:
@@ -335,7 +345,7 @@ def _over(run: Run, kept: Collection[int]) -> Run:
 
 
 def over_scenes(runs: Sequence[Run]) -> Run:
-    """Average runs of different scenes into one run.
+    """Average runs of one seed and different scenes into one run.
 
     Its rows are means of their headline rows, for the metrics that all of them have; its frames are
     the frames of all. A stage or a work that a run lacks did not occur in it and counts as 0.
@@ -352,30 +362,22 @@ def over_scenes(runs: Sequence[Run]) -> Run:
         n=("n", "sum"),
     )
     names = map(str, runs[0].facts.index)
-    facts = {name: _joined([run.facts[name] for run in runs]) for name in names}
+    facts: dict[str, Any] = {name: joined(run.facts[name] for run in runs) for name in names}
     facts["scene"] = f"mean of {', '.join(str(run.facts['scene']) for run in runs)}"
+    facts["seed"] = runs[0].facts["seed"]
     key = facts["run"] = content_key({"mean of": [run.key for run in runs]})[:16]
     if "fps" in rows.index:  # of the mean time, as in a run
         rows.loc["fps", "value"] = 1000 / rows["value"]["frame_ms"]
     rows = rows.reset_index().assign(lo=math.nan, hi=math.nan, **facts)
-    frames = cache(partial(_frames, runs))
+    frames = cache(lambda: pd.concat([run.frames for run in runs], ignore_index=True))
     return Run(key, runs[0].label, rows, frames, _record(runs), runs[0].pictures)
-
-
-def _frames(runs: Sequence[Run]) -> pd.DataFrame:
-    """The frames of all scenes, with the scene's name added to their names."""
-    named = (
-        run.frames.assign(name=f"{run.facts['scene']}/" + run.frames["name"].fillna(""))
-        for run in runs
-    )
-    return pd.concat(named, ignore_index=True)
 
 
 def _record(runs: Sequence[Run]) -> dict[str, Any]:
     """The record of the first run, with the scenes, machines and missing figures of all."""
     records = [run.record for run in runs]
     machines = [record["machine"] for record in records]
-    machine = {name: _joined([of[name] for of in machines]) for name in ("cpu", "threads")}
+    machine = {name: joined(of[name] for of in machines) for name in ("cpu", "threads")}
     gpus = list(dict.fromkeys(gpu for of in machines for gpu in of["gpus"]))
     digest = content_key({"mean of": [record["scene"]["digest"] for record in records]})
     return {
@@ -392,13 +394,13 @@ def read_picture(path: Path) -> np.ndarray:
     return decode_bytes(contents(path), path)[..., :3].numpy()
 
 
-def _joined(values: Sequence[Any]) -> Any:
-    """The value if all are equal, otherwise all of them as text."""
-    distinct = list(dict.fromkeys(values))
-    return distinct[0] if len(distinct) == 1 else " / ".join(map(str, distinct))
+def joined(values: Iterable[object]) -> str:
+    """All different `values`, as text."""
+    return " / ".join(dict.fromkeys(map(str, values)))
 
 
-def _listed(values: Mapping[str, Any]) -> str:
+def listed(values: Mapping[str, Any]) -> str:
+    """Names with their values, as text."""
     return ", ".join(
         f"{name} {' + '.join(value) or 'none' if isinstance(value, list) else value}"
         for name, value in values.items()

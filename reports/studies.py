@@ -7,17 +7,18 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 from bench.clock import OTHER
 from bench.convergence import observed_order
+from reports.comparison import conditions
 from reports.figures import frontier_plot
 from reports.images import Part, Picture
-from reports.runs import Run
-from reports.tables import BOLD, DENSE, Table, amount, decimal, megabytes, share
+from reports.runs import Run, grouped
+from reports.tables import BOLD, DENSE, Table, Write, amount, decimal, megabytes, share
 
 WORK = "work."
 
@@ -80,21 +81,20 @@ def pooled(found: Sequence[Measured]) -> list[Measured]:
     line which all groups have, the last of several, takes as long in each as in their median. Lost
     is the PSNR of the first line less that of a line.
     """
-    groups: dict[str, dict[tuple[str, ...], Measured]] = {}
-    for each in found:
-        groups.setdefault(each.line.group, {})[each.line.settings] = each
+    by_group = grouped(found, lambda each: each.line.group).values()
+    groups = [{each.line.settings: each for each in group} for group in by_group]
     lines = dict.fromkeys(each.line.settings for each in found)
-    common = [line for line in lines if all(line in group for group in groups.values())]
+    common = [line for line in lines if all(line in group for group in groups)]
     if common:
-        usual = statistics.median_low(group[common[-1]].ms for group in groups.values())
-        for group in groups.values():
+        usual = statistics.median_low(group[common[-1]].ms for group in groups)
+        for group in groups:
             pace = usual / group[common[-1]].ms
             for line, x in group.items():
                 ms, fastest, slowest = pace * x.ms, pace * x.fastest, pace * x.slowest
                 group[line] = replace(x, ms=ms, fastest=fastest, slowest=slowest)
     once = {}
     for line in lines:
-        several = [group[line] for group in groups.values() if line in group]
+        several = [group[line] for group in groups if line in group]
         middle = statistics.median_low(each.ms for each in several)
         usual_one = next(each for each in several if each.ms == middle)
         ends = min(x.fastest for x in several), max(x.slowest for x in several)
@@ -104,13 +104,12 @@ def pooled(found: Sequence[Measured]) -> list[Measured]:
 
 
 def by_method(found: Iterable[Measured]) -> dict[str, list[Measured]]:
-    methods: dict[str, list[Measured]] = {}
-    for each in found:
-        methods.setdefault(each.line.method, []).append(each)
+    """The `pooled` lines of each method."""
+    methods = grouped(found, lambda each: each.line.method)
     return {name: pooled(of) for name, of in methods.items()}
 
 
-def accuracy(found: Sequence[Measured]) -> list[Part]:
+def accuracy(found: Sequence[Measured]) -> Iterator[Part]:
     """Run time against error of all settings of a method, fastest first; the frontier is bold."""
     columns: Columns = {
         "ms / frame ↓": lambda line: decimal(line.ms, 1),
@@ -120,18 +119,16 @@ def accuracy(found: Sequence[Measured]) -> list[Part]:
         "PSNR to the first, dB ↑": _apart,
         "better at no more time": lambda line: line.better.label if line.better else "— (frontier)",
     }
-    parts: list[Part] = []
     for method, lines in by_method(found).items():
         rated = on_frontier(lines)
         fastest_first = sorted(rated, key=lambda line: line.ms)
         best = [line.line for line in rated if line.better is None]
         title = f"{method}: run time against error of a frame,"
-        parts.append(_table(title, "setting", columns, fastest_first, best))
+        yield _table(title, "setting", columns, fastest_first, best)
         if sum(math.isfinite(line.figure("psnr")) for line in rated) > 1:
             plot = partial(frontier_plot, list(map(_point, rated)))
             shows = f"{method}: error of a frame against its time, one point a setting"
-            parts.append(Picture(f"frontier-{method}", shows, plot))
-    return parts
+            yield Picture(f"frontier-{method}", shows, plot)
 
 
 def on_frontier(lines: Sequence[Measured]) -> list[Measured]:
@@ -159,34 +156,30 @@ def _point(line: Measured) -> dict[str, Any]:
     }
 
 
-def parity(found: Sequence[Measured]) -> list[Part]:
+def parity(found: Sequence[Measured]) -> Iterator[Part]:
     """Every engine and precision beside the first, torch in fp32."""
     columns: Columns = {
         **COMPARED,
         "p99 / p50 ↓": _tail,
         "worst pixel ↓": lambda line: decimal(line.figure("worst_to_first"), 4),
         "network, ms ↓": lambda line: decimal(line.run.parts.get("network"), 2),
-        "model, MB ↓": lambda line: megabytes(line.figure("size_bytes.total")),
+        "model, MB ↓": partial(_written, "size_bytes.total", megabytes),
     }
-    return [
-        _table(f"{method}: engines and precisions,", "engine, precision", columns, lines)
-        for method, lines in by_method(found).items()
-    ]
+    for method, lines in by_method(found).items():
+        yield _table(f"{method}: engines and precisions,", "engine, precision", columns, lines)
 
 
-def skips(found: Sequence[Measured]) -> list[Part]:
+def skips(found: Sequence[Measured]) -> Iterator[Part]:
     """A frame without each of the skips: how it differs, and its work as a share of all work, that
     of the last line."""
-    parts: list[Part] = []
     for method, lines in by_method(found).items():
         every = lines[-1].work.items()
         shares = {name.replace("_", " "): partial(_shared, name, of) for name, of in every}
         title = f"{method}: mean work of a frame, and its share of all;"
-        parts.append(_table(title, "skipped", {**COMPARED, **shares}, lines))
-    return parts
+        yield _table(title, "skipped", {**COMPARED, **shares}, lines)
 
 
-def breakdown(found: Sequence[Measured]) -> list[Part]:
+def breakdown(found: Sequence[Measured]) -> Iterator[Part]:
     """The ms of a frame that each of its parts takes itself, and where the host waits for a GPU."""
     there = dict.fromkeys(part for line in found for part in line.run.parts)
     columns: Columns = {
@@ -199,50 +192,46 @@ def breakdown(found: Sequence[Measured]) -> list[Part]:
         "PSNR, dB ↑": _psnr,
     }
     title = "ms of a frame, and what of it each part takes itself;"
-    tables: list[Part] = [_table(title, "", columns, found)]
+    yield _table(title, "", columns, found)
     for line in found:
         if waits := line.run.record["waits"]:
             total = decimal(sum(each["waits"] for each in waits), 1)
-            rows = tuple((decimal(x["waits"], 1), x["line"], x["source"]) for x in waits)
+            rows = [(decimal(x["waits"], 1), x["line"], x["source"]) for x in waits]
             title = f"{line.line.label}: {total} waits for the GPU a frame"
-            tables.append(Table(title, ("waits", "line", "source"), rows))
-    return tables
+            yield Table(title, ("waits", "line", "source"), rows)
 
 
-def scaling(found: Sequence[Measured]) -> list[Part]:
+def scaling(found: Sequence[Measured]) -> Iterator[Part]:
     """How time, work and memory of a frame grow along each axis: all lines, and below those of an
     axis the exponent of each figure."""
-    methods: dict[str, dict[str, list[Measured]]] = {}
-    for each in found:
-        methods.setdefault(each.line.method, {}).setdefault(each.line.group, []).append(each)
-    return [_scaling_table(method, axes) for method, axes in methods.items()]
+    for method, lines in grouped(found, lambda each: each.line.method).items():
+        yield _scaling_table(method, lines)
 
 
-def _scaling_table(method: str, axes: Mapping[str, Sequence[Measured]]) -> Table:
-    every = [line for lines in axes.values() for line in lines]
+def _scaling_table(method: str, every: Sequence[Measured]) -> Table:
     counters = dict.fromkeys(name for line in every for name in line.work)
-    figures: dict[str, tuple[str, Callable[[float], str]]] = {
+    figures: dict[str, tuple[str, Write]] = {
         "frame_ms": ("ms / frame ↓", partial(decimal, decimals=1)),
         **{f"{WORK}{name}": (name.replace("_", " "), amount) for name in counters},
         "peak_bytes": ("peak, MB ↓", megabytes),
         "size_bytes.total": ("model, MB ↓", megabytes),
     }
-    cells: list[tuple[str, ...]] = []
-    sources: list[tuple[str, ...]] = []
-    for axis, lines in axes.items():
-        for line in lines:
-            of_line = (write(line.figure(name)) for name, (_, write) in figures.items())
-            cells.append((line.line.label, *of_line, _tail(line)))
-            sources.append((line.run.key,))
-        values = [line.line.value for line in lines]
+    columns: Columns = {
+        **{head: partial(_written, name, write) for name, (head, write) in figures.items()},
+        "p99 / p50 ↓": _tail,
+    }
+    cells: list[Sequence[str]] = []
+    sources: list[Sequence[str]] = []
+    for axis, lines in grouped(every, lambda line: line.line.group).items():
+        of_axis, values = _table("", "", columns, lines), [line.line.value for line in lines]
         powers = (growth(values, [line.figure(name) for line in lines]) for name in figures)
-        cells.append((f"exponent of {axis}", *(decimal(power, 2) for power in powers), ""))
-        sources.append(())
-    columns = ("", *(label for label, _ in figures.values()), "p99 / p50 ↓")
-    return Table(f"{method}: {_where(every)}", columns, tuple(cells), sources=tuple(sources))
+        exponents = (f"exponent of {axis}", *(decimal(power, 2) for power in powers), "")
+        cells += [*of_axis.lines, exponents]
+        sources += [*of_axis.sources, ()]
+    return replace(_table(f"{method}:", "", columns, every), lines=cells, sources=sources)
 
 
-VIEWS: Mapping[str, Callable[[Sequence[Measured]], list[Part]]] = {
+VIEWS: Mapping[str, Callable[[Sequence[Measured]], Iterator[Part]]] = {
     view.__name__: view for view in (accuracy, parity, skips, breakdown, scaling)
 }
 """What each study shows of the lines that were measured, by the name of the study."""
@@ -256,10 +245,11 @@ def _table(
     best: Collection[StudyLine] = (),
 ) -> Table:
     """The `lines` below `head`, the `best` in bold, and what each of the `columns` says of them."""
-    labels = (BOLD[0] % x.line.label if x.line in best else x.line.label for x in lines)
-    figures = ((write(x) for write in columns.values()) for x in lines)
-    cells = tuple((label, *of) for label, of in zip(labels, figures, strict=True))
-    sources = tuple((line.run.key,) for line in lines)
+    cells = []
+    for each in lines:
+        label = BOLD[0] % each.line.label if each.line in best else each.line.label
+        cells.append([label, *(write(each) for write in columns.values())])
+    sources = [[each.run.key] for each in lines]
     return Table(f"{title} {_where(lines)}", (head, *columns), cells, sources)
 
 
@@ -267,6 +257,10 @@ def _apart(line: Measured) -> str:
     """The PSNR to the pictures of the first line."""
     apart = line.figure("psnr_to_first")
     return "the same" if apart == math.inf else decimal(apart, 1)
+
+
+def _written(metric: str, write: Write, line: Measured) -> str:
+    return write(line.figure(metric))
 
 
 def _psnr(line: Measured) -> str:
@@ -302,9 +296,8 @@ COMPARED: Columns = {
 
 def _where(lines: Sequence[Measured]) -> str:
     """Scene, path and size of the frames."""
-    facts = ("scene", "trajectory", "resolution")
-    several = [dict.fromkeys(str(line.run.facts[name]) for line in lines) for name in facts]
-    return ", ".join(next(iter(of)) for of in several if len(of) == 1)
+    facts = conditions([line.run for line in lines], ("scene", "trajectory", "resolution"))
+    return ", ".join(fact for fact in facts.values() if " / " not in fact)
 
 
 def growth(values: Sequence[float], figures: Sequence[float]) -> float:

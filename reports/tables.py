@@ -6,7 +6,7 @@ which have fewer preceding frames than the method can use, are listed separately
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -21,6 +21,9 @@ DENSE = ".dense"  # suffix of a work counter for the work of a method that skips
 NETS = ("alex", "vgg")  # of LPIPS
 
 
+Write = Callable[[float], str]
+
+
 @dataclass(frozen=True)
 class Metric:
     """How a metric is shown: its `name` with the unit, an arrow to `better` values, "" if neither
@@ -28,7 +31,7 @@ class Metric:
 
     name: str
     better: str
-    write: Callable[[float], str]
+    write: Write
 
     @property
     def heading(self) -> str:
@@ -41,9 +44,9 @@ class Table:
     the runs behind each line, or is empty."""
 
     title: str
-    columns: tuple[str, ...]
-    lines: tuple[tuple[str, ...], ...]
-    sources: tuple[tuple[str, ...], ...] = ()
+    columns: Sequence[str]
+    lines: Sequence[Sequence[str]]
+    sources: Sequence[Sequence[str]] = ()
 
     def right(self, column: int) -> bool:
         """Whether the column is aligned right: at least half of what is in it are figures."""
@@ -136,16 +139,15 @@ def _values(rows: pd.DataFrame, prefix: str = "") -> dict[str, float]:
 
 
 def _quality(rows: pd.DataFrame, suffix: str) -> Table:
-    columns = (rows[name] for name in ("metric", "value", "lo", "hi", "n"))
-    figures = {metric: of for metric, *of in zip(*columns, strict=True)}
-    scored, lines = figures["psnr"][-1], []
+    figures = rows.set_index("metric")
+    scored, lines = figures["n"]["psnr"], []
     for metric, shown in QUALITY.items():
-        if scored and metric in figures:
-            value, low, high, _ = figures[metric]
-            interval = " – ".join(map(shown.write, (low, high))) if math.isfinite(low) else ""
+        if scored and metric in figures.index:
+            value, *ends = map(float, figures.loc[metric, ["value", "lo", "hi"]])
+            interval = " – ".join(map(shown.write, ends)) if math.isfinite(ends[0]) else ""
             lines.append((shown.heading, shown.write(value), interval))
     title = f"Quality{suffix}, mean of {scored} frames"
-    return Table(title, ("metric", "mean", "95 % interval"), tuple(lines))
+    return Table(title, ("metric", "mean", "95 % interval"), lines)
 
 
 def _time(rows: pd.DataFrame, suffix: str) -> Table:
@@ -155,12 +157,12 @@ def _time(rows: pd.DataFrame, suffix: str) -> Table:
         lines = [(name, decimal(ms, 2), share(ms, total)) for name, ms in stages.items()]
         of_stages = share(sum(stages.values()), total) if stages else ""
         lines.append(("frame", decimal(total, 2), of_stages))
-        for each in ("p50", "p95", "p99"):
-            lines.append((f"frame, {each}", decimal(value[f"frame_ms.{each}"], 2), ""))
-        lines.append(("FPS", decimal(value["fps"], 2), ""))
-        if wall := value.get("wall_ms"):
-            lines.append(("frame, with the socket", decimal(wall, 2), ""))
-    return Table(f"Time of a frame{suffix}", ("stage", "mean ms", "share"), tuple(lines))
+        parts = {f"frame, {part}": f"frame_ms.{part}" for part in ("p50", "p95", "p99")}
+        others = {**parts, "FPS": "fps", "frame, with the socket": "wall_ms"}
+        for name, metric in others.items():
+            if metric in value:
+                lines.append((name, decimal(value[metric], 2), ""))
+    return Table(f"Time of a frame{suffix}", ("stage", "mean ms", "share"), lines)
 
 
 def _work(rows: pd.DataFrame, suffix: str) -> Table:
@@ -172,7 +174,7 @@ def _work(rows: pd.DataFrame, suffix: str) -> Table:
             saved = "" if dense is None else share(dense - done, dense)
             figures = ("" if x is None else decimal(x, 0 if x >= 100 else 1) for x in (done, dense))
             lines.append((name.replace("_", " "), *figures, saved))
-    return Table(f"Work of a frame{suffix}", ("work", "done", "dense", "saved"), tuple(lines))
+    return Table(f"Work of a frame{suffix}", ("work", "done", "dense", "saved"), lines)
 
 
 def _memory(rows: pd.DataFrame) -> Table:
@@ -182,5 +184,5 @@ def _memory(rows: pd.DataFrame) -> Table:
     for name, when in (("peak_bytes", "rendering"), ("train_peak_bytes", "training")):
         if math.isfinite(peak := _values(rows).get(name, math.nan)):
             sizes[f"peak, {when}"] = peak
-    lines = tuple((name, megabytes(size)) for name, size in sizes.items())
+    lines = [(name, megabytes(size)) for name, size in sizes.items()]
     return Table("Memory", ("component", "MB"), lines)

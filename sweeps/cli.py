@@ -88,7 +88,7 @@ def _fail(message: str, status: int) -> int:
 def dispatch(argv: Sequence[str]) -> int:
     """Pass `argv` to the file of its command, which is imported only now."""
     of_hydra = argv[:1] == ["run"] or argv[:1] in (["-sc"], ["--shell-completion"])
-    argv = _one_form(argv)
+    argv = list(_one_form(argv))
     options = None if of_hydra else parsed(argv)
     if options and options.command is None:
         options.parser.print_help()
@@ -99,26 +99,25 @@ def dispatch(argv: Sequence[str]) -> int:
     return command.main(options or argv[argv[0] == "run" :])
 
 
-def _one_form(argv: Sequence[str]) -> list[str]:
+def _one_form(argv: Sequence[str]) -> Iterator[str]:
     """`argv` with the folders of store and page as its command takes them.
 
     They are an option or a setting; every command understands `--outputs DIR` and `outputs=DIR`.
     """
     name, words = argv[0] if argv else "", iter(argv)
     if name not in COMMANDS:
-        return list(argv)
+        yield from argv
+        return
     known = {each for names, _ in _arguments(COMMANDS[name]) for each in names}
-    found = []
     for word in words:
         option, equals, value = word.partition("=")
         place = option.removeprefix("--")
         if place not in PLACES or word == place:
-            found.append(word)
+            yield word
         elif f"--{place}" in known:
-            found.append(f"--{place}={value}" if equals else f"--{place}")
+            yield f"--{place}={value}" if equals else f"--{place}"
         else:
-            found.append(f"{place}={value if equals else next(words, '')}")
-    return found
+            yield f"{place}={value if equals else next(words, '')}"
 
 
 class Parser(argparse.ArgumentParser):

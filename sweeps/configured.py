@@ -61,21 +61,21 @@ def checked_settings(config: DictConfig) -> Settings:
         values["frame_size"] = list(values["frame_size"])
     check_settings(Settings, values)
     settings = Settings(**values)
-    if not 0 <= settings.seed < 2**63:
-        raise unexpected("seed", "0 or more, below 2^63", settings.seed)
     if "engine" in config:
         precisions = target_of(config.engine).precisions
         if config.precision not in precisions:
             raise unexpected("precision", " or ".join(precisions), config.precision)
-    if settings.threads is not None and settings.threads < 1:
-        raise unexpected("threads", "1 or more, or null", settings.threads)
-    if settings.pictures < 0:
-        raise unexpected("pictures", "0 or more", settings.pictures)
-    size = settings.frame_size
-    if size is not None and (len(size) != 2 or min(size) < 1):
-        raise unexpected("frame_size", "[WIDTH, HEIGHT], each 1 or more, or null", size)
-    if not DEVICE.fullmatch(settings.device):
-        raise unexpected("device", "auto, cpu, cuda or cuda:N", settings.device)
+    threads, size = settings.threads, settings.frame_size
+    of_size = size is None or (len(size) == 2 and min(size) >= 1)
+    for name, right, expected in (
+        ("seed", 0 <= settings.seed < 2**63, "0 or more, below 2^63"),
+        ("threads", threads is None or threads >= 1, "1 or more, or null"),
+        ("pictures", settings.pictures >= 0, "0 or more"),
+        ("frame_size", of_size, "[WIDTH, HEIGHT], each 1 or more, or null"),
+        ("device", DEVICE.fullmatch(settings.device), "auto, cpu, cuda or cuda:N"),
+    ):
+        if not right:
+            raise unexpected(name, expected, values[name])
     _, _, number = settings.device.partition(":")
     if settings.device.startswith("cuda") and int(number or 0) >= torch.cuda.device_count():
         raise Unavailable(
@@ -140,8 +140,7 @@ def scene_of(config: DictConfig) -> Scene:
     If its trajectory renders held-out training pictures, these, one in eight, are removed from the
     training split, so that a model is never scored on pictures that it was trained on.
     """
-    scene: Scene = _current(_scene, config).value
-    return scene
+    return _current(_scene, config)
 
 
 def forget_scene() -> None:
@@ -158,19 +157,12 @@ def trajectory_of(config: DictConfig, scene: Scene, log: Log) -> Trajectory:
 
 
 def scene_digest(config: DictConfig) -> str:
-    digest: str = _current(_digest, config).value
-    return digest
+    return _current(_digest, config)
 
 
 def scene_folder(config: DictConfig) -> str | None:
     """The folder of the scene; None for an embedded scene."""
     return str(Path(config.scene.path).expanduser().resolve()) if "path" in config.scene else None
-
-
-def _contents(config: DictConfig) -> tuple[str, Path, bool]:
-    """The scene's node as YAML, the root of all outputs, and whether views are held out."""
-    held_out = OmegaConf.select(config, "trajectory.split") == VALIDATION
-    return OmegaConf.to_yaml(config.scene, resolve=True), Path(config.outputs), held_out
 
 
 class _Read(NamedTuple):
@@ -198,26 +190,27 @@ def _scene(node: str, root: Path, held_out: bool) -> _Read:
     return _Read(scene, scene.files, _stamps(scene.files))
 
 
-def _current(read: Any, config: DictConfig) -> _Read:
+def _current(read: Any, config: DictConfig) -> Any:
     """What the cached function `read` has of a scene; read again if a file has changed since."""
-    contents = _contents(config)
-    found: _Read = read(*contents)
+    node, outputs = OmegaConf.to_yaml(config.scene, resolve=True), Path(config.outputs)
+    held_out = OmegaConf.select(config, "trajectory.split") == VALIDATION
+    found = read(node, outputs, held_out)
     if found.stamps != _stamps(found.files):
         read.cache_clear()
         _scene.cache_clear()
-        found = read(*contents)
-    return found
+        found = read(node, outputs, held_out)
+    return found.value
 
 
 def _stamps(files: Iterable[Path]) -> dict[str, tuple[int, ...]]:
     """The `stamp` of each file, and of all files beside it: pictures may be added, lists of names
     changed."""
-    stamps: dict[str, tuple[int, ...]] = {}
     folders = {file.parent for file in files}
-    for folder in filter(Path.is_dir, folders):
-        for path in folder.iterdir():
-            stamps[str(path)] = stamp(path) if path.is_file() else ()
-    return stamps
+    return {
+        str(path): stamp(path) if path.is_file() else ()
+        for folder in filter(Path.is_dir, folders)
+        for path in folder.iterdir()
+    }
 
 
 def build(config: DictConfig, group: str, *args: Any, **extra: Any) -> Any:

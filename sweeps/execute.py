@@ -5,18 +5,17 @@ Jobs in other processes share with this one only the store, and a folder in whic
 
 import os
 import pickle
-import sys
 import time
 import uuid
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import as_completed
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
-from itertools import groupby
+from itertools import chain
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from hydra import initialize_config_dir
 from hydra._internal.callbacks import Callbacks
@@ -31,13 +30,13 @@ from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
 from bench.results import content_key
 from bench.study import study_of
-from reports.runs import load_runs
+from reports.runs import grouped, load_runs
 from reports.tables import decimal
 from sweeps.configured import scene_folder, trained, training_threads
 from sweeps.measurement import Job, JobFailed, obtain, reason, stored
-from sweeps.overrides import CONFIGS, composed, explain, setting, target_of
+from sweeps.overrides import CONFIGS, composed, explain, folder_words, setting, target_of
 from sweeps.processes import on_gpu, processes, set_up
-from sweeps.terminal import time_left
+from sweeps.terminal import note, time_left
 
 OF_MEASUREMENT = ("engine", "precision", "protocol", "pictures", "exclusive")
 """Settings of run.yaml that no training depends on."""
@@ -46,91 +45,6 @@ OF_METHOD = ("method", "engine", "precision")
 """Settings in which jobs may differ that are measured in turns."""
 
 Group = list[tuple[int, Job]]  # jobs that are measured together, each with its number among all
-
-W = TypeVar("W")
-R = TypeVar("R")
-
-
-@dataclass(frozen=True)
-class Launcher:
-    """Where work is done, as Hydra's `config` says; errors quote the `words` of the command."""
-
-    config: DictConfig
-    words: Sequence[str]
-
-    def run(self, work: Callable[[W], R], on: Sequence[W]) -> list[R]:
-        """The results of `work` on each of the things in `on`.
-
-        Raises what `work` raised first, once all is done; SteerbenchError if a setting of the
-        launcher is wrong.
-        """
-        if not on:
-            return []
-        with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-            loader = GlobalHydra.instance().config_loader()
-        config = self.config.copy()
-        own_folder(config)
-        ray = OmegaConf.select(config, "hydra.launcher.ray.init")
-        # Ray's launcher would ask for memory of its own, which a cluster at an address refuses.
-        if ray and ray.get("address"):
-            with open_dict(ray):
-                ray.setdefault("object_store_memory", None)
-        try:
-            launcher = Plugins.instance().instantiate_launcher(
-                hydra_context=HydraContext(config_loader=loader, callbacks=Callbacks()),
-                task_function=partial(_numbered, work, on),
-                config=config,
-            )
-        except InstantiationException as error:
-            raise explain(error, self.words) from error
-        jobs = launcher.launch([[] for _ in on], initial_job_idx=0)
-        results = [job.return_value for job in jobs]
-        for result in results:
-            if isinstance(result, Exception):
-                raise result
-        return results
-
-
-def launcher_of(words: Sequence[str], outputs: Path) -> Launcher:
-    """The launcher that `words` choose among those of a command (`hydra/launcher=joblib`), which
-    may name folders with further choices. Notes on the work go below `outputs`."""
-    words = [*words, setting("outputs", str(outputs))]
-    return Launcher(composed(words, return_hydra_config=True), words)
-
-
-def own_folder(config: DictConfig) -> None:
-    """Give the sweep a folder that no other has; it is below that in `config` and takes its place,
-    also in the configurations of the jobs."""
-    name = f"{datetime.now():%Y-%m-%d_%H-%M-%S}-{uuid.uuid4().hex[:6]}"
-    folder = Path(config.hydra.sweep.dir).resolve() / name
-    with flag_override(config, ["readonly", "struct"], False):
-        config.hydra.sweep.dir = str(folder)
-        config.hydra.overrides.hydra.append(setting("hydra.sweep.dir", str(folder)))
-
-
-def divided(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The settings of runs among `words`, and those of Hydra."""
-    of_hydra = [word for word in words if word.lstrip("+~").startswith(("hydra.", "hydra/"))]
-    return [word for word in words if word not in of_hydra], of_hydra
-
-
-def _numbered(work: Callable[[W], R], on: Sequence[W], config: Any) -> R | Exception:
-    """The task of a launcher's job: the job's number says what it works on. An exception is
-    returned, because Hydra would print it in its own way."""
-    set_up()
-    try:
-        return work(on[HydraConfig.get().job.num])
-    except Exception as error:
-        return picklable(error)
-
-
-def picklable(error: Exception) -> Exception:
-    """`error`, or only its message if another process could not read it."""
-    try:
-        pickle.loads(pickle.dumps(error))
-        return error
-    except Exception:
-        return SteerbenchError(f"{type(error).__name__}: {reason(error)}")
 
 
 @dataclass(frozen=True)
@@ -149,6 +63,86 @@ class Ended:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Ended, (self.run, self.measured, self.error and picklable(self.error))
+
+
+@dataclass(frozen=True)
+class Launcher:
+    """Where work is done, as Hydra's `config` says; errors quote the `words` of the command."""
+
+    config: DictConfig
+    words: Sequence[str]
+
+    def run(self, groups: Sequence[Group]) -> list[dict[str, Ended]]:
+        """How the jobs of each group ended, by their keys.
+
+        Raises what was raised first beside them, once all is done; SteerbenchError if a setting of
+        the launcher is wrong.
+        """
+        if not groups:
+            return []
+        with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+            loader = GlobalHydra.instance().config_loader()
+        config = self.config.copy()
+        own_folder(config)
+        ray = OmegaConf.select(config, "hydra.launcher.ray.init")
+        # Ray's launcher would ask for memory of its own, which a cluster at an address refuses.
+        if ray and ray.get("address"):
+            with open_dict(ray):
+                ray.setdefault("object_store_memory", None)
+        try:
+            launcher = Plugins.instance().instantiate_launcher(
+                hydra_context=HydraContext(config_loader=loader, callbacks=Callbacks()),
+                task_function=partial(_measured, groups, time.time()),
+                config=config,
+            )
+        except InstantiationException as error:
+            raise explain(error, self.words) from error
+        jobs = launcher.launch([[] for _ in groups], initial_job_idx=0)
+        results = [job.return_value for job in jobs]
+        for result in results:
+            if isinstance(result, Exception):
+                raise result
+        return results
+
+
+def own_folder(config: DictConfig) -> None:
+    """Give the sweep a folder that no other has; it is below that in `config` and takes its place,
+    also in the configurations of the jobs."""
+    name = f"{datetime.now():%Y-%m-%d_%H-%M-%S}-{uuid.uuid4().hex[:6]}"
+    folder = Path(config.hydra.sweep.dir).resolve() / name
+    with flag_override(config, ["readonly", "struct"], False):
+        config.hydra.sweep.dir = str(folder)
+        config.hydra.overrides.hydra.append(setting("hydra.sweep.dir", str(folder)))
+
+
+def divided(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The settings of runs among `words`, and those of Hydra."""
+    of_hydra = [word for word in words if word.lstrip("+~").startswith(("hydra.", "hydra/"))]
+    return [word for word in words if word not in of_hydra], of_hydra
+
+
+def _measured(
+    groups: Sequence[Group], begun: float, config: DictConfig
+) -> dict[str, Ended] | Exception:
+    """The task of a launcher's job, whose number says which of the `groups` it measures. An
+    exception is returned, because Hydra would print it in its own way."""
+    set_up()
+    hydra, total = HydraConfig.get(), sum(map(len, groups))
+    try:
+        for number, job in groups[hydra.job.num]:
+            note(f"{number + 1} of {total}, {job.name}")
+        return attempt(groups[hydra.job.num], total, Path(hydra.runtime.output_dir), begun)
+    except Exception as error:
+        return picklable(error)
+
+
+def picklable(error: Exception) -> Exception:
+    """`error`, or only its message if another process could not read it."""
+    try:
+        pickle.loads(pickle.dumps(error))
+        return error
+    except Exception:
+        return SteerbenchError(f"{type(error).__name__}: {reason(error)}")
 
 
 def attempt(group: Group, total: int, folder: Path, begun: float) -> dict[str, Ended]:
@@ -175,7 +169,7 @@ def attempt(group: Group, total: int, folder: Path, begun: float) -> dict[str, E
             cause = error.__cause__ if alone and isinstance(error.__cause__, Exception) else error
             failed = [each for each in left if alone is None or each[1] is alone]
             for number, job in failed:
-                print(f"steerbench: failed: {job.name}: {cause}", file=sys.stderr)
+                note(f"steerbench: failed: {job.name}: {cause}")
                 ended[job.key] = Ended(error=cause)
                 _count(folder, number)
             left = [each for each in left if each not in failed]
@@ -186,7 +180,7 @@ def say(job: Job, run: str, more: str = "") -> None:
     """Print the figures of a job's run in one line, and `more` after them."""
     (loaded,) = load_runs(job.store, [run])
     psnr, ms = decimal(loaded.values.get("psnr"), 2), decimal(loaded.values["frame_ms"], 1)
-    print(f"{job.name}: {psnr} dB, {ms} ms a frame{more}", file=sys.stderr)
+    note(f"{job.name}: {psnr} dB, {ms} ms a frame{more}")
 
 
 def _count(folder: Path, number: int, measured: bool = False) -> None:
@@ -213,24 +207,28 @@ def run_jobs(jobs: Sequence[Job], launcher: Launcher) -> list[Ended]:
     for job in jobs:  # of a folder, a key has the last part
         if (one := scene_folder(first[job.key].config)) != (other := scene_folder(job.config)):
             raise SteerbenchError(f"scene.path: {one}, {other}: expected folders with other names")
-    distinct = [job for job in jobs if first[job.key] is job]
-    scenes, seeds = ([job.settings[name] for job in distinct] for name in ("scene", "seed"))
-
-    def place(job: Job) -> tuple[int, int]:
-        return scenes.index(job.settings["scene"]), seeds.index(job.settings["seed"])
-
-    distinct.sort(key=place)
+    distinct = (job for job in jobs if first[job.key] is job)
+    of_scenes = [
+        list(chain(*grouped(of_scene, lambda job: job.settings["seed"]).values()))
+        for of_scene in grouped(distinct, lambda job: str(job.settings["scene"])).values()
+    ]
     in_process = launcher.config.hydra.runtime.choices["hydra/launcher"] == "basic"
     ahead, ended = in_process and room(jobs) > 1, dict[str, Ended]()
-    of_scenes = [list(some) for _, some in groupby(distinct, lambda job: place(job)[0])]
-    for some in of_scenes if ahead else [distinct]:
+    for some in of_scenes if ahead else [[*chain(*of_scenes)]]:
         groups, found = _groups(some, look_up=ahead)
         if ahead:
             train_ahead(some, found)
-        work = partial(_attempted, total=sum(map(len, groups)), begun=time.time())
-        for of_group in (found, *launcher.run(work, groups)):
+        for of_group in (found, *launcher.run(groups)):
             ended |= of_group
     return [ended[job.key] for job in jobs]
+
+
+def run_all(jobs: Sequence[Job], words: Sequence[str]) -> list[Ended]:
+    """Run the jobs, see `run_jobs`, with the launcher that `words` of a command choose
+    (`hydra/launcher=joblib`). Notes on the work go below the outputs of the jobs."""
+    place = setting("outputs", str(jobs[0].outputs))
+    words = [*folder_words(words), *divided(words)[1], place]
+    return run_jobs(jobs, Launcher(composed(words, return_hydra_config=True), words))
 
 
 def _groups(jobs: Sequence[Job], look_up: bool) -> tuple[list[Group], dict[str, Ended]]:
@@ -239,14 +237,14 @@ def _groups(jobs: Sequence[Job], look_up: bool) -> tuple[list[Group], dict[str, 
 
     With `look_up`, without those that the store has, which are returned as ended.
     """
-    together: dict[tuple[str, str], list[Job]] = {}
-    for job in jobs:
+
+    def together(job: Job) -> tuple[str, str]:
         shared = {name: of for name, of in job.settings.items() if name not in OF_METHOD}
-        with_others = content_key(shared) if job.turns else job.key
-        together.setdefault((job.turns, with_others), []).append(job)
+        return job.turns, content_key(shared) if job.turns else job.key
+
     groups: list[Group] = []
     ended: dict[str, Ended] = {}
-    for of_group in together.values():
+    for of_group in grouped(jobs, together).values():
         found: dict[str, Job] = {}
         with suppress(SteerbenchError):  # a job that cannot start says so when it is measured
             found = stored(of_group) if look_up else {}
@@ -256,12 +254,6 @@ def _groups(jobs: Sequence[Job], look_up: bool) -> tuple[list[Group], dict[str, 
         if left := [job for job in of_group if job.key not in ended]:
             groups.append(list(enumerate(left, sum(map(len, groups)))))
     return groups, ended
-
-
-def _attempted(group: Group, total: int, begun: float) -> dict[str, Ended]:
-    for number, job in group:
-        print(f"{number + 1} of {total}, {job.name}", file=sys.stderr)
-    return attempt(group, total, Path(HydraConfig.get().runtime.output_dir), begun)
 
 
 def train_ahead(jobs: Sequence[Job], measured: Collection[str]) -> None:
@@ -287,7 +279,7 @@ def train_ahead(jobs: Sequence[Job], measured: Collection[str]) -> None:
             left = time_left(time.monotonic() - begun, number, len(todo) - number)
             error = ended.exception()
             how = f"failed: {reason(error)}" if error else f"trained in {ended.result():.0f} s"
-            print(f"{how}: {names[ended]}{left}", file=sys.stderr)
+            note(f"{how}: {names[ended]}{left}")
 
 
 def room(jobs: Sequence[Job]) -> int:

@@ -5,7 +5,7 @@ from typing import Any
 
 from bench.errors import SteerbenchError, unknown
 from bench.study import Axis
-from sweeps.overrides import choices, loaded, swept
+from sweeps.overrides import choices, loaded, taken
 
 SEED = "seed"  # in a grid, it makes no lines: they are means over their seeds
 
@@ -23,8 +23,8 @@ def experiment(name: str, words: Sequence[str] = ()) -> Any:
 def grid(declared: Any) -> dict[str, list[str]]:
     """The settings that an experiment varies, each with its values, by what its file holds."""
     params = declared.get("hydra", {}).get("sweeper", {}).get("params") or {}
-    several = swept([f"{name}={values}" for name, values in params.items()])
-    return {name: several.get(name, [str(values)]) for name, values in params.items()}
+    words = [f"{name}={values}" for name, values in params.items()]
+    return {name: taken(words, name)[1] for name in params}
 
 
 def axes(method: str) -> dict[str, Axis]:

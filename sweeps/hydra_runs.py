@@ -17,7 +17,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, flag_override
 
 from bench.errors import unexpected
-from sweeps.overrides import CONFIGS, as_typed, explain, further, hint, of_hydra, settled, swept
+from sweeps.overrides import CONFIGS, as_typed, explain, further, hint, of_hydra, settled, taken
 
 if TYPE_CHECKING:  # these load torch, which --help and completion do not need
     from sweeps.execute import Ended
@@ -53,8 +53,9 @@ def run_hydra(
     sweep, how each ended, and all errors. SteerbenchError if the sweep has several stores.
     """
     argv = as_typed(argv)
-    if several := swept([word for word in argv if word.startswith("outputs=")]):
-        got = ", ".join(several["outputs"]) + hint(f"outputs={','.join(several['outputs'])}")
+    _, folders = taken(argv, "outputs")
+    if len(folders) > 1:
+        got = ", ".join(folders) + hint(f"outputs={','.join(folders)}")
         raise unexpected("outputs", "one folder, for the table of all jobs", got)
     # Hydra's parser accepts overrides only in one contiguous block, so flags go first.
     flags = [word for word in argv if word.startswith("-") or not re.search("^~|=", word)]

@@ -8,7 +8,7 @@ import pkgutil
 import re
 import shlex
 import traceback
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from importlib import metadata, util
@@ -84,12 +84,22 @@ def settled(config: DictConfig, folders: Sequence[Path]) -> DictConfig:
     return config
 
 
-def changed(config: DictConfig, words: Sequence[str]) -> DictConfig:
-    """A copy of `config` with values changed as Hydra would; faster than composing it again."""
-    copy = config.copy()
-    for override in OverridesParser.create().parse_overrides(list(words)):
-        OmegaConf.update(copy, override.get_key_element(), override.value())
-    return copy
+def variants(words: Sequence[str]) -> Callable[[Sequence[str]], DictConfig]:
+    """A function that makes the configuration of `words` with further settings.
+
+    Each set of choices is composed once; values are set afterwards as Hydra would, which is faster.
+    """
+    with_choices = cache(lambda *chosen: composed([*words, *chosen]))
+
+    def varied(settings: Sequence[str]) -> DictConfig:
+        chosen = [x for x in settings if x[0] == "+" or choices(x.partition("=")[0], words)]
+        values = [word for word in settings if word not in chosen]
+        config = with_choices(*chosen).copy()
+        for override in OverridesParser.create().parse_overrides(values):
+            OmegaConf.update(config, override.get_key_element(), override.value())
+        return config
+
+    return varied
 
 
 def swept(words: Sequence[str]) -> dict[str, list[str]]:
@@ -109,6 +119,16 @@ def swept(words: Sequence[str]) -> dict[str, list[str]]:
         for name, override in last.items()
         if override.is_discrete_sweep()
     }
+
+
+def taken(words: Sequence[str], name: str) -> tuple[list[str], list[str]]:
+    """The words without those that set `name`, and the different values that they give it."""
+    named = [word for word in words if word.lstrip("+").partition("=")[0] == name]
+    others = [word for word in words if word not in named]
+    values = swept(named).get(name)
+    if values is None:  # a single one, if any
+        values = [word.partition("=")[2] for word in named[-1:]]
+    return others, list(dict.fromkeys(values))
 
 
 def setting(name: str, text: str) -> str:
@@ -190,9 +210,9 @@ def explain(error: Exception, words: Sequence[str]) -> SteerbenchError:
         group, _, name = word.lstrip("+").partition("=")
         if file := choices(group, words).get(name):
             loaded(file)
-    causes = [error, error.__cause__] if error.__cause__ else [error]
+    causes = filter(None, (error, error.__cause__))
     lines = [line.strip() for cause in causes for line in str(cause).splitlines()]
-    return SteerbenchError("; ".join(line for line in lines if line))
+    return SteerbenchError("; ".join(filter(None, lines)))
 
 
 def hint(word: str) -> str:
@@ -297,14 +317,12 @@ def further(words: Sequence[str]) -> list[Path]:
     return [*_typed(words), *(x for x in plug_ins().values() if isinstance(x, Path))]
 
 
-def _typed(words: Sequence[str]) -> list[Path]:
+def _typed(words: Sequence[str]) -> Iterator[Path]:
     """The folders named in `words` by `--config-dir=DIR` or by its form in two words."""
-    folders = []
     for word, after in pairwise([*words, ""]):
         name, equals, value = word.partition("=")
         if name in FLAGS:
-            folders.append(Path(value if equals else after).resolve())
-    return folders
+            yield Path(value if equals else after).resolve()
 
 
 @cache

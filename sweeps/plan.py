@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from itertools import product
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from sweeps import experiments
 from sweeps.configured import build
 from sweeps.data_sets import DataSet, data_set_of
 from sweeps.measurement import Job, turns_of
-from sweeps.overrides import changed, choices, composed, setting, swept, target_of, unquoted
+from sweeps.overrides import composed, setting, swept, taken, target_of, unquoted, variants
 from sweeps.processes import on_gpu
 
 
@@ -46,11 +45,11 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
     all lines. SteerbenchError if a word gives several values to another setting than these two.
     """
     scenes = scenes_of(words, data)
-    words, seeds = _taken(words, experiments.SEED)
+    words, seeds = taken(words, experiments.SEED)
     declared = experiments.grid(experiments.experiment(table.name, words))
     seeds = seeds or declared.get(experiments.SEED, [])
     single = data is None and len(scenes) == 1
-    words = words if single else _taken(words, "scene")[0]
+    words = words if single else taken(words, "scene")[0]
     fixed = [f"+experiment={table.name}", *words, *([f"scene={data.layout}"] if data else [])]
     first = [] if single or data else [f"scene={scenes[0]}"]
     experiment = composed([*fixed, *first])
@@ -63,31 +62,24 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
     usual = [str(seed) for seed in range(several)]
     precisions = target_of(experiment.engine).precisions
 
-    @cache  # values are set afterwards without composing again
-    def with_choices(*groups: str) -> DictConfig:
-        return composed([*fixed, *groups])
-
+    varied = variants(fixed)
     jobs = []
     lines = ((x, key, line) for x, of in table.blocks.items() for key, line in of.items())
     for data_set, key, line in lines:
         if "precision" in line.job and line.job["precision"] not in precisions:
             continue
         settings = [f"{name}={of}" for name, of in line.job.items() if name not in asked]
-        groups = [word for word in settings if choices(word.partition("=")[0], fixed)]
-        values = [word for word in settings if word not in groups]
         repeated = line.every_seed or METHOD not in line.job
         of_line = seeds or (usual if repeated else usual[:1])
         of_block = [name for name in scenes if data_set in (data_set_of(name), "")]
         for seed, name in product(of_line, of_block):
             scene = "" if single else name
-            of_scene = [] if single or data else [f"scene={name}"]
-            config = changed(with_choices(*groups, *of_scene), [*values, f"seed={seed}"])
+            of_scene = [] if single else [f"scene={name}"]
             if data:
-                folder = str(data.scenes[name])
-                config.scene.path = folder
-                of_scene = [setting("scene.path", folder)]
-            OmegaConf.resolve(config)  # once, or each build would resolve `${...}` again
+                of_scene = [setting("scene.path", str(data.scenes[name]))]
             own = [*settings, *of_scene, f"seed={seed}"]
+            config = varied(own)
+            OmegaConf.resolve(config)  # once, or each build would resolve `${...}` again
             command = ["steerbench", "run", *fixed, *own, "hydra.mode=RUN"]
             parts = (f"{table.name}: {line.label}", scene, f"seed {config.seed}")
             told = ", ".join(filter(None, parts))
@@ -113,22 +105,15 @@ def _engine_here(experiment: DictConfig) -> list[str]:
 
 
 def scenes_of(words: Sequence[str], data: DataSet | None = None) -> list[str]:
-    """The names of the scenes in `data` or in `words`; of a folder, its last part."""
-    if data:
-        return list(data.scenes)
-    _, folders = _taken(words, "scene.path")
-    return [Path(unquoted(folders[-1])).name] if folders else _taken(words, "scene")[1] or [""]
+    """The names of the scenes in `data` or in `words`; of a folder, its last part.
 
-
-def _taken(words: Sequence[str], name: str) -> tuple[list[str], list[str]]:
-    """The words without those that set `name`, and the values that they give it.
-
-    SteerbenchError if one gives several values to another setting than scene and seed.
+    SteerbenchError if a word gives several values to another setting than scene and seed.
     """
     several = swept(words)
-    if others := sorted(several.keys() - {"scene", "seed"}):
+    if others := sorted(several.keys() - {"scene", experiments.SEED}):
         got = f"{', '.join(several[others[0]])}; only scene and seed may take several here"
         raise unexpected(others[0], "one value", got)
-    named = [word for word in words if word.lstrip("+").partition("=")[0] == name]
-    values = several.get(name) or [word.partition("=")[2] for word in named[-1:]]
-    return [word for word in words if word not in named], list(dict.fromkeys(values))
+    if data:
+        return list(data.scenes)
+    _, folders = taken(words, "scene.path")
+    return [Path(unquoted(folders[-1])).name] if folders else taken(words, "scene")[1] or [""]

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from itertools import chain
 from typing import Any
 
@@ -18,12 +18,12 @@ from sweeps.measurement import Job
 from sweeps.overrides import (
     CONFIGS,
     beside,
-    changed,
     composed,
     engine_kinds,
     folder_words,
-    swept,
+    taken,
     target_of,
+    variants,
 )
 
 AS_IT_IS = Variant("as it is")  # the settings as typed
@@ -62,6 +62,11 @@ class Subject:
         return study_of(target)
 
     @property
+    def off(self) -> dict[str, str]:
+        """By what is skipped, the word that switches this skipping off."""
+        return {name: f"{setting}=false" for name, setting in self.study.skips.items()}
+
+    @property
     def engine(self) -> str:
         return str(self.config.hydra.runtime.choices.engine)
 
@@ -74,16 +79,6 @@ class Subject:
             ]
             for engine, kind in engine_kinds(self.words).items()
         }
-
-    def varied(self, settings: Sequence[str]) -> DictConfig:
-        """The configuration with further settings; values are set without composing it again."""
-        plain = [word for word in settings if not word.startswith(("+", "engine="))]
-        return changed(self._with(*(word for word in settings if word not in plain)), plain)
-
-    @cached_property
-    def _with(self) -> Callable[..., DictConfig]:
-        """The configuration with further choices; each is composed once."""
-        return cache(lambda *words: composed([*self.words, *words]))
 
     def axes(self) -> dict[str, Axis]:
         """What tables vary of the method, and what it declares itself."""
@@ -105,8 +100,7 @@ def accuracy(subject: Subject, only: Sequence[str], trained: bool) -> Iterator[S
     knobs: dict[str, Sequence[Variant]] = {**study.knobs, **({"engine": others} if others else {})}
     if trained:
         for name, axis in subject.axes().items():
-            values = [Variant(axis.label.format(x), (f"{axis.setting}={x}",)) for x in axis.values]
-            knobs[f"{name}, trained"] = values
+            knobs[f"{name}, trained"] = [variant for _, variant in _points(axis)]
         knobs |= study.trained
     for knob in chosen(knobs, only, "knob") or [AS_IT_IS.name]:
         yield from subject.lines(knob, [*first, *knobs.get(knob, ())])
@@ -122,13 +116,10 @@ def parity(subject: Subject) -> Iterator[StudyLine]:
 
 def skips(subject: Subject) -> Iterator[StudyLine]:
     """All skips, further savings on top, all skips but each one, nothing skipped."""
-    study = subject.study
-    off = {name: f"{setting}=false" for name, setting in study.skips.items()}
-    each = [Variant(f"all but {name}", (word,)) for name, word in off.items()]
-    ends = Variant("all"), Variant(NOTHING, tuple(off.values()))
-    yield from subject.lines(
-        "skips", [ends[0], *study.savings, *(each if len(off) > 1 else ()), ends[1]]
-    )
+    off = subject.off
+    each = [Variant(f"all but {name}", (word,)) for name, word in off.items() if len(off) > 1]
+    nothing = Variant(NOTHING, tuple(off.values()))
+    yield from subject.lines("skips", [Variant("all"), *subject.study.savings, *each, nothing])
 
 
 def breakdown(subject: Subject) -> Iterator[StudyLine]:
@@ -137,40 +128,44 @@ def breakdown(subject: Subject) -> Iterator[StudyLine]:
     if subject.has_engine:
         own = subject.engines().get(subject.engine, ())
         variants = [Variant(f"{subject.name}, {each.name}", each.settings) for each in own]
-    off = tuple(f"{setting}=false" for setting in subject.study.skips.values())
-    if off:
+    if off := subject.off.values():
         variants += [Variant(f"{x.name}, {NOTHING} skipped", (*x.settings, *off)) for x in variants]
     yield from subject.lines("parts", variants)
 
 
 def scaling(subject: Subject, only: Sequence[str]) -> Iterator[StudyLine]:
     """Frame sizes, numbers of threads and the axes of the method, each measured alone."""
-    axes = subject.axes()
-    wanted = chosen(("pixels", "threads", *axes), only, "axis")
     config = subject.config
+    most = config.budget.threads or torch.get_num_threads()
+    counts = Axis("{} threads", "threads", tuple(range(1, most + 1)))
+    points: dict[str, list[tuple[float, Variant]]] = {
+        "pixels": [(w * h, Variant(f"{w} x {h}", (f"frame_size=[{w},{h}]",))) for w, h in SIZES],
+        "threads": _points(counts),
+        **{name: _points(axis) for name, axis in subject.axes().items()},
+    }
+    wanted = chosen(points, only, "axis")
     if "threads" in wanted and subject.has_engine and subject.engine != "torch":
-        others = ", ".join(("pixels", *axes))
+        others = ", ".join(name for name in points if name != "threads")
         raise SteerbenchError(
             "threads: expected engine=torch, whose threads can be chosen afterwards; for another "
             f"engine choose from {others} with --only"
         )
     # A 2D renderer costs the same however long it was trained; its own steps would win.
     short = ("method.steps=null",) if config.method.get("steps") else ()
-    most = config.budget.threads or torch.get_num_threads()
     for name in wanted:
-        points: list[tuple[float, str, tuple[str, ...]]] = []
-        if name == "pixels":
-            points = [(w * h, f"{w} x {h}", (f"frame_size=[{w},{h}]",)) for w, h in SIZES]
-        elif name == "threads":  # of the frames; all have the same training
-            trained = f"budget.threads={most}"
-            counts = range(1, most + 1)
-            points = [(n, f"{n} threads", (f"threads={n}", trained)) for n in counts]
-        else:
-            axis = axes[name]
-            words_of = {value: (f"{axis.setting}={value}",) for value in axis.values}
-            points = [(axis.size(x), axis.label.format(x), of) for x, of in words_of.items()]
-        for value, label, words in points:
-            yield StudyLine(subject.name, name, label, (*short, *words), value)
+        # The threads are those of the frames; all have the same training.
+        trained = (f"budget.threads={most}",) if name == "threads" else ()
+        for value, each in points[name]:
+            settings = (*short, *each.settings, *trained)
+            yield StudyLine(subject.name, name, each.name, settings, value)
+
+
+def _points(axis: Axis) -> list[tuple[float, Variant]]:
+    """A variant for each value of an axis, beside the size of the value."""
+    return [
+        (axis.size(value), Variant(axis.label.format(value), (f"{axis.setting}={value}",)))
+        for value in axis.values
+    ]
 
 
 def chosen(names: Sequence[str] | Mapping[str, Any], parts: Sequence[str], kind: str) -> list[str]:
@@ -193,12 +188,10 @@ def subjects(study: str, words: Sequence[str]) -> list[Subject]:
     With several, what the words set of a method is left out for one that lacks it. SteerbenchError
     if one of them has nothing that the study could vary; of the usual ones, it is left out.
     """
-    typed = [word for word in words if word.partition("=")[0] == "method"]
+    others, typed = taken(words, "method")
     folders = folder_words(words)
-    others = (word for word in words if word not in (*typed, *folders))
-    rest = [*folders, f"+experiment={study}", *others]
-    usual = OmegaConf.load(CONFIGS / "experiment" / f"{study}.yaml").study.methods
-    names = swept(words).get("method") or [word.partition("=")[2] for word in typed[-1:]] or usual
+    rest = [*folders, f"+experiment={study}", *(word for word in others if word not in folders)]
+    names = typed or OmegaConf.load(CONFIGS / "experiment" / f"{study}.yaml").study.methods
     alone = len(names) == 1
     found = [
         Subject(name, [*rest, f"method={name}"] if alone else beside(name, rest)) for name in names
@@ -232,16 +225,15 @@ class StudyJob(Job):
     line: StudyLine
 
 
-def jobs_of(study: str, found: Sequence[Subject], options: Mapping[str, Any]) -> list[StudyJob]:
+def jobs_of(study: str, found: Sequence[Subject], options: Mapping[str, Any]) -> Iterator[StudyJob]:
     """The jobs of all lines; those of a group in turns, if the study compares times."""
-    jobs = []
     for subject in found:
+        varied = variants(subject.words)
         for line in LINES[study](subject, **options):
             words = [*subject.words, *line.settings]
-            config = subject.varied(line.settings)
+            config = varied(line.settings)
             whose = [] if study == "breakdown" else [subject.name]  # all methods in turns
             turns = "" if study == "scaling" else ", ".join((study, *whose, line.group))
             name = f"{study}: {subject.name}, {line.group}: {line.label}"
             command = ["steerbench", "run", *words]
-            jobs.append(StudyJob(config, command, name, turns, line=line))
-    return jobs
+            yield StudyJob(config, command, name, turns, line=line)

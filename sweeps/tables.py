@@ -41,13 +41,13 @@ def chosen(
         every = [_table(*each, data_sets) for each in found.items() if "table" in each[1]]
         tables = [table for table in every if table.number is not None]
         tables.sort(key=lambda table: table.number or 0)
-    compared = [any(METHOD in line.job for line in table.lines.values()) for table in tables]
-    if methods and not any(compared):
+    compared = [x for x in tables if any(METHOD in line.job for line in x.lines.values())]
+    if methods and not compared:
         raise SteerbenchError(f"--beside: {name} compares no methods; table1 does")
     further = {f"with {x}": Line(x, {METHOD: x}, added=True) for x in methods}
     return [
-        replace(table, lines={**table.lines, **further}) if compares else table
-        for table, compares in zip(tables, compared, strict=True)
+        replace(table, lines={**table.lines, **further}) if table in compared else table
+        for table in tables
     ]
 
 

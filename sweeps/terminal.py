@@ -63,6 +63,11 @@ def say(line: str) -> None:
     console().print(line, markup=False, soft_wrap=True)
 
 
+def note(line: str) -> None:
+    """Print a line that is no result."""
+    print(line, file=sys.stderr)
+
+
 def say_missing(runs: Sequence[Run]) -> None:
     from reports.runs import missing_figures  # loads torch
 
@@ -80,7 +85,7 @@ def write_page(
     if report and keys:
         from reports import page  # loads matplotlib, which only a page needs
 
-        print(f"report: {page.write_page(store, keys, Path(report), failed)}", file=sys.stderr)
+        note(f"report: {page.write_page(store, keys, Path(report), failed)}")
 
 
 def print_rows(rows: Any) -> None:

@@ -12,7 +12,7 @@ import re
 import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -68,30 +68,34 @@ def publish(parts: Sequence[Part], folder: Path, runs: Sequence[Run] = ()) -> Pa
 
 def markdown(parts: Sequence[Part], folder: Path) -> str:
     """`parts` in GitHub's Markdown; writes their pictures below `folder`."""
-    texts: list[str] = []
-    for part in parts:
-        match part:
-            case Table():
-                texts.append(part.markdown())
-            case ComparedFrame():
-                texts += [_shown(picture, folder) for picture in still_images(part)]
-            case Picture():
-                texts.append(_shown(part, folder))
-            case _:
-                texts.append(part)
+    still = (
+        still_images(part) if isinstance(part, ComparedFrame) else [part]  # each image is a part
+        for part in parts
+    )
+    texts = [_markdown(part, folder) for part in chain(*still)]
     return "\n\n".join(texts)
 
 
-def _shown(picture: Picture, folder: Path) -> str:
-    """Draw `picture` into `folder`, named after its content; return the Markdown that shows it."""
-    with tempfile.TemporaryDirectory() as place, matplotlib.rc_context({"text.parse_math": False}):
-        picture.draw(drawn := Path(place) / f"{picture.stem}.png")
-        content = drawn.read_bytes()
-    name = f"pictures/{picture.stem}-{hashlib.sha256(content).hexdigest()[:12]}.png"
+def _markdown(part: str | Table | Picture, folder: Path) -> str:
+    """A part in Markdown; a picture is drawn into `folder`, and named after its content."""
+    if isinstance(part, str):
+        return part
+    if isinstance(part, Table):
+        return part.markdown()
+    content = _drawn(part, "png")
+    name = f"pictures/{part.stem}-{hashlib.sha256(content).hexdigest()[:12]}.png"
     (folder / "pictures").mkdir(exist_ok=True)
     with whole(folder / name) as new:
         new.write_bytes(content)
-    return f"![{picture.shows}]({name})"
+    return f"![{part.shows}]({name})"
+
+
+def _drawn(picture: Picture, form: str) -> bytes:
+    """The content of `picture` as a file of the `form` "png" or "svg"."""
+    style: Any = {"svg.fonttype": "none", "svg.hashsalt": picture.stem, "text.parse_math": False}
+    with tempfile.TemporaryDirectory() as place, matplotlib.rc_context(style):
+        picture.draw(drawn := Path(place) / f"picture.{form}")
+        return drawn.read_bytes()
 
 
 def html_page(parts: Sequence[Part], runs: Sequence[Run]) -> str:
@@ -146,10 +150,7 @@ def _html(part: Part, origins: dict[str, dict[str, str]], headings: dict[str, st
 
 def _svg(plot: Picture) -> str:
     """`plot` as SVG; its marks can be focused and have descriptions."""
-    style: Any = {"svg.fonttype": "none", "svg.hashsalt": plot.stem, "text.parse_math": False}
-    with tempfile.TemporaryDirectory() as place, matplotlib.rc_context(style):
-        plot.draw(drawn := Path(place) / "plot.svg")
-        content = drawn.read_text(encoding="utf-8")
+    content = _drawn(plot, "svg").decode()
     root = ElementTree.fromstring(content)
     used = set(re.findall(r"#([\w-]+)", content))
     for element in root.iter():
@@ -176,14 +177,9 @@ def _frame(frame: ComparedFrame) -> str:
     height, width = frame.truth.shape[:2]
     left, top, right, bottom = frame.box
     box = (left / width, top / height, (right - left) / width, (bottom - top) / height)
-    views = [{"titles": ("ground truth",), "rendering": _uri(frame.truth)}]
-    views += [
-        {"titles": view.titles, "rendering": _uri(view.rendering), "error": _uri(view.error)}
-        for view in frame.views
-    ]
     return TEMPLATES.get_template("frame.html").render(
         frame=frame,
-        views=views,
+        views=[{"titles": ("ground truth",), "rendering": frame.truth}, *frame.views],
         width=width,
         height=height,
         box=" ".join(f"{edge:.4f}" for edge in box),
@@ -200,3 +196,6 @@ def _uri(picture: np.ndarray) -> str:
     how: dict[str, Any] = {"quality": LOSSY_QUALITY} if large else quick
     Image.fromarray(picture).save(content, "webp", **how)
     return f"data:image/webp;base64,{base64.b64encode(content.getvalue()).decode()}"
+
+
+TEMPLATES.filters["uri"] = _uri

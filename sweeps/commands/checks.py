@@ -58,7 +58,7 @@ def _kernels(options: argparse.Namespace, log: ConsoleLog) -> int:
         if device == "cuda" and "gpu" in compiled(device):
             tried_again("cuda:0", log)
         rows = timed_rows(cases, device, compiled(device), options.repeats, log)
-    show(Table("Kernels", KERNELS, tuple(map(_of_kernel, _saving_most_first(rows)))))
+    show(Table("Kernels", KERNELS, list(map(_of_kernel, _saving_most_first(rows)))))
     print_rows(rows)
     return int(any(row["status"] != "ok" for row in rows))
 
@@ -101,8 +101,8 @@ def _stress(options: argparse.Namespace, log: ConsoleLog) -> int:
     of_cases = groupby(rows, key=lambda row: (row["subject"], row["case"]))
     worst = (max(cells, key=_nearness) for _, cells in of_cases)
     nearest = sorted(worst, key=_nearness, reverse=True)[:NEAREST]
-    show(Table(title, STRESS, tuple(map(_of_case, rows))))
-    show(Table("Nearest to their tolerances", STRESS, tuple(map(_of_case, nearest))))
+    show(Table(title, STRESS, list(map(_of_case, rows))))
+    show(Table("Nearest to their tolerances", STRESS, list(map(_of_case, nearest))))
     print_rows(rows)
     return int(wrong > 0)
 
@@ -127,7 +127,7 @@ def _experiments(options: argparse.Namespace, log: ConsoleLog) -> int:
         rows = experiment_rows(checks.found("experiments"), options.repeats, log)
     title = "Run time against error, where the exact answer is known"
     experiments = groupby(rows, key=lambda row: row["subject"])
-    show(Table(title, EXPERIMENTS, tuple(_of_experiment(*some) for _, some in experiments)))
+    show(Table(title, EXPERIMENTS, [_of_experiment(*some) for _, some in experiments]))
     print_rows(rows)
     return 0
 

@@ -15,6 +15,7 @@ from methods import checks
 from methods.kernels.compilation import wrong_of
 from sweeps.overrides import composed, target_of
 from sweeps.processes import processes
+from sweeps.terminal import note
 
 
 def main(options: argparse.Namespace) -> int:
@@ -29,7 +30,7 @@ def main(options: argparse.Namespace) -> int:
             wrong += ended.result()
             bar.advance()
     for case in sorted(wrong):
-        print(f"wrong on this machine: {case}; see `steerbench kernels`", file=sys.stderr)
+        note(f"wrong on this machine: {case}; see `steerbench kernels`")
     return int(bool(wrong))
 
 

@@ -44,7 +44,7 @@ def main(options: argparse.Namespace) -> int:
 
 def _show(title: str, columns: tuple[str, str], lines: Sequence[tuple[str, str]]) -> None:
     if lines:
-        show(Table(title, columns, tuple(lines)))
+        show(Table(title, columns, lines))
 
 
 def _brings(folder: Path | str, words: Sequence[str]) -> str:

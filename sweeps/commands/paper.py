@@ -3,10 +3,8 @@ them; `steerbench report` writes the same page from the store alone."""
 
 import argparse
 import re
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 from bench.errors import SteerbenchError
@@ -14,13 +12,14 @@ from bench.results import Store, existing_store
 from reports import export
 from reports.paper_page import write_paper_page
 from reports.paper_tables import Place
-from reports.runs import Repeated, Run, over_common_frames, over_scenes
+from reports.runs import Repeated, Run, grouped, over_common_frames, over_scenes
 from sweeps.data_sets import DataSet, data_sets, find
-from sweeps.execute import Ended, divided, launcher_of, run_jobs
+from sweeps.execute import divided, run_all
 from sweeps.measurement import of_scene
 from sweeps.overrides import unquoted
 from sweeps.plan import Planned, plan, scenes_of
 from sweeps.tables import chosen
+from sweeps.terminal import note
 from sweeps.versions import by_job
 
 DATA = "data="  # prefix of the word that names the folder of a data set
@@ -31,27 +30,25 @@ def main(options: argparse.Namespace) -> int:
 
     Returns 1 if a job failed that can run here.
     """
-    settings, of_hydra = divided(options.overrides)
+    settings, _ = divided(options.overrides)
     words, data = data_set(settings)
     missing = data.missing if data else {}
     for name, why in missing.items():
-        print(f"missing: {name}: {why}", file=sys.stderr)
+        note(f"missing: {name}: {why}")
     shown = data_sets(scenes_of(words, data))
     one = getattr(options, "table", None)
     tables = chosen(one, words, options.beside, shown)
     jobs = [job for table in tables for job in plan(table, words, data)]
-    outputs = Path(jobs[0].config.outputs)
-    ended: list[Ended] = []
-    if options.command != "report":
-        ended = run_jobs(jobs, launcher_of([*options.config_dir, *of_hydra], outputs))
+    outputs = jobs[0].outputs
+    ended = [] if options.command == "report" else run_all(jobs, options.overrides)
     store = existing_store(outputs) if options.command == "report" else Store(outputs)
-    runs = by_job(store, lambda line: print(line, file=sys.stderr))
+    runs = by_job(store, note)
     folder = options.report or outputs / (one or "paper")
     measured = gather(jobs, runs)
     page = write_paper_page(tables, measured, folder, missing)
     if options.format or options.command == "table":
         print(export.exported_tables(tables, measured, options.format or "markdown"), end="")
-    print(f"report: {page}", file=sys.stderr)
+    note(f"report: {page}")
     return int(any(each.failed for each in ended))
 
 
@@ -83,11 +80,9 @@ def gather(jobs: Sequence[Planned], runs: Mapping[str, Sequence[Run]]) -> dict[P
     With several scenes, a run of a line is the mean of one seed over the scenes that all lines of
     the block have. Lines without any measurement are ignored for this. `runs` are from `by_job`.
     """
-    blocks: dict[tuple[str, str], dict[Place, list[Outcome]]] = {}
-    for job in jobs:
-        of_block = blocks.setdefault(job.place[:2], {})
-        of_block.setdefault(job.place, []).append(_outcome(job, runs.get(job.key, ())))
-    return {place: line for block in blocks.values() for place, line in _lines(block).items()}
+    outcomes = [_outcome(job, runs.get(job.key, ())) for job in jobs]
+    blocks = grouped(outcomes, lambda each: each.job.place[:2]).values()
+    return {place: line for block in blocks for place, line in _lines(block).items()}
 
 
 def _outcome(job: Planned, runs: Sequence[Run]) -> Outcome:
@@ -101,29 +96,34 @@ def _outcome(job: Planned, runs: Sequence[Run]) -> Outcome:
     return Outcome(job, None, "not measured yet")
 
 
-def _lines(of_block: Mapping[Place, Sequence[Outcome]]) -> dict[Place, Repeated]:
-    every = [each for line in of_block.values() for each in line]
-    runs = iter(over_common_frames([each.run for each in every if each.run]))
-    lines = {
-        place: [each._replace(run=next(runs)) if each.run else each for each in line]
-        for place, line in of_block.items()
-    }
+def _lines(of_block: Sequence[Outcome]) -> dict[Place, Repeated]:
+    runs = [each.run for each in of_block if each.run]
+    comparable = iter(over_common_frames(runs))
+    outcomes = [
+        each._replace(run=next(comparable)) if each.run else each  # over the same frames
+        for each in of_block
+    ]
+    lines = grouped(outcomes, lambda each: each.job.place)
     measured = [{each.job.scene for each in line if each.run} for line in lines.values()]
     common = set.intersection(*filter(None, measured)) if any(measured) else set()
-    return {place: _line(outcomes, common) for place, outcomes in lines.items()}
+    return {place: _line(of_line, common) for place, of_line in lines.items()}
 
 
 def _line(outcomes: Sequence[Outcome], common: set[str]) -> Repeated:
     """A line whose runs are means over the scenes `common`, one per seed that has all of them."""
     label = outcomes[0].job.label
-    by_seed: dict[int, list[Run]] = {}
-    by_scene: dict[str, list[Run]] = {}
-    for each in sorted(outcomes, key=lambda each: each.job.scene not in common):
-        if each.run:
-            by_scene.setdefault(each.job.scene, []).append(each.run)
-            if each.job.scene in common:
-                by_seed.setdefault(each.job.config.seed, []).append(each.run)
-    complete = [of_seed for of_seed in by_seed.values() if len(of_seed) == len(common)]
+    found = [(each.job, each.run) for each in outcomes if each.run]
+    found.sort(key=lambda pair: pair[0].scene not in common)
+    by_scene = {
+        scene: [run for _, run in of_scene]
+        for scene, of_scene in grouped(found, lambda pair: pair[0].scene).items()
+    }
+    shared = (pair for pair in found if pair[0].scene in common)
+    complete = [
+        [run for _, run in of_seed]
+        for of_seed in grouped(shared, lambda pair: pair[0].config.seed).values()
+        if len(of_seed) == len(common)
+    ]
     runs = [over_scenes(of_seed) for of_seed in complete]
     gaps = list(_gaps(outcomes))
     if by_scene and not common:
@@ -137,14 +137,16 @@ def _gaps(outcomes: Sequence[Outcome]) -> Iterator[str]:
     """Each reason for gaps once, with its seeds and scenes unless it concerns all of them."""
     seeds = {each.job.config.seed for each in outcomes}
     scenes = {each.job.scene for each in outcomes}
-    for why in dict.fromkeys(each.gap for each in outcomes if each.gap):
-        where: dict[int, list[str]] = {}
-        for each in outcomes:
-            if each.gap == why:
-                where.setdefault(each.job.config.seed, []).append(each.job.scene)
-        groups = list(where.items())
-        same = where.keys() == seeds and all(of == groups[0][1] for _, of in groups)
+    gaps = (each for each in outcomes if each.gap)
+    for why, of_why in grouped(gaps, lambda each: each.gap).items():
+        by_seed = grouped(of_why, lambda each: each.job.config.seed)
+        groups = [
+            (seed, [each.job.scene for each in of_seed])  # where it is the reason
+            for seed, of_seed in by_seed.items()
+        ]
+        alike = all(of_seed == groups[0][1] for _, of_seed in groups)
+        same = alike and by_seed.keys() == seeds
         for seed, of_seed in groups[:1] if same else groups:
             words = [] if same else [f"seed {seed}"]
             words += [] if len(of_seed) == len(scenes) else [", ".join(of_seed)]
-            yield " ".join((*words, why))
+            yield " ".join((*words, str(why)))

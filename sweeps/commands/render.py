@@ -31,22 +31,22 @@ QUALITY = "18"  # H.264's constant rate factor: the video hardly differs from th
 
 def main(options: argparse.Namespace) -> int:
     """Render; write `0000.png` and so on, the path and the video; print where they are."""
-    words = [*words_of_run(options.run, options.overrides), *options.overrides]
+    words = words_of_run(options.run, options.overrides)
     if options.path:
         replaced = re.compile(r"[+~]*(trajectory(?!\.transforms=)\b|split=)")
         words = [word for word in words if not replaced.match(word)]
         place = setting("trajectory.path", str(options.path.resolve()))
         words = [*words, "trajectory=path", place]
-    config = composed(words)
-    others = [composed(beside(name, words)) for name in options.beside]
+    configs = [composed(of) for of in (words, *(beside(name, words) for name in options.beside))]
+    config = configs[0]
     log = ConsoleLog(Path(config.outputs))
-    scene = seen(options.path, words, [config, *others]) or scene_of(config)
+    scene = seen(options.path, words, configs) or scene_of(config)
     trajectory = trajectory_of(config, scene, log)
     if options.video:
         if trajectory.resolution == MIXED:
             raise SteerbenchError("--video: expected frames of one size, the path has several")
         library_of(options.video)  # before any training
-    methods = [trained(each, log, scene) for each in (config, *others)]
+    methods = [trained(each, log, scene) for each in configs]
     cameras = [step.camera for step in trajectory.steps]
     drawn = "-".join(filter(None, [scene.name, *(one.name for one in methods), trajectory.name]))
     folder = options.to or Path(config.outputs) / "render" / drawn
@@ -126,11 +126,11 @@ def recorded(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
 
 
 def words_of_run(key: str | None, words: Sequence[str]) -> list[str]:
-    """The words of the command that measured the run `key` of the store."""
+    """The words of the command that measured the run `key` of the store, and `words` after them."""
     if key is None:
-        return []
+        return list(words)
     store = existing_store(Path(composed(words).outputs))
     _, command, *rest = shlex.split(str(store.record(store.whole_key(key))["command"]))
     if command != "run":
         raise SteerbenchError(f"run {key}: expected one of `steerbench run`, got {command}")
-    return [word for word in rest if not word.startswith("hydra.")]
+    return [*(word for word in rest if not word.startswith("hydra.")), *words]

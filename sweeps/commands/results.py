@@ -2,13 +2,12 @@
 
 import argparse
 import math
-import sys
 
 from bench.errors import unknown
 from bench.results import COLUMNS, existing_store
 from reports.lines import results
 from reports.tables import NOT_AVAILABLE, Table
-from sweeps.terminal import show
+from sweeps.terminal import note, show
 
 SHOWN = (
     *("run", "method", "scene", "trajectory", "device", "seed", "phase"),
@@ -20,7 +19,7 @@ SHOWN = (
 def main(options: argparse.Namespace) -> int:
     """Print the rows below `options.outputs`, filtered if asked, in the form that is asked for."""
     store = existing_store(options.outputs)
-    rows = results(store, report=lambda message: print(message, file=sys.stderr))
+    rows = results(store, note)
     for column in ("method", "scene", "metric"):
         wanted = getattr(options, column)
         if wanted is not None:
@@ -30,8 +29,8 @@ def main(options: argparse.Namespace) -> int:
     own = [str(name) for name in rows if name not in COLUMNS]
     columns = [*SHOWN[:2], *own, *SHOWN[2:]]
     short = rows.assign(run=rows["run"].str[:8])[columns]
-    lines = tuple(tuple(map(_text, line)) for line in short.itertuples(index=False))
-    show(Table(str(options.outputs), tuple(columns), lines), rows, options.format)
+    lines = short.map(_text).to_numpy().tolist()
+    show(Table(str(options.outputs), columns, lines), rows, options.format)
     return 0
 
 

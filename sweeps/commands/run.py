@@ -54,7 +54,7 @@ def _alone(config: DictConfig, command: Sequence[str], form: str | None) -> None
 
 def _finish(ended: Sequence[tuple[Job, Ended]], form: str | None) -> None:
     """Print one table of all jobs that have ended, and write the pages that they requested."""
-    from reports.runs import load_runs
+    from reports.runs import grouped, load_runs
     from sweeps.measurement import reason
     from sweeps.terminal import say_missing, write_page
 
@@ -68,8 +68,8 @@ def _finish(ended: Sequence[tuple[Job, Ended]], form: str | None) -> None:
     runs = load_runs(store, keys)
     _show(runs, failed, form)
     say_missing(runs)
-    for report in dict.fromkeys(job.config.report for job, _ in ended):
-        write_page(report, store, *of([x for x in ended if x[0].config.report == report]))
+    for report, some in grouped(ended, lambda each: each[0].config.report).items():
+        write_page(report, store, *of(some))
 
 
 def _show(runs: Sequence[Run], failed: Mapping[str, str], form: str | None) -> None:

@@ -6,9 +6,7 @@ The lines of a study are runs in the store, as those of a sweep; a study shows t
 import argparse
 import re
 import shlex
-import sys
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 from bench.errors import unexpected
 from bench.provenance import commit, machine
@@ -17,9 +15,9 @@ from reports.publish import publish
 from reports.runs import load_runs
 from reports.studies import VIEWS, Measured, by_method
 from reports.tables import Table
-from sweeps.execute import divided, launcher_of, run_jobs
+from sweeps.execute import divided, run_all
 from sweeps.studies import StudyJob, jobs_of, subjects
-from sweeps.terminal import say, show
+from sweeps.terminal import note, say, show
 
 
 def main(options: argparse.Namespace) -> int:
@@ -28,37 +26,37 @@ def main(options: argparse.Namespace) -> int:
     study = options.command
     limit = getattr(options, "within", None)
     within = None if limit is None else decibels(limit)
-    words, of_hydra = divided(options.overrides)
+    words, _ = divided(options.overrides)
     given = {name: getattr(options, name) for name in ("only", "trained") if name in options}
     found = subjects(study, words)
-    jobs = jobs_of(study, found, given)
-    outputs = Path(jobs[0].config.outputs)
-    ended = run_jobs(jobs, launcher_of([*options.config_dir, *of_hydra], outputs))
+    jobs = list(jobs_of(study, found, given))
+    ended = run_all(jobs, options.overrides)
     done = [(job.line, end.run) for job, end in zip(jobs, ended, strict=True) if end.run]
     runs = load_runs(jobs[0].store, (key for _, key in done))
     lines = [Measured.of(line, run) for (line, _), run in zip(done, runs, strict=True)]
     if not lines:
         return 1
-    parts = VIEWS[study](lines)
+    parts = list(VIEWS[study](lines))
     for part in parts:
         if isinstance(part, Table):
             show(part)
     if within is not None:
         for text in _recommended(lines, jobs, within):
             say(text)
-    folder = options.report or outputs / study
-    page = publish(_page(options, parts), folder, [line.run for line in lines])
-    print(f"report: {page}", file=sys.stderr)
+    folder = options.report or jobs[0].outputs / study
+    page = publish([*_page(options, parts)], folder, [line.run for line in lines])
+    note(f"report: {page}")
     return int(any(each.failed for each in ended))
 
 
-def _page(options: argparse.Namespace, parts: Sequence[Part]) -> list[Part]:
+def _page(options: argparse.Namespace, parts: Sequence[Part]) -> Iterator[Part]:
     typed = shlex.join(["steerbench", *options.typed])
-    made = f"```sh\n{typed}\n```\n\nCommit {commit()}, {machine()['cpu']}."
-    page: list[Part] = [f"# {options.command.capitalize()}", made]
+    yield f"# {options.command.capitalize()}"
+    yield f"```sh\n{typed}\n```\n\nCommit {commit()}, {machine()['cpu']}."
     for part in parts:
-        page += [f"## {part.title}", part] if isinstance(part, Table) else [part]
-    return page
+        if isinstance(part, Table):
+            yield f"## {part.title}"
+        yield part
 
 
 def decibels(text: str) -> float:

@@ -28,6 +28,7 @@ from bench.paths import write_path
 from bench.study import study_of
 from bench.types import Camera, composite
 from bench.viewing import Ask, Drawn, Painter, Turns, difference, divided, seen_from
+from reports.tables import Table, decimal
 from sweeps.commands.render import words_of_run
 from sweeps.configured import build, scene_of, trained
 from sweeps.overrides import beside, composed
@@ -71,7 +72,7 @@ def main(options: argparse.Namespace) -> int:
 
 def opened(options: argparse.Namespace) -> Viewer:
     """Open the viewer that the command describes, and print its address."""
-    words = [*words_of_run(options.run, options.overrides), *options.overrides]
+    words = words_of_run(options.run, options.overrides)
     wanted = [words, *([beside(options.beside, words)] if options.beside else [])]
     viewer = Viewer(wanted, options.host, options.port)
     port = viewer.server.get_port()  # the next free one if the requested one is taken
@@ -289,9 +290,8 @@ def _figures(
 
 def _stages(painter: Painter, drawn: Sequence[Drawn]) -> str:
     height, width = drawn[0].rgb.shape[:2]
-    lines = [f"{width} x {height} pixels", ""]
+    parts = [f"{width} x {height} pixels"]
     for method, picture in zip(painter.methods, drawn, strict=True):
-        lines += [f"| {method.name} | ms |", "|---|---|"]
-        lines += [f"| {stage} | {ms:.1f} |" for stage, ms in picture.stages_ms.items()]
-        lines.append("")
-    return "\n".join(lines)
+        lines = [(stage, decimal(ms, 1)) for stage, ms in picture.stages_ms.items()]
+        parts.append(Table("", (method.name, "ms"), lines).markdown())
+    return "\n\n".join(parts)
