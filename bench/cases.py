@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from itertools import product
 
 import torch
@@ -48,10 +47,10 @@ def cases() -> list[Case]:
     )
     return [
         *_round_trips(),
-        front.case("behind the camera", partial(_not_in_front, (-1e20, -1.0, -1e-20))),
-        front.case("on the camera's plane", partial(_not_in_front, (0.0, -0.0))),
-        pixels.case("a scene 1e-06 wide", partial(_normalisation_error, 1e-6)),
-        pixels.case("a scene 1e+06 wide", partial(_normalisation_error, 1e6)),
+        front.case("behind the camera", _not_in_front, (-1e20, -1.0, -1e-20)),
+        front.case("on the camera's plane", _not_in_front, (0.0, -0.0)),
+        pixels.case("a scene 1e-06 wide", _normalisation_error, 1e-6),
+        pixels.case("a scene 1e+06 wide", _normalisation_error, 1e6),
         moved.case("rigid motion of scene and camera", _motion_error),
     ]
 
@@ -75,7 +74,7 @@ def _round_trips() -> Iterator[Case]:
             "turned, as many more; away from the origin by r, 8 f (1 + r / z) u more",
             units,
         )
-        yield same.case(f"{name}, depth {depth:g}", partial(_round_trip, camera, depth))
+        yield same.case(f"{name}, depth {depth:g}", _round_trip, camera, depth)
 
 
 def _apart(got: Tensor, want: Tensor) -> float:
