@@ -21,14 +21,14 @@ def pixel_grid(width: int, height: int, device: torch.device | str = "cpu") -> T
 def cast(camera: Camera, pixels: Tensor | None = None) -> Rays:
     """Rays through `pixels` [R, 2] as (u, v), or through all pixel centres, row by row."""
     if pixels is None:
-        pixels = pixel_grid(camera.width, camera.height, camera.c2w.device)
+        pixels = pixel_grid(*camera.size, camera.c2w.device)
     check_shape("pixels", pixels, None, 2)
     x = (pixels[:, 0] - camera.cx) / camera.fx
     y = (pixels[:, 1] - camera.cy) / camera.fy
     local = torch.stack((x, y, torch.ones_like(x)), dim=-1)
-    rotation = camera.c2w[:, :3].to(local.dtype)
+    rotation = camera.rotation.to(local.dtype)
     directions = local @ rotation.T
-    return Rays(camera.c2w[:, 3].to(local.dtype).expand_as(directions), directions)
+    return Rays(camera.centre.to(local.dtype).expand_as(directions), directions)
 
 
 def unproject(camera: Camera, pixels: Tensor, depth: Tensor) -> Tensor:
@@ -40,7 +40,7 @@ def unproject(camera: Camera, pixels: Tensor, depth: Tensor) -> Tensor:
 def project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
     """Pixels [R, 2] and z-depth [R] of `points` [R, 3] (Eq. 7, 9); no pixel unless depth > 0."""
     check_shape("points", points, None, 3)
-    rotation, centre = camera.c2w[:, :3].to(points.dtype), camera.c2w[:, 3].to(points.dtype)
+    rotation, centre = camera.rotation.to(points.dtype), camera.centre.to(points.dtype)
     local = (points - centre) @ rotation  # R^T (p - c), row vectors
     depth = local[:, 2]
     safe = torch.where(depth > 0, depth, torch.ones_like(depth))
@@ -91,9 +91,8 @@ def place_camera(camera: Camera, device: torch.device | str) -> Camera:
 
 def pack_camera(camera: Camera) -> Tensor:
     """`camera` as one [18] float64 tensor on the CPU: `c2w` row by row, then the intrinsics."""
-    sizes = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
     pose = camera.c2w.double().cpu().flatten()
-    return torch.cat((pose, pose.new_tensor(sizes)))
+    return torch.cat((pose, pose.new_tensor((*camera.intrinsics, *camera.size))))
 
 
 def unpack_camera(packed: Tensor) -> Camera:

@@ -61,8 +61,8 @@ def _property(subject: str, holds: str, derivation: str, units: float = 0.0) -> 
 
 def _round_trips() -> Iterator[Case]:
     for (name, camera), depth in product(CAMERAS.items(), DEPTHS):
-        reach = max(abs(camera.cx), abs(camera.cy), camera.width, camera.height)
-        distance, units = camera.c2w[:, 3].norm().item(), 8 * reach
+        reach = max(abs(camera.cx), abs(camera.cy), *camera.size)
+        distance, units = camera.centre.norm().item(), 8 * reach
         if distance and depth < 1:
             continue  # nearer than the rounding error of the camera position
         if distance:
@@ -83,9 +83,9 @@ def _apart(got: Tensor, want: Tensor) -> float:
 
 
 def _round_trip(camera: Camera, depth: float, backend: str, device: str, precision: str) -> float:
-    tolerated = 16 * (1 + camera.c2w[:, 3].norm().item() / depth) * U32
+    tolerated = 16 * (1 + camera.centre.norm().item() / depth) * U32
     camera = place_camera(camera, device)
-    pixels = pixel_grid(camera.width, camera.height, device)
+    pixels = pixel_grid(*camera.size, device)
     points = unproject(camera, pixels, torch.full_like(pixels[:, 0], depth))
     got, got_depth = project(camera, points)
     relative = (got_depth / depth - 1).abs().max().item()
@@ -113,7 +113,7 @@ def _normalisation_error(side: float, backend: str, device: str, precision: str)
     local = (origin + side * points - given[:, 3]) @ given[:, :3]
     u = camera.fx * local[:, 0] / local[:, 2] + camera.cx
     v = camera.fy * local[:, 1] / local[:, 2] + camera.cy
-    return _apart(torch.stack((u, v), dim=1), pixel_grid(camera.width, camera.height))
+    return _apart(torch.stack((u, v), dim=1), pixel_grid(*camera.size))
 
 
 def _motion_error(backend: str, device: str, precision: str) -> float:

@@ -87,8 +87,7 @@ def _colmap(scene: Scene, folder: Path, log: Log) -> None:
         in_parallel(write, numbers, f"write {name}", log)
         for number, seen in zip(numbers, split.cameras, strict=True):
             camera = data_camera(scene, seen)
-            lens = camera.fx, camera.fy, camera.cx, camera.cy
-            cameras.append(_line(number, "PINHOLE", camera.width, camera.height, *lens))
+            cameras.append(_line(number, "PINHOLE", *camera.size, *camera.intrinsics))
             pose = camera.c2w.numpy()
             turn = Rotation.from_matrix(pose[:, :3].T)  # world to camera, exactly a rotation
             shift = turn.apply(-pose[:, 3])

@@ -118,7 +118,7 @@ def _of_ngp(settings: ChainMap, where: str, remarks: Remarks, usual: Camera | No
     centre = numbers_of(settings.get("T"), 3, f"{where}.T")
     pose = np.column_stack((Rotation.from_quat(turn).as_matrix(), centre))
     like = _known(usual, settings, where)
-    return _centred(torch.from_numpy(pose), settings.get("fov"), like.width, like.height, where)
+    return _centred(torch.from_numpy(pose), settings.get("fov"), *like.size, where)
 
 
 def _of_splatting(settings: ChainMap, where: str, remarks: Remarks, _: Camera | None) -> Camera:
@@ -179,7 +179,7 @@ def _out_of_model(
 
 
 def _centres(cameras: Sequence[Camera]) -> Tensor:
-    return torch.stack([camera.c2w[:, 3] for camera in cameras])
+    return torch.stack([camera.centre for camera in cameras])
 
 
 def _moved(cameras: Sequence[Camera], move: Tensor, where: Path) -> list[Camera]:
@@ -243,11 +243,11 @@ def _nerfbaselines(cameras: Sequence[Camera], fps: float) -> dict:
     frames = [
         {
             "pose": camera.c2w.flatten().tolist(),
-            "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+            "intrinsics": [*camera.intrinsics],
             "appearance_weights": [],
         }
         for camera in cameras
     ]
-    size = [cameras[0].width, cameras[0].height]
+    size = [*cameras[0].size]
     about = {"format": NERFBASELINES, "camera_model": "pinhole", "image_size": size, "fps": fps}
     return {**about, "source": None, "appearances": [], "frames": frames}

@@ -69,6 +69,26 @@ class Camera:
     width: int
     height: int
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.width, self.height
+
+    @property
+    def intrinsics(self) -> tuple[float, float, float, float]:
+        """Focal lengths, then the principal point."""
+        return self.fx, self.fy, self.cx, self.cy
+
+    @property
+    def rotation(self) -> Tensor:
+        """[3, 3], of camera axes in the world."""
+        return self.c2w[:, :3]
+
+    @property
+    def centre(self) -> Tensor:
+        """[3], where the camera is."""
+        return self.c2w[:, 3]
+
 
 @dataclass(frozen=True)
 class Rays:

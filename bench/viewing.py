@@ -93,7 +93,7 @@ class Painter:
     @torch.no_grad()
     def draw(self, who: Hashable, camera: Camera) -> list[Drawn]:
         """Render `camera` with each method; SteerbenchError if values are not finite."""
-        sequence = (who, camera.width, camera.height)
+        sequence = (who, *camera.size)
         if sequence != self._sequence:
             for method in self.methods:
                 method.reset()

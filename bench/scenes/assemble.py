@@ -290,7 +290,7 @@ def _left(
         pixels, depth = pixels.reshape(-1, 8, 2), depth.reshape(-1, 8)
         first = pixels.amin(1).floor() - 1
         last = pixels.amax(1).floor() + 2  # one past the last pixel
-        limit = first.new_tensor((camera.width, camera.height))
+        limit = first.new_tensor(camera.size)
         inside = ((first >= 0) & (last <= limit)).all(1) & (depth > 0).all(1)
         (u0, v0), (u1, v1) = (edge[inside].long().unbind(1) for edge in (first, last))
         # A summed-area table counts the mask's pixels in any rectangle with four look-ups. NumPy's

@@ -151,7 +151,7 @@ class GaussianTraining(loop.Training):
         picture = composite(self.split.images[view].to(device, non_blocking=True), self.background)
         if (mask := self.split.mask(view)) is not None:
             picture[~mask.to(device)] = math.nan
-        if half and min(camera.width, camera.height) > 1:
+        if half and min(camera.size) > 1:
             camera = scale_camera(camera, camera.width // 2, camera.height // 2)
             planes, size = picture.movedim(-1, 0)[None], (camera.height, camera.width)
             shrunk = functional.interpolate(planes, size=size, mode="area")

@@ -99,7 +99,7 @@ def sees_matter(camera: Camera, occupancy: Occupancy) -> Tensor:
     unit = torch.arange(2, device=device)
     corners = (bricks[:, None] + torch.cartesian_prod(unit, unit, unit)) * BRICK
     projected, depth = project(camera, corners.reshape(-1, 3) / occupancy.resolution)
-    projected, sides = projected.view(-1, 8, 2), (camera.width, camera.height)
+    projected, sides = projected.view(-1, 8, 2), camera.size
     behind = (depth.view(-1, 8) <= 0).any(dim=1)[:, None]  # [B, 1]
 
     low = torch.where(behind, 0, projected.amin(dim=1)).floor()

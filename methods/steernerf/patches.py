@@ -80,7 +80,7 @@ class Patches:
         self.pictures = [*real.images, *distilled.images]
         self.masks = [*(real.masks or [None] * len(real)), *[None] * len(distilled)]
         self._real, self._distilled = len(real), len(distilled)
-        shortest = min(min(camera.width, camera.height) for camera in self.cameras)
+        shortest = min(min(camera.size) for camera in self.cameras)
         # Of all patches, in low-resolution pixels; even the smallest picture has one.
         self._side = min(options.patch, -(-shortest // pipeline.model.scale))
 
@@ -143,7 +143,7 @@ class Patches:
         parts = [part for patch in patches for part in self._to_render(patch)]
         chosen = indices_where([mask for _, mask in parts])
         each = [
-            cast(camera, pixel_grid(camera.width, camera.height, some.device)[some])
+            cast(camera, pixel_grid(*camera.size, some.device)[some])
             for (camera, _), some in zip(parts, chosen, strict=True)
         ]
         rays, field, jitter = Rays.joined(each), self.pipeline.field, None

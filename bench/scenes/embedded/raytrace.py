@@ -68,7 +68,7 @@ def render(model: SceneModel, camera: Camera, samples: int) -> Frame:
     mean z-depth weighted by opacity (+inf where alpha is below EMPTY_ALPHA). A single sample is at
     the centre.
     """
-    width, height, offsets = camera.width, camera.height, sample_offsets(samples)
+    (width, height), offsets = camera.size, sample_offsets(samples)
     x = (torch.arange(width)[:, None] + offsets[:, 0] - camera.cx) / camera.fx
     y = (torch.arange(height)[:, None] + offsets[:, 1] - camera.cy) / camera.fy
     rgb, (alpha, depth) = torch.zeros(height, width, 3), torch.zeros(2, height, width)
@@ -83,7 +83,7 @@ def render(model: SceneModel, camera: Camera, samples: int) -> Frame:
         ]
         if not spans:
             continue
-        band = Band(camera.c2w[:, 3], camera.c2w[:, :3], x[None], y[top:bottom, None])
+        band = Band(camera.centre, camera.rotation, x[None], y[top:bottom, None])
         for picture, seen in zip((rgb, alpha, depth), model.trace(band, spans), strict=True):
             picture[top:bottom] = seen.mean(2)
     depth = (depth / alpha.clamp(min=EMPTY_ALPHA)).masked_fill(alpha < EMPTY_ALPHA, math.inf)
@@ -102,7 +102,7 @@ def sample_offsets(samples: int) -> Tensor:
 def windows(camera: Camera, boxes: Tensor) -> list[list[int]]:
     """The first and last column and row, exclusive, in which a camera may see each of `boxes`."""
     pixels, depth = (x.reshape(len(boxes), 8, -1) for x in project(camera, boxes.reshape(-1, 3)))
-    ahead, size = depth[..., 0] > 0, pixels.new_tensor((camera.width, camera.height))
+    ahead, size = depth[..., 0] > 0, pixels.new_tensor(camera.size)
     low, high = pixels.amin(1).floor() - 1, pixels.amax(1).ceil() + 1
     # A part that reaches behind the camera may be visible anywhere.
     whole = ahead.all(1, keepdim=True)

@@ -90,7 +90,7 @@ def _given(count: int) -> Given:
     depth[: count // 8] *= -1
     local = torch.cat((depth[:, None] * half * across, depth[:, None]), dim=1)
     return {
-        "means": local @ CAMERA.c2w[:, :3].T + CAMERA.c2w[:, 3],
+        "means": local @ CAMERA.rotation.T + CAMERA.centre,
         "scales": random.share(count, 3) * 0.5 / CAMERA.fx + 1e-3,
         "rotations": random.normal(count, 4),
         "opacities": random.share(count),
@@ -102,7 +102,7 @@ def _slopes_error(backend: str, device: str, precision: str) -> float:
     drawn = placed(_given(1000), device, precision)
     camera = drawn.pop("camera")
     pixels, depth = project(camera, drawn["means"])
-    size = pixels.new_tensor((camera.width, camera.height))
+    size = pixels.new_tensor(camera.size)
     seen = (depth > 0.1) & ((pixels > 0) & (pixels < size)).all(dim=1) & (drawn["opacities"] > 0.01)
     drawn = {name: x[seen] for name, x in drawn.items()}
     ellipses = project_gaussians(**drawn, camera=camera, backend=backend)
@@ -135,7 +135,7 @@ HIDDEN: dict[str, dict[str, float]] = {
 
 def _shown(changed: dict[str, float], backend: str, device: str, precision: str) -> float:
     """How many numbers are shown, or have a gradient that is not finite."""
-    place = CAMERA.c2w[:, 3] + changed.get("depth", 1.0) * CAMERA.c2w[:, 2]
+    place = CAMERA.centre + changed.get("depth", 1.0) * CAMERA.c2w[:, 2]
     scales, opacity = torch.full((1, 3), changed.get("scale", 0.01)), changed.get("opacity", 0.5)
     shape = place[None], scales, torch.tensor([[1.0, 0, 0, 0]])
     given = *shape, torch.tensor([opacity]), CAMERA
