@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bench.cameras import project
@@ -123,7 +124,8 @@ class Part:
     frame: Tensor = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "frame", rotation(*self.turn))
+        turned = Rotation.from_euler("xyz", self.turn, degrees=True).as_matrix()
+        object.__setattr__(self, "frame", torch.from_numpy(turned).float())
 
 
 class Solids:
@@ -226,16 +228,6 @@ class Solids:
                 found &= owners[under] != number
             dark[under[found]] = True
         return torch.empty_like(dark).index_put_((order,), dark)
-
-
-def rotation(x: float, y: float, z: float) -> Tensor:
-    """[3, 3] rotation by degrees about x, then y, then z."""
-    turns = torch.eye(3, dtype=torch.float64)
-    for axis, degrees in enumerate((x, y, z)):
-        c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-        about_x = torch.tensor([[1, 0, 0], [0, c, -s], [0, s, c]], dtype=torch.float64)
-        turns = about_x.roll((axis, axis), (0, 1)) @ turns
-    return turns.float()
 
 
 @dataclass(frozen=True)
