@@ -109,8 +109,7 @@ class Diver(Student):
     )
 
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> DiverTraining:
-        generator = torch.Generator().manual_seed(self.teacher.seed)
-        model = CornerModel.taught(teacher, self.resolution, generator)
+        model = CornerModel.taught(teacher, self.resolution, self.teacher.generator())
         return DiverTraining(model, scene, budget, self.training, self.teacher.seed)
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:

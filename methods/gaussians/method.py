@@ -77,7 +77,7 @@ class GaussianSplatting(OnField):
         finished = log.stage_dir("gaussians", key) / "gaussians.safetensors"
 
         def begin() -> GaussianTraining:
-            generator = torch.Generator(setup.device).manual_seed(setup.seed)
+            generator = setup.generator(setup.device)
             points, colours = on_surfaces(teacher, scene, self.count, generator)
             scales = self.fitting.size * spacing(points)
             untrained = Gaussians.at(points, colours, scales, self.fitting.opacity, self.degree)

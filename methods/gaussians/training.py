@@ -75,7 +75,7 @@ class GaussianTraining(loop.Training):
         self.steps = steps
         self.split, self.background = scene.splits["train"], scene.background.to(setup.device)
         self.endless = scene.space == "all"
-        self.generator = torch.Generator(setup.device).manual_seed(setup.seed)
+        self.generator = setup.generator(setup.device)
         self.views: list[int] = []  # still to come in this pass over the pictures
 
     @cached_property

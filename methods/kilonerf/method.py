@@ -76,8 +76,8 @@ class KiloNerf(FieldStudent):
 
     def new_field(self) -> KiloField:
         """Make the networks of the grid that was placed or restored last."""
-        generator = torch.Generator().manual_seed(self.teacher.seed)
-        return KiloField(self.grid, self.teacher.backend, generator).to(self.teacher.device)
+        teacher = self.teacher
+        return KiloField(self.grid, teacher.backend, teacher.generator()).to(teacher.device)
 
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> KiloTraining:
         bounds = scene.cells.to(self.teacher.device)

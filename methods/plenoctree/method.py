@@ -125,9 +125,8 @@ class PlenOctree(Student):
 
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> OctreeTraining:
         setup = self.teacher
-        generator = torch.Generator(setup.device).manual_seed(setup.seed)
         batches = PixelBatches(scene.splits["train"], setup.device)
-        octree = extract(teacher, batches, self.extraction, generator)
+        octree = extract(teacher, batches, self.extraction, setup.generator(setup.device))
         return OctreeTraining(octree, scene, budget, self.training, setup)
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:

@@ -23,7 +23,7 @@ def distilled_views(
         return Split([], [], []), 0.0
     key = {**setup.key(scene, budget), "views": count, "distillation": digest(distilled_views)}
     path = log.stage_dir("distilled", key) / "views.safetensors"
-    generator = torch.Generator().manual_seed(setup.seed)
+    generator = setup.generator()
     taken, target = scene.splits["train"].cameras, viewing_target(scene)
     cameras = [novel_view(taken, target, generator) for _ in range(count)]
     names = [str(number) for number in range(count)]

@@ -70,9 +70,9 @@ def train_stage2(
     meter = MemoryMeter(str(setup.device))
     with meter:
         distilled, distilled_s = distilled_views(setup, trained, scene, budget, count, log)
-    trained.field.widen(model.channels, torch.Generator().manual_seed(setup.seed))
+    trained.field.widen(model.channels, setup.generator())
 
-    renderer, generator = stage2.make(setup), torch.Generator().manual_seed(setup.seed)
+    renderer, generator = stage2.make(setup), setup.generator()
     pipeline = Pipeline(trained, scene.background, renderer, model)
     patches = Patches(pipeline, scene, distilled, joint, generator)
     training = JointTraining(renderer, patches, steps, trained if patches.learning else None)
