@@ -6,6 +6,7 @@ An `Occupancy` says where samples may lie, `Samples` are `Intervals` on rays wit
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar, Self
@@ -110,6 +111,16 @@ def clearance(used: Tensor) -> Tensor:
     there is none; at most 255. The host waits for a GPU."""
     apart = torch.from_numpy(distance_transform_cdt(~used.cpu().numpy(), "chessboard"))
     return apart.where(apart >= 0, len(used)).clamp(max=255).to(used.device, torch.uint8)
+
+
+def cat(parts: Sequence[Tensor]) -> Tensor:
+    """`torch.cat` of one or more tensors; a single one is not copied."""
+    return parts[0] if len(parts) == 1 else torch.cat(tuple(parts))
+
+
+def joined(parts: Iterable[Sequence[Tensor]]) -> tuple[Tensor, ...]:
+    """The first tensors of all `parts` as one, see `cat`; the second ones; and so on."""
+    return tuple(map(cat, zip(*parts, strict=True)))
 
 
 def total_and_longest(counts: Tensor, offsets: Tensor) -> list[int]:

@@ -11,9 +11,9 @@ from bench.cameras import cast, project
 from bench.types import EMPTY_ALPHA, Camera, Frame, Probe, Rays
 from methods.kernels.composite import composite, visibility
 from methods.kernels.march import march
-from methods.kernels.types import BRICK, Occupancy, Pixels, Samples
+from methods.kernels.types import BRICK, Occupancy, Pixels, Samples, joined
 from methods.rendering.compaction import compacts
-from methods.rendering.field import CACHED_SAMPLES, CHUNK_SAMPLES, Field, cat, pad, query
+from methods.rendering.field import CACHED_SAMPLES, CHUNK_SAMPLES, Field, pad, query
 from methods.rendering.sampling import Sampling
 
 CHUNK_RAYS = 1 << 16
@@ -140,7 +140,7 @@ def render_rays(
         # Contiguous, as kernels want them; once.
         some = Rays(rays.origins[chunk].contiguous(), rays.directions[chunk])
         parts.append(_render_chunk(field, some, occupancy, probe, chunk_how).columns)
-    return Pixels(*map(cat, zip(*parts, strict=True)))
+    return Pixels(*joined(parts))
 
 
 def _render_chunk(
@@ -220,7 +220,7 @@ def _evaluated(
         else:
             columns = samples.positions.split(CHUNK_SAMPLES), samples.ray.split(CHUNK_SAMPLES)
             parts = [query(field, *piece, encoded) for piece in zip(*columns, strict=True)]
-            sigma, values = map(cat, zip(*parts, strict=True))
+            sigma, values = joined(parts)
             shaded, values = len(samples), torch.where(bright(sigma)[:, None], values, 0)
     probe.count("shaded_samples", shaded, len(samples))
     field.count(probe, len(samples), shaded)

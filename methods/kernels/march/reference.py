@@ -8,15 +8,21 @@ from torch.nn import functional
 
 from methods.kernels.march import LEAST_STEP, Segments, longest_ray
 from methods.kernels.march.contraction import Course, contract
-from methods.kernels.types import PARALLEL, Occupancy, Samples, offsets_of, total_and_longest
+from methods.kernels.types import (
+    PARALLEL,
+    Occupancy,
+    Samples,
+    joined,
+    offsets_of,
+    total_and_longest,
+)
 
 BLOCK = 1 << 12  # rays that are tested at a time: [BLOCK, 1024, 3] positions are 50 MB
 
 
 def march(segments: Segments, occupancy: Occupancy) -> Samples:
     steps = _Steps(segments, occupancy)
-    parts = zip(*steps.taken(occupancy), strict=True)
-    kept, counts, resume = (torch.cat(column) for column in parts)
+    kept, counts, resume = joined(steps.taken(occupancy))
     offsets = offsets_of(counts)
     total, longest = total_and_longest(counts, offsets)
     place = torch.nonzero_static(kept.flatten(), size=total).squeeze(1)
