@@ -170,12 +170,11 @@ class GaussianTraining(loop.Training):
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
         self.gaussians.load_state_dict({name: tensors[name] for name in self.result()})
 
-    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        tensors, figures = super().state()
-        return tensors | {"views": torch.tensor(self.views, dtype=torch.int64)}, figures
+    def state(self) -> dict[str, Tensor]:
+        return super().state() | {"views": torch.tensor(self.views, dtype=torch.int64)}
 
-    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        super().restore(tensors, figures)
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        super().restore(tensors)
         self.views = tensors["views"].tolist()
 
 

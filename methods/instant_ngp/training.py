@@ -169,15 +169,15 @@ class PixelTraining(loop.Training, ABC):
         change = min(max(self.samples / max(samples, 1), 0.5), 1.25)
         self.rays = min(max(int(self.rays * change), MIN_RAYS), self.options.max_rays)
 
-    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        tensors, _ = super().state()
+    def state(self) -> dict[str, Tensor]:
+        tensors = super().state() | {"rays": torch.tensor(self.rays)}
         if self.errors is not None:
             tensors |= {"errors": self.errors.errors, "error_ends": self.errors.ends}
-        return tensors, {"rays": self.rays}
+        return tensors
 
-    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        super().restore(tensors, figures)
-        self.rays = int(figures["rays"])
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        super().restore(tensors)
+        self.rays = int(tensors["rays"])
         if self.errors is not None:
             self.errors.errors.copy_(tensors["errors"])
             self.errors.ends.copy_(tensors["error_ends"])

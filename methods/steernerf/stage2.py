@@ -165,15 +165,15 @@ class JointTraining(loop.Training):
             restore_field(self.trained.field, self.trained.grid, tensors)
             self.patches.pipeline.occupancy = self.trained.grid.occupancy
 
-    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        tensors, figures = super().state()
+    def state(self) -> dict[str, Tensor]:
+        tensors = super().state()
         tensors |= {f"patches.{name}": x for name, x in self.patches.state().items()}
         if self.trained:
             tensors["visits"] = self._visits.get_state()
-        return tensors, figures
+        return tensors
 
-    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        super().restore(tensors, figures)
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        super().restore(tensors)
         self.patches.restore(checkpoint.part(tensors, "patches."))
         if self.trained:
             self._visits.set_state(tensors["visits"].cpu())

@@ -53,12 +53,12 @@ class Training(Protocol):
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
         """Restore what `result` returned."""
 
-    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
+    def state(self) -> dict[str, Tensor]:
         """What a checkpoint must hold, besides the result, to go on as if never stopped."""
         tensors = checkpoint.of_optimisers(self.optimisers())
-        return tensors | {"generator": self.generator.get_state()}, {}
+        return tensors | {"generator": self.generator.get_state()}
 
-    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Restore result and state."""
         self.restore_result(tensors)
         checkpoint.restore_optimisers(self.optimisers(), tensors)
@@ -130,11 +130,10 @@ def save(training: Training, path: Path, done: bool = False) -> None:
     """Write the result and, unless `done`, the state. Something that is not finite raises
     `SteerbenchError` and leaves the last good file alone."""
     check_finite(training)
-    more, figures = training.state()
     if training.meter:
         training.peak_bytes = max(training.peak_bytes, training.meter.look())
-    figures |= {name: getattr(training, name) for name in ("step", "seconds", "peak_bytes")}
-    checkpoint.write(path, training.result() | ({} if done else more), figures)
+    figures = {name: getattr(training, name) for name in ("step", "seconds", "peak_bytes")}
+    checkpoint.write(path, training.result() | ({} if done else training.state()), figures)
 
 
 def load(training: Training, path: Path, done: bool = False) -> None:
@@ -145,7 +144,7 @@ def load(training: Training, path: Path, done: bool = False) -> None:
         if done:
             training.restore_result(tensors)
         else:
-            training.restore(tensors, figures)
+            training.restore(tensors)
         training.step, training.seconds = int(figures["step"]), figures["seconds"]
         training.peak_bytes = figures["peak_bytes"]
 
