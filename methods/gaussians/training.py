@@ -4,7 +4,6 @@ Carlo"). Their number is fixed.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated
@@ -116,7 +115,7 @@ class GaussianTraining(loop.Training):
         costs = costs + options.scale_cost * scales.mean()
         (loss + costs).backward()
 
-        def error() -> dict[str, Tensor]:
+        def error() -> checkpoint.Tensors:
             return {"": functional.mse_loss(picture, target)}
 
         errors = loop.look(self, error, {"picture": picture})
@@ -161,19 +160,19 @@ class GaussianTraining(loop.Training):
     def optimisers(self) -> checkpoint.Optimisers:
         return {"adam": self.optimiser}
 
-    def watched(self) -> dict[str, Tensor]:
+    def watched(self) -> checkpoint.Tensors:
         return dict(self.gaussians.named_parameters())
 
-    def result(self) -> dict[str, Tensor]:
+    def result(self) -> checkpoint.Tensors:
         return {name: value.detach() for name, value in self.gaussians.named_parameters()}
 
-    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore_result(self, tensors: checkpoint.Tensors) -> None:
         self.gaussians.load_state_dict({name: tensors[name] for name in self.result()})
 
-    def state(self) -> dict[str, Tensor]:
+    def state(self) -> checkpoint.Tensors:
         return super().state() | {"views": torch.tensor(self.views, dtype=torch.int64)}
 
-    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore(self, tensors: checkpoint.Tensors) -> None:
         super().restore(tensors)
         self.views = tensors["views"].tolist()
 

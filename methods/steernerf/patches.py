@@ -6,7 +6,7 @@ used. After a number of patches they are replaced, by those before another view.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
 
@@ -182,7 +182,7 @@ class Patches:
             points = [_renewed(old, *next(rendered), background) for old in points]
         return Observation(replace(frame, depth=frame.depth.detach()), points)
 
-    def state(self) -> dict[str, Tensor]:
+    def state(self) -> checkpoint.Tensors:
         """All examples, to be kept in a file."""
         tensors = {}
         for place, example in enumerate(self._pool):
@@ -192,7 +192,7 @@ class Patches:
                 tensors |= {f"{place}.{age}.{name}": x for name, x in parts.items()}
         return tensors
 
-    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore(self, tensors: checkpoint.Tensors) -> None:
         """Restore the examples that `state` returned, with the same views and options."""
         self._pool, device = [], self.pipeline.background.device
         while example := checkpoint.part(tensors, f"{len(self._pool)}."):

@@ -1,11 +1,9 @@
 """Stage 2: the 2D renderer and the field, trained together on patches (Section 3.4)."""
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 
 import torch
-from torch import Tensor
 from torch.nn import functional
 
 from bench.errors import SteerbenchError
@@ -148,31 +146,31 @@ class JointTraining(loop.Training):
         final, waves = self.options.final_rate / first, self.options.half_waves
         return first * loop.cosine(self.step / self.steps, final, waves)
 
-    def watched(self) -> dict[str, Tensor]:
+    def watched(self) -> checkpoint.Tensors:
         field = self.trained.field.named_parameters("field") if self.trained else ()
         return dict([*self.renderer.named_parameters("renderer"), *field])
 
-    def result(self) -> dict[str, Tensor]:
+    def result(self) -> checkpoint.Tensors:
         result = self.renderer.state_dict(prefix="renderer.")
         if self.trained:
             result |= self.trained.field.state_dict(prefix="field.")
             result["grid.density"] = self.trained.grid.density
         return result
 
-    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore_result(self, tensors: checkpoint.Tensors) -> None:
         self.renderer.load_state_dict(checkpoint.part(tensors, "renderer."))
         if self.trained:
             restore_field(self.trained.field, self.trained.grid, tensors)
             self.patches.pipeline.occupancy = self.trained.grid.occupancy
 
-    def state(self) -> dict[str, Tensor]:
+    def state(self) -> checkpoint.Tensors:
         tensors = super().state()
         tensors |= {f"patches.{name}": x for name, x in self.patches.state().items()}
         if self.trained:
             tensors["visits"] = self._visits.get_state()
         return tensors
 
-    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore(self, tensors: checkpoint.Tensors) -> None:
         super().restore(tensors)
         self.patches.restore(checkpoint.part(tensors, "patches."))
         if self.trained:

@@ -44,21 +44,21 @@ class Training(Protocol):
     def optimisers(self) -> checkpoint.Optimisers:
         """The optimisers, which a checkpoint keeps."""
 
-    def watched(self) -> Mapping[str, Tensor]:
+    def watched(self) -> checkpoint.Tensors:
         """The tensors that must be finite in a good state, by name."""
 
-    def result(self) -> dict[str, Tensor]:
+    def result(self) -> checkpoint.Tensors:
         """The tensors that the training is for."""
 
-    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore_result(self, tensors: checkpoint.Tensors) -> None:
         """Restore what `result` returned."""
 
-    def state(self) -> dict[str, Tensor]:
+    def state(self) -> checkpoint.Tensors:
         """What a checkpoint must hold, besides the result, to go on as if never stopped."""
         tensors = checkpoint.of_optimisers(self.optimisers())
         return tensors | {"generator": self.generator.get_state()}
 
-    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore(self, tensors: checkpoint.Tensors) -> None:
         """Restore result and state."""
         self.restore_result(tensors)
         checkpoint.restore_optimisers(self.optimisers(), tensors)
@@ -67,7 +67,7 @@ class Training(Protocol):
 
 def trained(
     begin: Callable[[], Training], finished: Path, label: str, device: torch.device, log: Log
-) -> tuple[dict[str, Tensor], float, float]:
+) -> tuple[checkpoint.Tensors, float, float]:
     """The result of the training on `device` that `begin` makes, seconds and peak memory, of making
     it and of all its steps: read from `finished`, after a `train` if that is missing."""
     if finished.exists():
@@ -150,7 +150,7 @@ def load(training: Training, path: Path, done: bool = False) -> None:
 
 
 def look(
-    training: Training, errors: Callable[[], Mapping[str, Tensor]], tensors: Mapping[str, Tensor]
+    training: Training, errors: Callable[[], checkpoint.Tensors], tensors: checkpoint.Tensors
 ) -> dict[str, float]:
     """Return the `errors` of a step as numbers; raise `SteerbenchError` if one is not finite, with
     the names of the `tensors` that are not. On a GPU this happens every `LOOK_EVERY` steps, with
@@ -168,7 +168,7 @@ def look(
     return told
 
 
-def _ask(errors: Mapping[str, Tensor]) -> Asked:
+def _ask(errors: checkpoint.Tensors) -> Asked:
     """Send the errors to the host, which does not wait for them."""
     together = torch.stack([error.detach() for error in errors.values()])
     labels, values, arrived = list(errors), together.to("cpu", non_blocking=True), None
@@ -183,7 +183,7 @@ def _ask(errors: Mapping[str, Tensor]) -> Asked:
     return tell
 
 
-def check_finite(training: Training, more: Mapping[str, Tensor] | None = None) -> None:
+def check_finite(training: Training, more: checkpoint.Tensors | None = None) -> None:
     """Raise `SteerbenchError` naming the step and the tensors that are not finite, if any are."""
     tensors = {**training.watched(), **(more or {})}
     bad = [name for name, tensor in tensors.items() if not tensor.isfinite().all()]
