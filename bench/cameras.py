@@ -38,14 +38,14 @@ def unproject(camera: Camera, pixels: Tensor, depth: Tensor) -> Tensor:
 
 
 def project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels [R, 2] and z-depth [R] of `points` [R, 3] (Eq. 7, 9); no pixel unless depth > 0."""
-    check_shape("points", points, None, 3)
+    """Pixels [..., 2] and z-depth [...] of `points` [..., 3] (Eq. 7, 9); none unless depth > 0."""
+    check_shape("points", points, *[None] * (points.dim() - 1), 3)
     rotation, centre = camera.rotation.to(points.dtype), camera.centre.to(points.dtype)
     local = (points - centre) @ rotation  # R^T (p - c), row vectors
-    depth = local[:, 2]
+    x, y, depth = local.unbind(dim=-1)
     safe = torch.where(depth > 0, depth, torch.ones_like(depth))
-    u = camera.fx * local[:, 0] / safe + camera.cx
-    v = camera.fy * local[:, 1] / safe + camera.cy
+    u = camera.fx * x / safe + camera.cx
+    v = camera.fy * y / safe + camera.cy
     return torch.stack((u, v), dim=-1), depth
 
 

@@ -286,8 +286,7 @@ def _left(
     """The `cells` [M, 3] of `size` [3], counted from `lower` [3], that no picture drops."""
     for camera, image in views:
         corners = (lower + size * (cells[:, None] + _grid(2))).float()  # [M, 8, 3]
-        pixels, depth = project(camera, corners.reshape(-1, 3))
-        pixels, depth = pixels.reshape(-1, 8, 2), depth.reshape(-1, 8)
+        pixels, depth = project(camera, corners)
         first = pixels.amin(1).floor() - 1
         last = pixels.amax(1).floor() + 2  # one past the last pixel
         limit = first.new_tensor(camera.size)

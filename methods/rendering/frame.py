@@ -98,14 +98,13 @@ def sees_matter(camera: Camera, occupancy: Occupancy) -> Tensor:
     bricks = occupancy.bricks.to(device)
     unit = torch.arange(2, device=device)
     corners = (bricks[:, None] + torch.cartesian_prod(unit, unit, unit)) * BRICK
-    projected, depth = project(camera, corners.reshape(-1, 3) / occupancy.resolution)
-    projected, sides = projected.view(-1, 8, 2), camera.size
-    behind = (depth.view(-1, 8) <= 0).any(dim=1)[:, None]  # [B, 1]
+    projected, depth = project(camera, corners / occupancy.resolution)  # [B, 8, 2], [B, 8]
+    behind = (depth <= 0).any(dim=1)[:, None]  # [B, 1]
 
     low = torch.where(behind, 0, projected.amin(dim=1)).floor()
     high = torch.where(behind, torch.inf, projected.amax(dim=1)).ceil()
     (left, top), (right, bottom) = (
-        [x.clamp(0, size).long() for x, size in zip(ends.unbind(dim=1), sides, strict=True)]
+        [x.clamp(0, size).long() for x, size in zip(ends.unbind(dim=1), camera.size, strict=True)]
         for ends in (low, high)
     )
 

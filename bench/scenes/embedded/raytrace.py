@@ -102,8 +102,8 @@ def sample_offsets(samples: int) -> Tensor:
 
 def windows(camera: Camera, boxes: Tensor) -> list[list[int]]:
     """The first and last column and row, exclusive, in which a camera may see each of `boxes`."""
-    pixels, depth = (x.reshape(len(boxes), 8, -1) for x in project(camera, boxes.reshape(-1, 3)))
-    ahead, size = depth[..., 0] > 0, pixels.new_tensor(camera.size)
+    pixels, depth = project(camera, boxes)
+    ahead, size = depth > 0, pixels.new_tensor(camera.size)
     low, high = pixels.amin(1).floor() - 1, pixels.amax(1).ceil() + 1
     # A part that reaches behind the camera may be visible anywhere.
     whole = ahead.all(1, keepdim=True)
