@@ -16,7 +16,7 @@ from scipy.ndimage import distance_transform_cdt
 from torch import Tensor
 from torch.nn import functional
 
-from bench.types import Rays, check_shape
+from bench.types import Rays, check_shape, rows
 
 BRICK = 4  # cells along the side of a brick; its 64 cells are one word of `Occupancy.words`
 
@@ -196,9 +196,7 @@ class Pixels:
 
     def take(self, index: Tensor | slice) -> Pixels:
         """The rays at `index`."""
-        if isinstance(index, slice):
-            return Pixels(*(x[index] for x in self.columns))
-        return Pixels(*(x.index_select(0, index) for x in self.columns))
+        return Pixels(*(rows(x, index) for x in self.columns))
 
     def copy(self) -> Pixels:
         """Contiguous tensors of their own."""
