@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from bench.types import Camera, Rays, check_shape
 
@@ -103,6 +104,6 @@ def unpack_camera(packed: Tensor) -> Camera:
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
     """Camera-to-world [3, 4] at `eye`, looking at `target`, with `up` upward in the picture."""
-    forward = torch.nn.functional.normalize(target - eye, dim=0)
-    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
+    forward = normalize(target - eye, dim=0)
+    right = normalize(torch.linalg.cross(forward, up), dim=0)
     return torch.stack((right, torch.linalg.cross(forward, right), forward, eye), dim=1)

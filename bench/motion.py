@@ -11,6 +11,7 @@ from dataclasses import replace
 import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
 from torch import Generator, Tensor
+from torch.nn.functional import normalize
 
 from bench.errors import unexpected
 from bench.types import Camera, Scene, check_shape
@@ -112,7 +113,7 @@ def novel_view(cameras: Sequence[Camera], target: Tensor, generator: Generator) 
     start, end, chord = (_offset(camera, target).norm().item() for camera in (first, second, view))
     # `between` moves along the chord, which comes too near to the target: restore the distance.
     zoom = ((1 - share) * start + share * end) / chord * (1 + JITTER_ZOOM * (2 * zoom - 1))
-    step = math.radians(JITTER_DEG * angle) * torch.nn.functional.normalize(axis, dim=0)
+    step = math.radians(JITTER_DEG * angle) * normalize(axis, dim=0)
     return _turned(view, target, step, zoom)
 
 
@@ -120,7 +121,7 @@ def _nearest(cameras: Sequence[Camera], target: Tensor, index: int) -> list[int]
     """The cameras whose direction to `target` is nearest to that of camera `index`, of those with
     pictures of its size; without any, that camera itself."""
     offsets = torch.stack([_offset(camera, target) for camera in cameras])  # [N, 3]
-    directions = torch.nn.functional.normalize(offsets, dim=-1)
+    directions = normalize(offsets, dim=-1)
     order = (directions @ directions[index]).argsort(descending=True, stable=True).tolist()
     alike = [other for other in order if cameras[other].size == cameras[index].size]
     return [other for other in alike if other != index][:NEIGHBOURS] or [index]

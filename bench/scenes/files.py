@@ -81,11 +81,14 @@ def frames_of(record: Mapping, path: Path) -> list[Fields]:
     return frames
 
 
+def _real(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
 def number(value: Any, where: str, low: float = -math.inf, high: float = math.inf) -> float:
     """A finite number with low < value < high."""
-    real = isinstance(value, int | float) and not isinstance(value, bool)
     # Compare before converting: an integer of hundreds of digits overflows a float.
-    if real and low < value < high and abs(value) < sys.float_info.max:
+    if _real(value) and low < value < high and abs(value) < sys.float_info.max:
         return float(value)
     limits = [f"above {low:g}"] * (low > -math.inf) + [f"below {high:g}"] * (high < math.inf)
     expected = f"a finite number {' and '.join(limits)}".rstrip()
@@ -99,8 +102,7 @@ def focal_length(angle: object, size: float, where: str) -> float:
 
 def whole_number(value: Any, where: str, low: int) -> int:
     """A whole number, at least `low`; 3.0 is one, too."""
-    real = isinstance(value, int | float) and not isinstance(value, bool)
-    if real and low <= value <= sys.maxsize and value == int(value):
+    if _real(value) and low <= value <= sys.maxsize and value == int(value):
         return int(value)
     raise unexpected(where, f"a whole number from {low} on", describe(value))
 

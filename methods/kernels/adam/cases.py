@@ -25,8 +25,10 @@ DYADIC = {"levels": 2, "log2_table": 8, "n_min": 5, "n_max": 9}
 SHARES = tuple(1 / (1 - beta) for beta in BETAS)
 """Rounding beta changes 1 - beta by at most this many u of itself, 10 and 100; and 1 - beta^n."""
 
-SECOND = 2 * U32 * (1 - BETAS[1] ** STEPS) * (SHARES[1] + 3 * STEPS)
-FIRST = 2 * U32 * (1 - BETAS[0] ** STEPS) * (SHARES[0] + 3 * STEPS)
+FIRST, SECOND = (
+    2 * U32 * (1 - beta**STEPS) * (share + 3 * STEPS)
+    for beta, share in zip(BETAS, SHARES, strict=True)
+)
 OF_STEP = 1.2 * RATE * (2 * SHARES[0] + SHARES[1] + 16)
 
 BOUNDS = {
