@@ -1,7 +1,7 @@
 """Volume rendering of frames: features, depth and opacity of the pixels of a camera."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Self
 
 import torch
@@ -75,8 +75,7 @@ def everywhere(field: Field, occupancy: Occupancy, probe: Probe, how: Sampling) 
     `how.window` [h * w, 2], which is given for all pixels."""
 
     def render(seen: Tensor, rays: Rays) -> Pixels:
-        window = None if how.window is None else how.window[seen]
-        return render_rays(field, rays, occupancy, probe, replace(how, window=window))
+        return render_rays(field, rays, occupancy, probe, how.of(seen))
 
     return render
 
@@ -135,10 +134,9 @@ def render_rays(
     parts = []
     for first in range(0, max(len(rays.origins), 1), size):
         chunk = slice(first, first + size)
-        chunk_how = replace(how, window=None if how.window is None else how.window[chunk])
         # Contiguous, as kernels want them; once.
         some = Rays(rays.origins[chunk].contiguous(), rays.directions[chunk])
-        parts.append(_render_chunk(field, some, occupancy, probe, chunk_how).columns)
+        parts.append(_render_chunk(field, some, occupancy, probe, how.of(chunk)).columns)
     return Pixels(*joined(parts))
 
 
@@ -146,7 +144,7 @@ def _render_chunk(
     field: Field, rays: Rays, occupancy: Occupancy, probe: Probe, how: Sampling
 ) -> Pixels:
     """`render_rays` for rays that are rendered together."""
-    count, device, window = len(rays.origins), rays.origins.device, how.window
+    count, device = len(rays.origins), rays.origins.device
     with probe.stage("field"):
         directions = field.encode_directions(rays.directions)
     canvas = Pixels.blank(count, field.channels, device)
@@ -161,7 +159,7 @@ def _render_chunk(
                 rays.take(index),
                 occupancy,
                 how.step,
-                window=None if window is None else window[index],
+                window=how.of(index).window,
                 start=start,
                 limit=limit,
                 backend=field.backend,
