@@ -57,9 +57,10 @@ def long_rays() -> Rays:
 
 
 MIDDLE = torch.full((3,), 0.5)
+OUTSIDE = MIDDLE - 2 * SOME  # of the cube, whose middle is ahead
 SPECIAL = {
     "along axes": Rays(MIDDLE - 2 * AXES, AXES),
-    "along diagonals": Rays(MIDDLE - 2 * SOME, SOME),
+    "along diagonals": Rays(OUTSIDE, SOME),
     "in planes of the grid": Rays(torch.tensor([[-1.0, 0.25, 0.5]]), AXES[:1]),
     "through a corner of the cube": Rays(-2 * SOME, SOME),
     "through an edge of the cube": Rays(torch.tensor([0.0, 0.0, 0.5]) - 2 * SOME, SOME),
@@ -70,10 +71,10 @@ SPECIAL = {
     "past the cube": Rays(MIDDLE - 2 * AXES + 3 * AXES.roll(1, dims=1), AXES),
     "without direction": Rays(MIDDLE.expand(1, 3), torch.zeros(1, 3)),
     "from 1e6 away": Rays(MIDDLE - 1e6 * SOME, SOME),
-    "of direction 1e-30": Rays(MIDDLE - 2 * SOME, 1e-30 * SOME),
-    "of direction 1e-40": Rays(MIDDLE - 2 * SOME, 1e-40 * SOME),
+    "of direction 1e-30": Rays(OUTSIDE, 1e-30 * SOME),
+    "of direction 1e-40": Rays(OUTSIDE, 1e-40 * SOME),
     "from inside, of direction 1e-40": Rays(MIDDLE.expand(26, 3), 1e-40 * SOME),
-    "of direction 1e30": Rays(MIDDLE - 2 * SOME, 1e30 * SOME),
+    "of direction 1e30": Rays(OUTSIDE, 1e30 * SOME),
     "of directions 1 and 1e-40": Rays(
         MIDDLE + 0.01 - 2 * AXES, AXES + 1e-40 * AXES.roll(1, dims=1)
     ),
@@ -81,7 +82,7 @@ SPECIAL = {
     "along an edge, off it by 1e-30": Rays(torch.zeros(6, 3), AXES.abs() + 1e-30),
 }
 
-TOO_LONG = {f"of direction {size:g}": Rays(MIDDLE - 2 * SOME, size * SOME) for size in (1e37, 3e38)}
+TOO_LONG = {f"of direction {size:g}": Rays(OUTSIDE, size * SOME) for size in (1e37, 3e38)}
 """3e38: all three components are finite, the length is not."""
 
 
