@@ -142,8 +142,8 @@ class Difference:
     def __call__(self, backend: str, device: str, precision: str) -> Deviation:
         if (backend, device) == ("reference", "cpu"):
             return Deviation(0.0, 0.0)
-        got = tuple(result.cpu() for result in self.prepare(device)(backend))
-        return nearest(got, self.prepare("cpu")("reference"), self.tolerances())
+        got, want = self.prepare(device)(backend), self.prepare("cpu")("reference")
+        return nearest(got, want, self.tolerances())
 
 
 @dataclass(frozen=True)
@@ -300,10 +300,11 @@ def largest_error(results: Sequence[Tensor], reference: Sequence[Tensor]) -> flo
 
 
 def _errors(got: Tensor, want: Tensor) -> Tensor:
-    """|got - want| in float64; inf where only one is NaN or infinite, or if shapes differ."""
+    """|got - want| in float64 on the CPU; inf where only one is NaN or infinite, or if shapes
+    differ."""
     if got.shape != want.shape:
         return torch.full((1,), torch.inf, dtype=torch.float64)
-    got, want = got.detach().double(), want.detach().double()
+    got, want = (x.detach().cpu().double() for x in (got, want))
     same = (got == want) | (got.isnan() & want.isnan())
     error = torch.where(same, 0, (got - want).abs())
     return torch.where(error.isnan(), torch.inf, error)

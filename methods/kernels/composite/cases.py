@@ -225,7 +225,7 @@ def _extreme_error(
     weights = pad(behind[:-1], (1, 0), value=1.0) * -torch.expm1(-tau)
     if not backward:
         want = (weights @ values)[None], (weights @ t)[None], weights.sum()[None]
-        return largest_error([x.cpu() for x in pixels], want)
+        return largest_error(pixels, want)
     total = torch.cat([x.flatten() for x in pixels]).sum()
     of_sigma, of_values = (x.cpu() for x in torch.autograd.grad(total, learned))
     gain = values.sum(dim=1) + t + 1

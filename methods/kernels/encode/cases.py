@@ -169,4 +169,4 @@ def _feature_error(positions: Tensor, backend: str, device: str, precision: str)
     got = encode(**there, backend=backend)
     nearest = there["positions"].cpu().double().clamp(0, 1).tolist()
     exact = [_exact(at, level, table) for at in nearest for level in range(GRID.levels)]
-    return largest_error((got.cpu(),), (torch.cat(exact).view(got.shape),))
+    return largest_error((got,), (torch.cat(exact).view(got.shape),))

@@ -119,7 +119,7 @@ def _slopes_error(backend: str, device: str, precision: str) -> float:
     extents = (reach * spread.diagonal(dim1=1, dim2=2)).sqrt()
     width, (exact, z) = camera.width, project(CAMERA, means)
     got = ellipses.centres / width, ellipses.conics, ellipses.depth, ellipses.extents / width
-    return largest_error([x.cpu() for x in got], (exact / width, conics, z, extents / width))
+    return largest_error(got, (exact / width, conics, z, extents / width))
 
 
 HIDDEN: dict[str, dict[str, float]] = {
