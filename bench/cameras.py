@@ -41,7 +41,8 @@ def unproject(camera: Camera, pixels: Tensor, depth: Tensor) -> Tensor:
 def project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
     """Pixels [..., 2] and z-depth [...] of `points` [..., 3] (Eq. 7, 9); none unless depth > 0."""
     check_shape("points", points, *[None] * (points.dim() - 1), 3)
-    rotation, centre = camera.rotation.to(points.dtype), camera.centre.to(points.dtype)
+    rotation = camera.rotation.to(points.dtype)
+    centre = camera.centre.to(points.dtype)
     local = (points - centre) @ rotation  # R^T (p - c), row vectors
     x, y, depth = local.unbind(dim=-1)
     safe = torch.where(depth > 0, depth, torch.ones_like(depth))

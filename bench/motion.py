@@ -108,7 +108,8 @@ def novel_view(cameras: Sequence[Camera], target: Tensor, generator: Generator) 
     other = near[int(torch.randint(len(near), (), generator=generator))]
     share, angle, zoom = torch.rand(3, generator=generator, dtype=torch.float64).tolist()
     axis = torch.randn(3, generator=generator, dtype=torch.float64)
-    first, second = cameras[pick], cameras[other]
+    first = cameras[pick]
+    second = cameras[other]
     view = between(first, second, rotation_between(first, second), share)
     start, end, chord = (_offset(camera, target).norm().item() for camera in (first, second, view))
     # `between` moves along the chord, which comes too near to the target: restore the distance.

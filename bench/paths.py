@@ -80,7 +80,8 @@ def read_path(
         cameras = _moved(cameras, cube, file)
     elif name == KEYFRAMES and not record.items() >= OURS.items():
         cameras = _out_of_model(cameras, file, scene, remarks, model)
-    scale, offset = 1 / scene.unit_length, -scene.origin.double() / scene.unit_length
+    scale = 1 / scene.unit_length
+    offset = -scene.origin.double() / scene.unit_length
     return [move_camera(camera, scale, offset) for camera in cameras]
 
 
@@ -126,8 +127,10 @@ def _of_splatting(settings: Fields, remarks: Remarks, _: Camera | None) -> Camer
         expected = f"a position and three rows of a rotation, or a file with {READ}"
         got = f"{', '.join(settings)}: {error}"
         raise unexpected(settings.where, expected, got) from error
-    width, height = settings.size("width"), settings.size("height")
-    fx, fy = settings.number("fx", 0), settings.number("fy", 0)
+    width = settings.size("width")
+    height = settings.size("height")
+    fx = settings.number("fx", 0)
+    fy = settings.number("fy", 0)
     cx = settings.number("cx", usual=width / 2)
     cy = settings.number("cy", usual=height / 2)
     return Camera(pose, fx, fy, cx, cy, width, height)

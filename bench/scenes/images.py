@@ -140,10 +140,12 @@ def fitted_camera(camera: Camera, path: Path) -> Camera:
 
 def describe(view: View, downscale: int) -> ScaledView:
     """Describe a view as a `ScaledView`; raises if it is none, of another size, or too small."""
-    content, camera = contents(view.path), view.camera
+    content = contents(view.path)
+    camera = view.camera
     with opened(io.BytesIO(content), view.path) as image:
         check_mode(image, view.path)
-        turned, clear = obeyed(image, view), image.has_transparency_data
+        turned = obeyed(image, view)
+        clear = image.has_transparency_data
         size = image.size[::-1] if turned and orientation(image) > 4 else image.size
         if size != camera.size:
             expected = f"{camera.width} x {camera.height} pixels"

@@ -118,7 +118,8 @@ def read_views(
         log.info(f"{path.name}: none of its {len(files)} pictures are there, split left out")
         return []
     report(root, names, files, f"{path}: frames", log, every)
-    remarks, views = Remarks(), list[tuple[str, View | None]]()
+    remarks = Remarks()
+    views = list[tuple[str, View | None]]()
     remarks.add_unread(path, [record, *frames], KNOWN)
     for frame, name, file in zip(frames, map(tidy, names), files, strict=True):
         if not file:
@@ -128,7 +129,8 @@ def read_views(
         width, height = image_size(file)
         usual = Camera(pose, 0, 0, width / 2, height / 2, width, height)  # without a focal length
         camera = fitted_camera(read_camera(frame, usual, remarks), file)
-        lens, mask = read_lens(frame), frame_mask(root, frame, file)
+        lens = read_lens(frame)
+        mask = frame_mask(root, frame, file)
         views.append((name, View(os.path.relpath(file, root), file, camera, lens, *mask)))
     remarks.tell(log.info)
     return views
@@ -136,21 +138,27 @@ def read_views(
 
 def read_camera(settings: Fields, usual: Camera, remarks: Remarks) -> Camera:
     """The pinhole camera of a frame; what is not given is that of `usual`, scaled to its size."""
-    width, height = settings.size("w", usual.width), settings.size("h", usual.height)
+    width = settings.size("w", usual.width)
+    height = settings.size("h", usual.height)
     usual = scale_camera(usual, width, height)
-    x, y = focal(settings, "x", width, remarks), focal(settings, "y", height, remarks)
-    fx, fy = x or y or usual.fx, y or x or usual.fy
+    x = focal(settings, "x", width, remarks)
+    y = focal(settings, "y", height, remarks)
+    fx = x or y or usual.fx
+    fy = y or x or usual.fy
     if not fx:
         expected = "a focal length, or camera_angle_x"
         raise unexpected(settings.place("fl_x"), expected, "neither")
     # Outside of a picture, if it is a crop.
-    cx, cy = settings.number("cx", usual=usual.cx), settings.number("cy", usual=usual.cy)
+    cx = settings.number("cx", usual=usual.cx)
+    cy = settings.number("cy", usual=usual.cy)
     return Camera(usual.c2w, fx, fy, cx, cy, width, height)
 
 
 def focal(settings: Fields, axis: str, size: float, remarks: Remarks) -> float | None:
     """Focal length in pixels, from the frame or else the file; None if not given."""
-    fov, length, angle = f"{axis}_fov", f"fl_{axis}", f"camera_angle_{axis}"
+    fov = f"{axis}_fov"
+    length = f"fl_{axis}"
+    angle = f"camera_angle_{axis}"
     for level in settings.maps:
         given = {name: level[name] for name in (fov, length, angle) if name in level}
         if not given:
@@ -164,7 +172,8 @@ def focal(settings: Fields, axis: str, size: float, remarks: Remarks) -> float |
         radians = 2 * math.atan(size / 2 / pixels)
         meant = {fov: math.degrees(radians), length: pixels, angle: radians}
         for other, y in given.items():
-            low, high = 0.98 * meant[other], 1.02 * meant[other]
+            low = 0.98 * meant[other]
+            high = 1.02 * meant[other]
             if not (isinstance(y, int | float) and low < y < high):
                 remarks.add(at, f"is taken, not {other}, which contradicts it", describe(y))
         return pixels

@@ -64,7 +64,8 @@ class GaussianSplatting(OnField):
         self.background = scene.background.to(self.setup.device)
 
     def _trained(self, scene: Scene, budget: Budget, log: Log) -> Gaussians:
-        setup, steps = self.setup, self.steps or budget.renderer_steps
+        setup = self.setup
+        steps = self.steps or budget.renderer_steps
         teacher = train_field(setup, scene, budget, log)
         key = {
             "field": setup.key(scene, budget),

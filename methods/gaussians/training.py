@@ -93,7 +93,8 @@ class GaussianTraining(loop.Training):
         return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def advance(self) -> dict[str, float]:
-        options, gaussians = self.options, self.gaussians
+        options = self.options
+        gaussians = self.gaussians
         share = self.step / self.steps
         camera, target = self._picture(half=share < options.half)
         pixels = gaussians.render(camera, STOP, NullProbe(), self.backend)
@@ -107,9 +108,11 @@ class GaussianTraining(loop.Training):
         if options.similarity:
             loss = loss + options.similarity * (1 - ssim(picture, target, backend=self.backend))
         # Gaussians that are not needed fade. Far ones are large, and go far.
-        scales, before = gaussians.log_scales.exp(), gaussians.means.detach()
+        scales = gaussians.log_scales.exp()
+        before = gaussians.means.detach()
         if self.endless:
-            before, far = before.clone(), self._distances()
+            before = before.clone()
+            far = self._distances()
             scales = scales / far
         costs = options.opacity_cost * gaussians.opacities.mean()
         costs = costs + options.scale_cost * scales.mean()
@@ -142,17 +145,20 @@ class GaussianTraining(loop.Training):
         """The next training view and its picture [H, W, 3], NaN where pixels do not count; a pass
         uses every view once."""
         if not self.views:
-            count, generator = len(self.split), self.generator
+            count = len(self.split)
+            generator = self.generator
             order = torch.randperm(count, generator=generator, device=generator.device)
             self.views = order.tolist()
         view = self.views.pop()
-        camera, device = self.split.cameras[view], self.background.device
+        camera = self.split.cameras[view]
+        device = self.background.device
         picture = composite(self.split.images[view].to(device, non_blocking=True), self.background)
         if (mask := self.split.mask(view)) is not None:
             picture[~mask.to(device)] = math.nan
         if half and min(camera.size) > 1:
             camera = scale_camera(camera, camera.width // 2, camera.height // 2)
-            planes, size = picture.movedim(-1, 0)[None], (camera.height, camera.width)
+            planes = picture.movedim(-1, 0)[None]
+            size = (camera.height, camera.width)
             shrunk = functional.interpolate(planes, size=size, mode="area")
             picture = shrunk[0].movedim(0, -1).contiguous()
         return place_camera(camera, device), picture

@@ -62,7 +62,8 @@ class PixelBatches:
         fx, fy, cx, cy = inside.T[..., None]
         # A step in the picture, to the right and down, the ray through its upper left corner, and
         # the centre: [N, 4, 3].
-        right, down = poses[:, :, 0] / fx, poses[:, :, 1] / fy
+        right = poses[:, :, 0] / fx
+        down = poses[:, :, 1] / fy
         corner = poses[:, :, 2] - cx * right - cy * down
         self._rays = torch.stack((right, down, corner, poses[:, :, 3]), dim=1).float().to(device)
 

@@ -157,7 +157,8 @@ def train_field(setup: Setup, scene: Scene, budget: Budget, log: Log) -> Trained
         return FieldTraining(field, scene, budget, setup.training, setup.seed)
 
     tensors, *cost = loop.trained(begin, finished, "field", setup.device, log)
-    grid, field.gradients = new_grid(scene, setup.device), None
+    grid = new_grid(scene, setup.device)
+    field.gradients = None
     with checkpoint.restoring(finished):
         restore_field(field, grid, tensors)
     return TrainedField(field, grid, setup.training.sampling(budget), *cost)

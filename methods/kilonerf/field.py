@@ -62,9 +62,11 @@ def place_networks(occupancy: Occupancy, bounds: Tensor, along: int) -> tuple[Gr
     extent = bounds[1] - bounds[0]
     side = extent.max() / along * (1 + 1e-6)  # a little larger: no face is lost by rounding
     shape = (extent / side).ceil().int()
-    corner, device = bounds[0].clone(), bounds.device
+    corner = bounds[0].clone()
+    device = bounds.device
     cells = occupancy.cells.nonzero()  # [C, 3]
-    low, high = cells / occupancy.resolution, (cells + 1) / occupancy.resolution
+    low = cells / occupancy.resolution
+    high = (cells + 1) / occupancy.resolution
     first = ((low - corner) / side).floor().int()
     last = ((high - corner) / side).ceil().int() - 1
     parts = []

@@ -144,7 +144,8 @@ def _render_chunk(
     field: Field, rays: Rays, occupancy: Occupancy, probe: Probe, how: Sampling
 ) -> Pixels:
     """`render_rays` for rays that are rendered together."""
-    count, device = len(rays.origins), rays.origins.device
+    count = len(rays.origins)
+    device = rays.origins.device
     with probe.stage("field"):
         directions = field.encode_directions(rays.directions)
     canvas = Pixels.blank(count, field.channels, device)
@@ -182,12 +183,14 @@ def _render_chunk(
             with probe.stage("composite"):
                 canvas.put(left, front)
                 going = (sees & (resume >= 0)).nonzero().squeeze(1)
-                left, start = left[going], resume[going]
+                left = left[going]
+                start = resume[going]
         return canvas
     limit = taken = most = GPU_SAMPLES
     while taken >= limit:  # else no ray resumes: each would have taken as many as it may
         taken, canvas, resume, sees = advance(slice(None), canvas, start, limit)
-        start, most = torch.where(sees, resume, -1), max(most, taken)
+        start = torch.where(sees, resume, -1)
+        most = max(most, taken)
         limit *= max(most // (2 * taken), 2) if taken else 1
     return canvas
 
@@ -208,7 +211,8 @@ def _evaluated(
             sigma, geometry = field.density(pad(samples.positions))
             sigma = sigma[: len(samples)]
             seen = bright(sigma).nonzero().squeeze(1)
-            shaded, values = len(seen), sigma.new_zeros(len(samples), field.channels)
+            shaded = len(seen)
+            values = sigma.new_zeros(len(samples), field.channels)
             for part in seen.split(CACHED_SAMPLES):
                 index = pad(part)
                 view = encoded.index_select(0, samples.ray.index_select(0, index))
@@ -218,7 +222,8 @@ def _evaluated(
             columns = samples.positions.split(CHUNK_SAMPLES), samples.ray.split(CHUNK_SAMPLES)
             parts = [query(field, *piece, encoded) for piece in zip(*columns, strict=True)]
             sigma, values = joined(parts)
-            shaded, values = len(samples), torch.where(bright(sigma)[:, None], values, 0)
+            shaded = len(samples)
+            values = torch.where(bright(sigma)[:, None], values, 0)
     probe.count("shaded_samples", shaded, len(samples))
     field.count(probe, len(samples), shaded)
     return sigma, values

@@ -60,7 +60,9 @@ def train_stage2(
     """Train `stage2` on the field that `setup` made for `scene`, or load the result of the same
     training. The field is widened to K features and changed in place. Returns the pipeline, the
     key of its weights, and the seconds and the peak memory of stage 2 up to them."""
-    model, joint, steps = stage2.model, stage2.joint, budget.renderer_steps
+    model = stage2.model
+    joint = stage2.joint
+    steps = budget.renderer_steps
     key = {**setup.key(scene, budget), **stage2.key(budget)}
     finished = log.stage_dir("steernerf", key) / "steernerf.safetensors"
     count = 0 if finished.exists() else joint.distilled(steps)
@@ -70,11 +72,13 @@ def train_stage2(
         distilled, distilled_s = distilled_views(setup, trained, scene, budget, count, log)
     trained.field.widen(model.channels, setup.generator())
 
-    renderer, generator = stage2.make(setup), setup.generator()
+    renderer = stage2.make(setup)
+    generator = setup.generator()
     pipeline = Pipeline(trained, scene.background, renderer, model)
     patches = Patches(pipeline, scene, distilled, joint, generator)
     training = JointTraining(renderer, patches, steps, trained if patches.learning else None)
-    training.seconds, training.meter = distilled_s, meter
+    training.seconds = distilled_s
+    training.meter = meter
 
     with meter:
         loop.train(training, finished, "training the 2D renderer", log)

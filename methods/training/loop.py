@@ -73,10 +73,12 @@ def trained(
     if finished.exists():
         log.info(f"trained {label} found: {finished}")
     else:
-        begun, meter = time.monotonic(), MemoryMeter(str(device))
+        begun = time.monotonic()
+        meter = MemoryMeter(str(device))
         with meter:
             training = begin()
-            training.seconds, training.meter = time.monotonic() - begun, meter
+            training.seconds = time.monotonic() - begun
+            training.meter = meter
             train(training, finished, label, log)
     tensors, figures = checkpoint.read(finished)
     with checkpoint.restoring(finished):
@@ -160,7 +162,8 @@ def look(
     if not on_cpu and training.step % LOOK_EVERY:
         return {}
     with torch.no_grad():
-        before, training.asked = training.asked, _ask(errors())
+        before = training.asked
+        training.asked = _ask(errors())
     asked = training.asked if on_cpu else before
     told = {} if asked is None else asked()
     if not all(map(math.isfinite, told.values())):
@@ -171,7 +174,9 @@ def look(
 def _ask(errors: checkpoint.Tensors) -> Asked:
     """Send the errors to the host, which does not wait for them."""
     together = torch.stack([error.detach() for error in errors.values()])
-    labels, values, arrived = list(errors), together.to("cpu", non_blocking=True), None
+    labels = list(errors)
+    values = together.to("cpu", non_blocking=True)
+    arrived = None
     if together.device.type == "cuda":
         arrived = torch.cuda.current_stream(together.device).record_event()
 

@@ -69,10 +69,12 @@ def render(model: SceneModel, camera: Camera, samples: int) -> Frame:
     mean z-depth weighted by opacity (+inf where alpha is below EMPTY_ALPHA). A single sample is at
     the centre.
     """
-    (width, height), offsets = camera.size, sample_offsets(samples)
+    width, height = camera.size
+    offsets = sample_offsets(samples)
     x = (torch.arange(width)[:, None] + offsets[:, 0] - camera.cx) / camera.fx
     y = (torch.arange(height)[:, None] + offsets[:, 1] - camera.cy) / camera.fy
-    rgb, (alpha, depth) = torch.zeros(height, width, 3), torch.zeros(2, height, width)
+    rgb = torch.zeros(height, width, 3)
+    alpha, depth = torch.zeros(2, height, width)
     rows = max(BAND_RAYS // (width * samples), 1)
     seen_in = windows(camera, model.boxes())
     for top in range(0, height, rows):

@@ -102,7 +102,8 @@ def _hashed(samples: int, features: int) -> Given:
     grid = HashGrid(**DYADIC, features=features)
     random = Random(samples)
     table = random.signed(grid.entries, features)
-    steps, most = [], 0.0
+    steps = []
+    most = 0.0
     for _ in range(STEPS):
         positions = random.whole(0, 33, samples, 3) / 32
         grads = random.whole(-2, 3, samples, grid.channels) / 4

@@ -184,10 +184,13 @@ def _given(
     random = Random(rays + most)
     counts = random.whole(0, most + 1, rays)
     counts[: rays // 2] = most
-    total, alpha = int(counts.sum()), random.share(rays)
+    total = int(counts.sum())
+    alpha = random.share(rays)
     front = Pixels(alpha[:, None].expand(rays, channels), DEPTH * alpha, alpha)
-    sigma, values = density * random.share(total), random.share(total, channels)
-    t, delta = DEPTH * random.share(total), DEPTH / max(most, 1) * random.share(total)
+    sigma = density * random.share(total)
+    values = random.share(total, channels)
+    t = DEPTH * random.share(total)
+    delta = DEPTH / max(most, 1) * random.share(total)
     return {
         "sigma": sigma,
         "values": values,
@@ -212,14 +215,16 @@ def _extreme_error(
     sigma, delta = torch.full((2, 8), 2.0, dtype=torch.float64)
     delta[:] = 0.1
     sigma[3], delta[3] = extreme
-    values, t = torch.linspace(0, 1, 24).view(8, 3).flip(0), torch.linspace(0, 2, 8)
+    values = torch.linspace(0, 1, 24).view(8, 3).flip(0)
+    t = torch.linspace(0, 2, 8)
     given = _ray(sigma, delta, values, t, precision)
     there = placed(given, device)
     learned = [there[name].requires_grad_(backward) for name in ("sigma", "values")]
     pixels = composite(**there, backend=backend).columns
 
     sigma, values, intervals, _ = placed(given, "cpu", "fp64").values()
-    t, delta = intervals.t, intervals.delta
+    t = intervals.t
+    delta = intervals.delta
     tau = torch.where(delta > 0, sigma * delta, 0)
     behind = torch.exp(-tau.cumsum(0))
     weights = pad(behind[:-1], (1, 0), value=1.0) * -torch.expm1(-tau)

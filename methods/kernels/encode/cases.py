@@ -92,7 +92,8 @@ def cases() -> list[Case]:
         ("view, packed", LARGE, _view(VIEW), True),
         ("random, packed", LARGE, _random(VIEW), True),
     ):
-        precision, given = "bf16" if packed else "fp32", (positions, grid, packed)
+        precision = "bf16" if packed else "fp32"
+        given = (positions, grid, packed)
         found += ENCODE.cases(name, _given, *given, precision=precision, items=len(positions))
     return [*found, *_extremes()]
 

@@ -203,7 +203,8 @@ def _ways() -> Iterator[Case]:
 
 def _way_error(grid: str, given: Rays, backend: str, device: str, precision: str) -> float:
     """Error of the path length covered by the samples; infinite if they are not in order."""
-    rays, occupied = placed(given, device, precision), cells(grid, SIZE)
+    rays = placed(given, device, precision)
+    occupied = cells(grid, SIZE)
     samples = march(rays, Occupancy(occupied.to(device)), STEP, backend=backend)
     same = samples.ray[1:] == samples.ray[:-1]
     if (samples.t.diff()[same] < 0).any() or (samples.resume >= 0).any():

@@ -26,7 +26,8 @@ def march(segments: Segments, occupancy: Occupancy) -> Samples:
     offsets = offsets_of(counts)
     total, longest = total_and_longest(counts, offsets)
     place = torch.nonzero_static(kept.flatten(), size=total).squeeze(1)
-    ray, k = place // max(steps.most, 1), place % max(steps.most, 1)
+    ray = place // max(steps.most, 1)
+    k = place % max(steps.most, 1)
     t, positions = steps.at(ray, k)
     course = steps.course
     delta = torch.full_like(t, segments.step) if course is None else course.lengths(ray, t)

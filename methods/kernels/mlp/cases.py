@@ -60,7 +60,8 @@ def cases() -> list[Case]:
 
 def _network(count: int, network: Network, precision: str) -> Given:
     inputs, widths = network
-    random, channels = Random(count), (sum(inputs), *widths)
+    random = Random(count)
+    channels = (sum(inputs), *widths)
     shapes = [(channels[n + 1], channels[n]) for n in range(len(widths))]
     drawn = {
         "inputs": [_eighths(random, count, part) for part in inputs],

@@ -111,9 +111,13 @@ def _inside() -> Given:
     pairs = torch.cartesian_prod(torch.arange(27), torch.arange(27))
     drawn = Random(1000).share(2, 1000, 3)
     entry, leave = torch.cat((drawn, places[pairs.T]), dim=1)
-    count, rays = len(entry), Rays(entry / SIDE, (leave - entry) / SIDE)
-    number, zeros, ones = torch.arange(count), torch.zeros(count), torch.ones(count)
-    offsets, first = torch.arange(count + 1), torch.zeros(count, dtype=torch.int32)
+    count = len(entry)
+    rays = Rays(entry / SIDE, (leave - entry) / SIDE)
+    number = torch.arange(count)
+    zeros = torch.zeros(count)
+    ones = torch.ones(count)
+    offsets = torch.arange(count + 1)
+    first = torch.zeros(count, dtype=torch.int32)
     crossings = Crossings(ones / 2, ones, offsets, zeros, ones, number.int(), first)
     voxels = Voxels(torch.zeros(1, 3, dtype=torch.int32), SIDE)
     return {"rays": rays, "crossings": crossings, "voxels": voxels}
@@ -132,8 +136,10 @@ def _quadrature_error(
     make: Callable[[], Given], backend: str, device: str, precision: str
 ) -> float:
     rays, crossings, voxels = placed(list(make().values()), device, precision)
-    ray, corner = crossings.ray.long(), voxels.coordinates[crossings.voxel.long()]
-    origins, directions = rays.origins[ray].double(), rays.directions[ray].double()
+    ray = crossings.ray.long()
+    corner = voxels.coordinates[crossings.voxel.long()]
+    origins = rays.origins[ray].double()
+    directions = rays.directions[ray].double()
     near, far = (
         ((origins + t.double()[:, None] * directions) * SIDE - corner).clamp(0, 1)
         for t in (crossings.near, crossings.far)

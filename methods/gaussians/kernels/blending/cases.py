@@ -123,20 +123,24 @@ def _alphas(given: Given, width: int, height: int) -> Tensor:
 
 def _loop_error(backend: str, device: str, precision: str) -> float:
     """Of pixels, and of their slopes in the colours: weights, which are 0 behind the stop."""
-    width, height = 13, 9
+    width = 13
+    height = 9
     given = draw(60, width, height, stop=0.3)
     given["opacities"][0] = 1.0  # its alpha is cut
-    depth, shares = given["depth"], torch.zeros(width * height, 60, dtype=torch.float64)
+    depth = given["depth"]
+    shares = torch.zeros(width * height, 60, dtype=torch.float64)
     for row, weights in zip(_alphas(given, width, height).tolist(), shares, strict=True):
         light = 1.0
         for i in depth.argsort().tolist():
             if light > given["stop"] and row[i] >= LEAST_ALPHA:
                 weights[i] = light * min(row[i], LARGEST_ALPHA)
                 light -= weights[i].item()
-    weights, there = shares[:, : len(depth)], placed(given, device, precision)
+    weights = shares[:, : len(depth)]
+    there = placed(given, device, precision)
     there["colours"].requires_grad_()
     got = _pixels(**there, backend=backend)
     (slope,) = torch.autograd.grad(got[0].mean(dim=0).sum(), there["colours"])
-    colours, z = weights @ given["colours"].double(), weights @ depth.double()
+    colours = weights @ given["colours"].double()
+    z = weights @ depth.double()
     want = colours, z, weights.sum(dim=1), weights.mean(dim=0)[:, None].expand(-1, 3)
     return largest_error((*got, slope), want)

@@ -18,7 +18,8 @@ def blend(
     bands = []
     for top in range(0, height, BAND):
         rows = min(BAND, height - top)
-        y, half = ellipses.centres[:, 1].detach(), ellipses.extents[:, 1]
+        y = ellipses.centres[:, 1].detach()
+        half = ellipses.extents[:, 1]
         reaching = (half > 0) & (y + half >= top) & (y - half <= top + rows)
         some = order[reaching[order]]
         column, row = pixel_grid(width, rows, opacities.device).to(opacities).unbind(dim=1)

@@ -117,7 +117,8 @@ def _slopes_error(backend: str, device: str, precision: str) -> float:
     conics = spread.inverse().flatten(1)[:, [0, 1, 3]]
     reach = 2 * (opacities / LEAST_ALPHA).log()[:, None]
     extents = (reach * spread.diagonal(dim1=1, dim2=2)).sqrt()
-    width, (exact, z) = camera.width, project(CAMERA, means)
+    width = camera.width
+    exact, z = project(CAMERA, means)
     got = ellipses.centres / width, ellipses.conics, ellipses.depth, ellipses.extents / width
     return largest_error(got, (exact / width, conics, z, extents / width))
 
@@ -136,7 +137,8 @@ HIDDEN: dict[str, dict[str, float]] = {
 def _shown(changed: dict[str, float], backend: str, device: str, precision: str) -> float:
     """How many numbers are shown, or have a gradient that is not finite."""
     place = CAMERA.centre + changed.get("depth", 1.0) * CAMERA.c2w[:, 2]
-    scales, opacity = torch.full((1, 3), changed.get("scale", 0.01)), changed.get("opacity", 0.5)
+    scales = torch.full((1, 3), changed.get("scale", 0.01))
+    opacity = changed.get("opacity", 0.5)
     shape = place[None], scales, torch.tensor([[1.0, 0, 0, 0]])
     given = *shape, torch.tensor([opacity]), CAMERA
     *shape, opacities, camera = placed(given, device, precision)

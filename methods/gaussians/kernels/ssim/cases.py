@@ -43,7 +43,9 @@ def _pictures(kind: str, height: int, width: int) -> Given:
     if kind == "black":
         one[:, : width // 2] = 0
     if kind == "patch":
-        rows, columns = slice(height // 4, height // 2 + 1), slice(width // 5, width // 2 + 1)
-        patch, other = other[rows, columns], one.clone()
+        rows = slice(height // 4, height // 2 + 1)
+        columns = slice(width // 5, width // 2 + 1)
+        patch = other[rows, columns]
+        other = one.clone()
         other[rows, columns] = patch
     return {"picture": one, "target": one if kind == "equal" else other}
