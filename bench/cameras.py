@@ -46,9 +46,11 @@ def project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
     local = (points - centre) @ rotation  # R^T (p - c), row vectors
     x, y, depth = local.unbind(dim=-1)
     safe = torch.where(depth > 0, depth, torch.ones_like(depth))
-    u = camera.fx * x / safe + camera.cx
-    v = camera.fy * y / safe + camera.cy
-    return torch.stack((u, v), dim=-1), depth
+    pixels = (
+        camera.fx * x / safe + camera.cx,
+        camera.fy * y / safe + camera.cy,
+    )
+    return torch.stack(pixels, dim=-1), depth
 
 
 def within(pixels: Tensor, width: int, height: int) -> Tensor:

@@ -217,9 +217,14 @@ class Operation:
             if not wanted:
                 return results
             lit = [x for x in results if x.requires_grad]
-            drawn = zip(lit, shine(*(x.shape for x in lit)), strict=True)
-            grads = [grad.to(x.dtype) for x, grad in drawn]
-            found = torch.autograd.grad(lit, wanted, grads, materialize_grads=True)
+            shapes = (x.shape for x in lit)
+            grads = [grad.to(x.dtype) for x, grad in zip(lit, shine(*shapes), strict=True)]
+            found = torch.autograd.grad(
+                lit,
+                wanted,
+                grads,
+                materialize_grads=True,
+            )
             if self.relative:
                 found = tuple(x / x.abs().max().clamp(min=1e-30) if len(x) else x for x in found)
             return (*(x.detach() for x in results), *found)

@@ -64,10 +64,12 @@ def entries_of(record: Mapping, name: str, path: Path) -> list[Fields]:
     entries = record.get(name)
     if not isinstance(entries, list) or not entries:
         raise unexpected(f"{path}: {name}", "a list with at least one entry", describe(entries))
-    placed = [Fields(f"{path}: {name}[{n}]", one, record) for n, one in enumerate(entries)]
-    for one in placed:
-        if not isinstance(one.maps[0], dict):
-            raise unexpected(one.where, "an object", describe(one.maps[0]))
+    placed = []
+    for number, entry in enumerate(entries):
+        where = f"{path}: {name}[{number}]"
+        if not isinstance(entry, dict):
+            raise unexpected(where, "an object", describe(entry))
+        placed.append(Fields(where, entry, record))
     return placed
 
 

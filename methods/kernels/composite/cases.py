@@ -187,14 +187,14 @@ def _given(
     total = int(counts.sum())
     alpha = random.share(rays)
     front = Pixels(alpha[:, None].expand(rays, channels), DEPTH * alpha, alpha)
-    sigma = density * random.share(total)
-    values = random.share(total, channels)
-    t = DEPTH * random.share(total)
-    delta = DEPTH / max(most, 1) * random.share(total)
     return {
-        "sigma": sigma,
-        "values": values,
-        "intervals": Intervals(t, delta, offsets_of(counts)),
+        "sigma": density * random.share(total),
+        "values": random.share(total, channels),
+        "intervals": Intervals(
+            t=DEPTH * random.share(total),
+            delta=DEPTH / max(most, 1) * random.share(total),
+            offsets=offsets_of(counts),
+        ),
         "carry": front if carry else None,
         "stop": stop,
     }

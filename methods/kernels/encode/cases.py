@@ -165,9 +165,20 @@ def _feature_error(positions: Tensor, backend: str, device: str, precision: str)
     # Multiples of 1/64, which bfloat16 holds.
     table = Random(0).whole(-64, 65, GRID.entries, GRID.features) / 64
     packed = pack(table) if precision == "bf16" else None
-    given = {"positions": positions, "table": table, "grid": GRID, "packed": packed}
-    there = placed(given, device, "fp32" if packed is not None else precision)
+    given = {
+        "positions": positions,
+        "table": table,
+        "grid": GRID,
+        "packed": packed,
+    }
+    kind = precision if packed is None else "fp32"
+    there = placed(given, device, kind)
     got = encode(**there, backend=backend)
-    nearest = there["positions"].cpu().double().clamp(0, 1).tolist()
-    exact = [_exact(at, level, table) for at in nearest for level in range(GRID.levels)]
-    return largest_error((got,), (torch.cat(exact).view(got.shape),))
+    nearest = there["positions"].cpu().double().clamp(0, 1)
+    exact = [
+        _exact(position, level, table)
+        for position in nearest.tolist()
+        for level in range(GRID.levels)
+    ]
+    want = torch.cat(exact).view(got.shape)
+    return largest_error((got,), (want,))

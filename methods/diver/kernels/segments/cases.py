@@ -112,15 +112,21 @@ def _inside() -> Given:
     drawn = Random(1000).share(2, 1000, 3)
     entry, leave = torch.cat((drawn, places[pairs.T]), dim=1)
     count = len(entry)
-    rays = Rays(entry / SIDE, (leave - entry) / SIDE)
-    number = torch.arange(count)
-    zeros = torch.zeros(count)
     ones = torch.ones(count)
-    offsets = torch.arange(count + 1)
-    first = torch.zeros(count, dtype=torch.int32)
-    crossings = Crossings(ones / 2, ones, offsets, zeros, ones, number.int(), first)
-    voxels = Voxels(torch.zeros(1, 3, dtype=torch.int32), SIDE)
-    return {"rays": rays, "crossings": crossings, "voxels": voxels}
+    crossings = Crossings(
+        t=ones / 2,
+        delta=ones,
+        offsets=torch.arange(count + 1),
+        near=torch.zeros(count),
+        far=ones,
+        ray=torch.arange(count).int(),
+        voxel=torch.zeros(count, dtype=torch.int32),
+    )
+    return {
+        "rays": Rays(entry / SIDE, (leave - entry) / SIDE),
+        "crossings": crossings,
+        "voxels": Voxels(torch.zeros(1, 3, dtype=torch.int32), SIDE),
+    }
 
 
 def _through() -> Given:

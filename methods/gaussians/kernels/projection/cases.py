@@ -136,14 +136,21 @@ HIDDEN: dict[str, dict[str, float]] = {
 
 def _shown(changed: dict[str, float], backend: str, device: str, precision: str) -> float:
     """How many numbers are shown, or have a gradient that is not finite."""
-    place = CAMERA.centre + changed.get("depth", 1.0) * CAMERA.c2w[:, 2]
-    scales = torch.full((1, 3), changed.get("scale", 0.01))
-    opacity = changed.get("opacity", 0.5)
-    shape = place[None], scales, torch.tensor([[1.0, 0, 0, 0]])
-    given = *shape, torch.tensor([opacity]), CAMERA
-    *shape, opacities, camera = placed(given, device, precision)
-    means, scales, rotations = learned = [x.requires_grad_() for x in shape]
-    found = project_gaussians(means, scales, rotations, opacities, camera, backend=backend)
-    slopes = torch.autograd.grad(found.centres.sum() + found.conics.sum(), learned)
-    wrong = found.extents.count_nonzero() + sum((~x.isfinite()).sum() for x in slopes)
+    depth = changed.get("depth", 1.0)
+    shape = {
+        "means": (CAMERA.centre + depth * CAMERA.c2w[:, 2])[None],
+        "scales": torch.full((1, 3), changed.get("scale", 0.01)),
+        "rotations": torch.tensor([[1.0, 0, 0, 0]]),
+    }
+    rest = {
+        "opacities": torch.tensor([changed.get("opacity", 0.5)]),
+        "camera": CAMERA,
+    }
+    shape, rest = placed((shape, rest), device, precision)
+    learned = [x.requires_grad_() for x in shape.values()]
+    found = project_gaussians(**shape, **rest, backend=backend)
+    shown = found.centres.sum() + found.conics.sum()
+    slopes = torch.autograd.grad(shown, learned)
+    wrong = found.extents.count_nonzero()
+    wrong += sum((~x.isfinite()).sum() for x in slopes)
     return float(wrong)

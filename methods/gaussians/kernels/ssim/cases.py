@@ -32,8 +32,14 @@ def cases() -> list[Case]:
     for height, width in ((40, 33), (1, 1), (3, 20), (400, 400)):
         for kind in ("noise", "patch", "equal", "black"):
             items = height * width if (height, kind) == (400, "noise") else 0
-            name = f"{kind}, {width} x {height}"
-            both = SSIM.cases(name, _pictures, kind, height, width, items=items)
+            both = SSIM.cases(
+                f"{kind}, {width} x {height}",
+                _pictures,
+                kind,
+                height,
+                width,
+                items=items,
+            )
             found += both[:1] if kind == "equal" else both  # there its gradient is 0
     return found
 
