@@ -105,15 +105,14 @@ def _normalisation_error(side: float, backend: str, device: str, precision: str)
     """Pixel error after normalising a cube of `side` that lies some 10^4 sides from the origin."""
     camera = CAMERAS["looking at the cube"]
     origin = side * torch.tensor([1e4, -2e4, 3e4], dtype=torch.float64)
-    given = camera.c2w.double()
-    given = torch.cat((given[:, :3], (origin + side * given[:, 3])[:, None]), dim=1)
-    moved = move_camera(replace(camera, c2w=given), 1 / side, -origin / side)
+    centre = origin + side * camera.centre.double()
+    pose = torch.column_stack((camera.rotation.double(), centre))
+    there = replace(camera, c2w=pose)
+    moved = move_camera(there, 1 / side, -origin / side)
     rays = cast(place_camera(moved, device))
     points = (rays.origins + 2 * rays.directions).cpu().double()
-    local = (origin + side * points - given[:, 3]) @ given[:, :3]
-    u = camera.fx * local[:, 0] / local[:, 2] + camera.cx
-    v = camera.fy * local[:, 1] / local[:, 2] + camera.cy
-    return _apart(torch.stack((u, v), dim=1), pixel_grid(*camera.size))
+    pixels, _ = project(there, origin + side * points)
+    return _apart(pixels, pixel_grid(*camera.size))
 
 
 def _motion_error(backend: str, device: str, precision: str) -> float:
