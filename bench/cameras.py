@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from bench.types import Camera, Rays, check_shape
 
@@ -21,14 +22,14 @@ def pixel_grid(width: int, height: int, device: torch.device | str = "cpu") -> T
 def cast(camera: Camera, pixels: Tensor | None = None) -> Rays:
     """Rays through `pixels` [R, 2] as (u, v), or through all pixel centres, row by row."""
     if pixels is None:
-        pixels = pixel_grid(camera.width, camera.height, camera.c2w.device)
+        pixels = pixel_grid(*camera.size, camera.c2w.device)
     check_shape("pixels", pixels, None, 2)
     x = (pixels[:, 0] - camera.cx) / camera.fx
     y = (pixels[:, 1] - camera.cy) / camera.fy
     local = torch.stack((x, y, torch.ones_like(x)), dim=-1)
-    rotation = camera.c2w[:, :3].to(local.dtype)
+    rotation = camera.rotation.to(local.dtype)
     directions = local @ rotation.T
-    return Rays(camera.c2w[:, 3].to(local.dtype).expand_as(directions), directions)
+    return Rays(camera.centre.to(local.dtype).expand_as(directions), directions)
 
 
 def unproject(camera: Camera, pixels: Tensor, depth: Tensor) -> Tensor:
@@ -38,15 +39,18 @@ def unproject(camera: Camera, pixels: Tensor, depth: Tensor) -> Tensor:
 
 
 def project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels [R, 2] and z-depth [R] of `points` [R, 3] (Eq. 7, 9); no pixel unless depth > 0."""
-    check_shape("points", points, None, 3)
-    rotation, centre = camera.c2w[:, :3].to(points.dtype), camera.c2w[:, 3].to(points.dtype)
+    """Pixels [..., 2] and z-depth [...] of `points` [..., 3] (Eq. 7, 9); none unless depth > 0."""
+    check_shape("points", points, *[None] * (points.dim() - 1), 3)
+    rotation = camera.rotation.to(points.dtype)
+    centre = camera.centre.to(points.dtype)
     local = (points - centre) @ rotation  # R^T (p - c), row vectors
-    depth = local[:, 2]
+    x, y, depth = local.unbind(dim=-1)
     safe = torch.where(depth > 0, depth, torch.ones_like(depth))
-    u = camera.fx * local[:, 0] / safe + camera.cx
-    v = camera.fy * local[:, 1] / safe + camera.cy
-    return torch.stack((u, v), dim=-1), depth
+    pixels = (
+        camera.fx * x / safe + camera.cx,
+        camera.fy * y / safe + camera.cy,
+    )
+    return torch.stack(pixels, dim=-1), depth
 
 
 def within(pixels: Tensor, width: int, height: int) -> Tensor:
@@ -91,9 +95,8 @@ def place_camera(camera: Camera, device: torch.device | str) -> Camera:
 
 def pack_camera(camera: Camera) -> Tensor:
     """`camera` as one [18] float64 tensor on the CPU: `c2w` row by row, then the intrinsics."""
-    sizes = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
     pose = camera.c2w.double().cpu().flatten()
-    return torch.cat((pose, pose.new_tensor(sizes)))
+    return torch.cat((pose, pose.new_tensor((*camera.intrinsics, *camera.size))))
 
 
 def unpack_camera(packed: Tensor) -> Camera:
@@ -104,6 +107,6 @@ def unpack_camera(packed: Tensor) -> Camera:
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
     """Camera-to-world [3, 4] at `eye`, looking at `target`, with `up` upward in the picture."""
-    forward = torch.nn.functional.normalize(target - eye, dim=0)
-    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
+    forward = normalize(target - eye, dim=0)
+    right = normalize(torch.linalg.cross(forward, up), dim=0)
     return torch.stack((right, torch.linalg.cross(forward, right), forward, eye), dim=1)

@@ -36,6 +36,32 @@ U16 = 2.0**-8
 to neighbours."""
 
 
+LEAST_TIMED = 2000  # samples, rays or entries a call: fewer are done in too short a time
+
+
+class Random:
+    """Random numbers of a seed: what they are depends on what was drawn before."""
+
+    def __init__(self, seed: int) -> None:
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def share(self, *shape: int) -> Tensor:
+        """From 0 to 1."""
+        return torch.rand(shape, generator=self.generator)
+
+    def signed(self, *shape: int) -> Tensor:
+        """From -1 to 1."""
+        return 2 * self.share(*shape) - 1
+
+    def normal(self, *shape: int) -> Tensor:
+        """Of mean 0 and variance 1."""
+        return torch.randn(shape, generator=self.generator)
+
+    def whole(self, low: int, end: int, *shape: int) -> Tensor:
+        """Integers from `low` to less than `end`."""
+        return torch.randint(low, end, shape, generator=self.generator)
+
+
 class Deviation(NamedTuple):
     """An error, and the largest one that is allowed there."""
 
@@ -100,8 +126,9 @@ class Property:
     derivation: str
     tolerances: Mapping[Cell, float]
 
-    def case(self, name: str, error: Callable[[str, str, str], float]) -> Case:
-        return Case(name=name, error=error, **vars(self))
+    def case(self, name: str, error: Callable[..., float], *settings: object) -> Case:
+        """A case that calls `error` with `settings` first."""
+        return Case(name=name, error=partial(error, *settings), **vars(self))
 
 
 @dataclass(frozen=True)
@@ -115,8 +142,8 @@ class Difference:
     def __call__(self, backend: str, device: str, precision: str) -> Deviation:
         if (backend, device) == ("reference", "cpu"):
             return Deviation(0.0, 0.0)
-        got = tuple(result.cpu() for result in self.prepare(device)(backend))
-        return nearest(got, self.prepare("cpu")("reference"), self.tolerances())
+        got, want = self.prepare(device)(backend), self.prepare("cpu")("reference")
+        return nearest(got, want, self.tolerances())
 
 
 @dataclass(frozen=True)
@@ -130,49 +157,45 @@ class Bound:
         return self.off(given) if callable(self.off) else self.off
 
 
-def uniform(generator: torch.Generator, shape: Sequence[int]) -> Tensor:
-    """Random numbers from -1 to 1."""
-    return 2 * torch.rand(tuple(shape), generator=generator) - 1
-
-
 @dataclass(frozen=True)
 class Operation:
     """An operation; all its `backends` agree with the reference, forward and backward."""
 
     subject: str
     backends: Sequence[str]
-    compute: Callable[[Given, str], tuple[Tensor, ...]]  # its results, with a backend
+    compute: Callable[..., Any]  # its results, of the inputs by name and a `backend`
     outputs: Mapping[str, Bound]  # of each result, by its name, in their order
     gradients: Mapping[str, Bound] = field(default_factory=dict)  # of an input or a list of them
-    draw: Callable[[torch.Generator, Sequence[int]], Tensor] = uniform  # gradients of the results
+    draw: Callable[..., Tensor] = Random.signed  # gradients of the results, of a `Random` and sizes
     relative: bool = False  # gradients are compared in units of the largest number of each
 
     def cases(
         self,
         name: str,
-        make: Callable[[], Given],
-        *,
+        make: Callable[..., Given],
+        *settings: object,
         precision: str = "fp32",
-        items: int | None = None,
+        items: int = 0,
     ) -> list[Case]:
-        """The cases with the inputs that `make` makes on the CPU: one of the outputs and, if there
-        are gradients, one of outputs and gradients. They are timed if `items`, the number that a
-        call processes, is given."""
+        """The cases with the inputs that `make` makes of `settings` on the CPU: one of the outputs
+        and, if there are gradients, one of outputs and gradients. They are timed if `items`, the
+        number that a call processes, is at least `LEAST_TIMED`."""
+        given = partial(make, *settings)
         ways: list[tuple[str, Mapping[str, Bound]]] = [(self.subject, {})]
         if self.gradients:
             ways.append((f"{self.subject} backward", self.gradients))
         found = []
         for subject, gradients in ways:
             bounds = {**self.outputs, **{f"gradient of {k}": v for k, v in gradients.items()}}
-            prepare = partial(self._prepare, make, tuple(gradients))
+            prepare = partial(self._prepare, given, tuple(gradients))
             case = Case(
                 subject,
                 name,
                 "the result is that of the reference",
                 "; ".join(f"{result}: {bound.why}" for result, bound in bounds.items()),
                 dict.fromkeys((backend, precision) for backend in self.backends),
-                Difference(prepare, partial(self._tolerances, make, gradients)),
-                items,
+                Difference(prepare, partial(self._tolerances, given, gradients)),
+                items if items >= LEAST_TIMED else None,
             )
             found.append(case)
         return found
@@ -186,22 +209,35 @@ class Operation:
 
         @cache
         def shine(*shapes: torch.Size) -> list[Tensor]:
-            generator = torch.Generator().manual_seed(1)
-            return [self.draw(generator, shape).to(device) for shape in shapes]
+            random = Random(1)
+            return [self.draw(random, *shape).to(device) for shape in shapes]
 
         def call(backend: str) -> tuple[Tensor, ...]:
-            results = self.compute(given, backend)
+            results = self._results(self.compute(**given, backend=backend))
             if not wanted:
                 return results
             lit = [x for x in results if x.requires_grad]
-            drawn = zip(lit, shine(*(x.shape for x in lit)), strict=True)
-            grads = [grad.to(x.dtype) for x, grad in drawn]
-            found = torch.autograd.grad(lit, wanted, grads, materialize_grads=True)
+            shapes = (x.shape for x in lit)
+            grads = [grad.to(x.dtype) for x, grad in zip(lit, shine(*shapes), strict=True)]
+            found = torch.autograd.grad(
+                lit,
+                wanted,
+                grads,
+                materialize_grads=True,
+            )
             if self.relative:
                 found = tuple(x / x.abs().max().clamp(min=1e-30) if len(x) else x for x in found)
             return (*(x.detach() for x in results), *found)
 
         return call
+
+    def _results(self, computed: Any) -> tuple[Tensor, ...]:
+        """A tensor, several, or those of an object that are called like the outputs."""
+        if isinstance(computed, Tensor):
+            return (computed,)
+        if isinstance(computed, tuple):
+            return computed
+        return tuple(getattr(computed, name) for name in self.outputs)
 
     def _tolerances(
         self, make: Callable[[], Given], gradients: Mapping[str, Bound]
@@ -217,18 +253,22 @@ def _several(value: Tensor | Sequence[Tensor]) -> Sequence[Tensor]:
     return [value] if isinstance(value, Tensor) else value
 
 
-def placed(value: Any, device: str) -> Any:
-    """The tensors in mappings, lists and dataclasses on `device`, detached."""
+def placed(value: Any, device: str, precision: str = "") -> Any:
+    """The tensors in mappings, lists and dataclasses on `device`, detached; those of floating-point
+    numbers in a `precision`, if that is given."""
+
+    def moved(part: Any) -> Any:
+        return placed(part, device, precision)
+
     if isinstance(value, Tensor):
-        return value.detach().to(device)
+        rounded = precision and value.is_floating_point()
+        return value.detach().to(device, DTYPES[precision] if rounded else value.dtype)
     if isinstance(value, Mapping):
-        return {name: placed(item, device) for name, item in value.items()}
+        return {name: moved(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
-        return [placed(item, device) for item in value]
+        return [moved(item) for item in value]
     if is_dataclass(value) and not isinstance(value, type):
-        return replace(
-            value, **{f.name: placed(getattr(value, f.name), device) for f in fields(value)}
-        )
+        return replace(value, **{f.name: moved(getattr(value, f.name)) for f in fields(value)})
     return value
 
 
@@ -265,10 +305,11 @@ def largest_error(results: Sequence[Tensor], reference: Sequence[Tensor]) -> flo
 
 
 def _errors(got: Tensor, want: Tensor) -> Tensor:
-    """|got - want| in float64; inf where only one is NaN or infinite, or if shapes differ."""
+    """|got - want| in float64 on the CPU; inf where only one is NaN or infinite, or if shapes
+    differ."""
     if got.shape != want.shape:
         return torch.full((1,), torch.inf, dtype=torch.float64)
-    got, want = got.detach().double(), want.detach().double()
+    got, want = (x.detach().cpu().double() for x in (got, want))
     same = (got == want) | (got.isnan() & want.isnan())
     error = torch.where(same, 0, (got - want).abs())
     return torch.where(error.isnan(), torch.inf, error)

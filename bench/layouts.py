@@ -75,7 +75,8 @@ def _colmap(scene: Scene, folder: Path, log: Log) -> None:
     points = (scene.origin + scene.unit_length * inside).tolist()
     for name, split in scene.splits.items():
         place = folder / ("" if name == "train" else name)
-        model, pictures = place / "sparse" / "0", place / "images"
+        model = place / "sparse" / "0"
+        pictures = place / "images"
         for made in (model, pictures):
             made.mkdir(parents=True)
 
@@ -83,12 +84,13 @@ def _colmap(scene: Scene, folder: Path, log: Log) -> None:
             flat = as_bytes(composite(split.images[number - 1], scene.background))
             Image.fromarray(flat).save(pictures / f"{number:04}.png")
 
-        numbers, cameras, images = range(1, len(split) + 1), [], []
+        numbers = range(1, len(split) + 1)
+        cameras = []
+        images = []
         in_parallel(write, numbers, f"write {name}", log)
         for number, seen in zip(numbers, split.cameras, strict=True):
             camera = data_camera(scene, seen)
-            lens = camera.fx, camera.fy, camera.cx, camera.cy
-            cameras.append(_line(number, "PINHOLE", camera.width, camera.height, *lens))
+            cameras.append(_line(number, "PINHOLE", *camera.size, *camera.intrinsics))
             pose = camera.c2w.numpy()
             turn = Rotation.from_matrix(pose[:, :3].T)  # world to camera, exactly a rotation
             shift = turn.apply(-pose[:, 3])

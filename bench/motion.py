@@ -11,6 +11,7 @@ from dataclasses import replace
 import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
 from torch import Generator, Tensor
+from torch.nn.functional import normalize
 
 from bench.errors import unexpected
 from bench.types import Camera, Scene, check_shape
@@ -32,14 +33,14 @@ def viewing_target(scene: Scene) -> Tensor:
 
 def rotation_between(first: Camera, second: Camera) -> Tensor:
     """The rotation [3] from `first` to `second`, axis times angle, in the axes of `first`."""
-    relative = first.c2w[:, :3].double().T @ second.c2w[:, :3].double()
+    relative = first.rotation.double().T @ second.rotation.double()
     return rotation_matrix_to_axis_angle(relative[None])[0]
 
 
 def shift_of(target: Tensor, first: Camera, second: Camera) -> float:
     """By how much the `target` [3] moves in the axes of a camera that goes from `first` to
     `second`, as an angle in radians: 0 on an orbit, where the camera turns with it."""
-    before, after = (x.c2w[:, :3].double().T @ -_offset(x, target) for x in (first, second))
+    before, after = (x.rotation.double().T @ -_offset(x, target) for x in (first, second))
     return math.atan2((after - before).norm().item(), before.norm().item())
 
 
@@ -50,8 +51,8 @@ def between(first: Camera, second: Camera, turn: Tensor, share: float) -> Camera
     it is off by 0.06 % of the distance. Raises SteerbenchError if the pictures differ in size.
     """
     camera = lens_between(first, second, share)
-    rotation = first.c2w[:, :3].double() @ _rotation(share * turn)
-    centre = torch.lerp(first.c2w[:, 3].double(), second.c2w[:, 3].double(), share)
+    rotation = first.rotation.double() @ _rotation(share * turn)
+    centre = torch.lerp(first.centre.double(), second.centre.double(), share)
     return replace(camera, c2w=torch.column_stack((rotation, centre)).to(first.c2w))
 
 
@@ -88,7 +89,7 @@ def preceding(
     axis = torch.tensor([math.cos(spin), math.sin(spin), 0.0], dtype=torch.float64)
     path = [replace(camera, c2w=camera.c2w.double())]
     for _ in range(count):
-        step = math.radians(speed) * (path[-1].c2w[:, :3] @ axis)
+        step = math.radians(speed) * (path[-1].rotation @ axis)
         path.append(_turned(path[-1], target, step, zoom))
         axis = _rotation(axis.new_tensor([0.0, 0.0, bend])) @ axis  # about viewing direction
     return [replace(frame, c2w=frame.c2w.to(camera.c2w)) for frame in path[:0:-1]]
@@ -107,12 +108,13 @@ def novel_view(cameras: Sequence[Camera], target: Tensor, generator: Generator) 
     other = near[int(torch.randint(len(near), (), generator=generator))]
     share, angle, zoom = torch.rand(3, generator=generator, dtype=torch.float64).tolist()
     axis = torch.randn(3, generator=generator, dtype=torch.float64)
-    first, second = cameras[pick], cameras[other]
+    first = cameras[pick]
+    second = cameras[other]
     view = between(first, second, rotation_between(first, second), share)
     start, end, chord = (_offset(camera, target).norm().item() for camera in (first, second, view))
     # `between` moves along the chord, which comes too near to the target: restore the distance.
     zoom = ((1 - share) * start + share * end) / chord * (1 + JITTER_ZOOM * (2 * zoom - 1))
-    step = math.radians(JITTER_DEG * angle) * torch.nn.functional.normalize(axis, dim=0)
+    step = math.radians(JITTER_DEG * angle) * normalize(axis, dim=0)
     return _turned(view, target, step, zoom)
 
 
@@ -120,10 +122,9 @@ def _nearest(cameras: Sequence[Camera], target: Tensor, index: int) -> list[int]
     """The cameras whose direction to `target` is nearest to that of camera `index`, of those with
     pictures of its size; without any, that camera itself."""
     offsets = torch.stack([_offset(camera, target) for camera in cameras])  # [N, 3]
-    directions = torch.nn.functional.normalize(offsets, dim=-1)
+    directions = normalize(offsets, dim=-1)
     order = (directions @ directions[index]).argsort(descending=True, stable=True).tolist()
-    size = cameras[index].width, cameras[index].height
-    alike = [other for other in order if (cameras[other].width, cameras[other].height) == size]
+    alike = [other for other in order if cameras[other].size == cameras[index].size]
     return [other for other in alike if other != index][:NEIGHBOURS] or [index]
 
 
@@ -131,12 +132,12 @@ def _turned(camera: Camera, target: Tensor, turn: Tensor, zoom: float) -> Camera
     """`camera` turned rigidly about `target` by `turn` [3], its distance times `zoom`."""
     rotation = _rotation(turn)
     centre = target.double() + zoom * (rotation @ _offset(camera, target))
-    pose = torch.column_stack((rotation @ camera.c2w[:, :3].double(), centre))
+    pose = torch.column_stack((rotation @ camera.rotation.double(), centre))
     return replace(camera, c2w=pose.to(camera.c2w))
 
 
 def _offset(camera: Camera, target: Tensor) -> Tensor:
-    return camera.c2w[:, 3].double() - target.double()
+    return camera.centre.double() - target.double()
 
 
 def _rotation(turn: Tensor) -> Tensor:

@@ -6,8 +6,7 @@ OpenCV's in those of NerfBaselines, instant-ngp and 3D Gaussian Splatting.
 
 import json
 import math
-from collections import ChainMap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,13 +20,11 @@ from bench.errors import unexpected
 from bench.records import read_json
 from bench.scenes.export import data_camera
 from bench.scenes.files import (
-    describe,
+    Fields,
     entries_of,
     focal_length,
     matrix,
     number,
-    numbers_of,
-    opengl_pose,
     opengl_to_opencv,
     rigid_pose,
     whole_number,
@@ -74,79 +71,77 @@ def read_path(
     if name is None:
         raise unexpected(file, READ, ", ".join(record) or "an empty object")
     entries = entries_of(record, name, file)
-    levels = [record, *(entry for _, entry in entries)]
-    remarks.add_unread(file, levels, {name, *KNOWN, *HARMLESS.split()})
+    remarks.add_unread(file, [record, *entries], {name, *KNOWN, *HARMLESS.split()})
     read = dict(zip(FORMS, (_of_viewer, _of_frame, _of_ngp, _of_splatting), strict=True))[name]
     usual = scene.splits["test"].cameras[0] if scene.splits else None
-    cameras = [read(ChainMap(entry, record), where, remarks, usual) for where, entry in entries]
+    cameras = [read(entry, remarks, usual) for entry in entries]
     if name == "path":
         cube = (scene.maps or program_maps(file, {}))["instant-ngp"]
         cameras = _moved(cameras, cube, file)
     elif name == KEYFRAMES and not record.items() >= OURS.items():
         cameras = _out_of_model(cameras, file, scene, remarks, model)
-    scale, offset = 1 / scene.unit_length, -scene.origin.double() / scene.unit_length
+    scale = 1 / scene.unit_length
+    offset = -scene.origin.double() / scene.unit_length
     return [move_camera(camera, scale, offset) for camera in cameras]
 
 
-def _of_viewer(settings: ChainMap, where: str, remarks: Remarks, _: Camera | None) -> Camera:
-    if (kind := settings.get("camera_type", "perspective")) != "perspective":
-        raise unexpected(f"{where}.camera_type", "perspective", describe(kind))
-    pose = opengl_pose(settings, "camera_to_world", where, remarks)
+def _of_viewer(settings: Fields, remarks: Remarks, _: Camera | None) -> Camera:
+    if settings.get("camera_type", "perspective") != "perspective":
+        raise settings.wrong("camera_type", "perspective")
+    pose = opengl_to_opencv(settings.pose("camera_to_world", remarks))
     fov = settings.get("fov", settings.get("default_fov"))
-    return _centred(pose, fov, *_size(settings, where, "render_"), where)
+    width, height = settings.size("render_width"), settings.size("render_height")
+    return _centred(pose, fov, width, height, settings)
 
 
-def _of_frame(settings: ChainMap, where: str, remarks: Remarks, usual: Camera | None) -> Camera:
+def _of_frame(settings: Fields, remarks: Remarks, usual: Camera | None) -> Camera:
     if settings.get("format") == NERFBASELINES:
-        if (model := settings.get("camera_model")) != "pinhole":
-            raise unexpected(f"{where}.camera_model", "pinhole", describe(model))
-        size = numbers_of(settings.get("image_size"), 2, f"{where}.image_size")
-        width, height = (whole_number(x, f"{where}.image_size", 1) for x in size)
-        pose = rigid_pose(settings.get("pose"), f"{where}.pose", remarks)
-        fx, fy, cx, cy = numbers_of(settings.get("intrinsics"), 4, f"{where}.intrinsics")
-        fx, fy = (number(x, f"{where}.intrinsics", 0) for x in (fx, fy))
+        if settings.get("camera_model") != "pinhole":
+            raise settings.wrong("camera_model", "pinhole")
+        size = settings.numbers("image_size", 2)
+        width, height = (whole_number(x, settings.place("image_size"), 1) for x in size)
+        pose = settings.pose("pose", remarks)
+        fx, fy, cx, cy = settings.numbers("intrinsics", 4)
+        fx, fy = (number(x, settings.place("intrinsics"), 0) for x in (fx, fy))
         return Camera(pose, fx, fy, cx, cy, width, height)
-    if lens := read_lens(settings, where):
-        remarks.add(where, "a frame of a path is a pinhole's, without its lens", lens)
-    pose = opengl_pose(settings, "transform_matrix", where, remarks)
-    return read_camera(settings, replace(_known(usual, settings, where), c2w=pose), where, remarks)
+    if lens := read_lens(settings):
+        remarks.add(settings.where, "a frame of a path is a pinhole's, without its lens", lens)
+    pose = opengl_to_opencv(settings.pose("transform_matrix", remarks))
+    return read_camera(settings, replace(_known(usual, settings), c2w=pose), remarks)
 
 
-def _of_ngp(settings: ChainMap, where: str, remarks: Remarks, usual: Camera | None) -> Camera:
-    turn = numbers_of(settings.get("R"), 4, f"{where}.R")
-    number(math.hypot(*turn), f"{where}.R: its length", 0)
-    centre = numbers_of(settings.get("T"), 3, f"{where}.T")
+def _of_ngp(settings: Fields, remarks: Remarks, usual: Camera | None) -> Camera:
+    turn = settings.numbers("R", 4)
+    number(math.hypot(*turn), settings.place("R: its length"), 0)
+    centre = settings.numbers("T", 3)
     pose = np.column_stack((Rotation.from_quat(turn).as_matrix(), centre))
-    like = _known(usual, settings, where)
-    return _centred(torch.from_numpy(pose), settings.get("fov"), like.width, like.height, where)
+    size = _known(usual, settings).size
+    return _centred(torch.from_numpy(pose), settings.get("fov"), *size, settings)
 
 
-def _of_splatting(settings: ChainMap, where: str, remarks: Remarks, _: Camera | None) -> Camera:
+def _of_splatting(settings: Fields, remarks: Remarks, _: Camera | None) -> Camera:
     try:
         rows = zip(settings["rotation"], settings["position"], strict=True)
-        pose = rigid_pose([[*row, x] for row, x in rows], where, remarks)
+        pose = rigid_pose([[*row, x] for row, x in rows], settings.where, remarks)
     except (KeyError, TypeError, ValueError) as error:
         expected = f"a position and three rows of a rotation, or a file with {READ}"
-        raise unexpected(where, expected, f"{', '.join(settings)}: {error}") from error
-    width, height = _size(settings, where)
-    fx, fy = (number(settings.get(name), f"{where}.{name}", 0) for name in ("fx", "fy"))
-    middle = {"cx": width / 2, "cy": height / 2}
-    cx, cy = (number(settings.get(name, x), f"{where}.{name}") for name, x in middle.items())
+        got = f"{', '.join(settings)}: {error}"
+        raise unexpected(settings.where, expected, got) from error
+    width = settings.size("width")
+    height = settings.size("height")
+    fx = settings.number("fx", 0)
+    fy = settings.number("fy", 0)
+    cx = settings.number("cx", usual=width / 2)
+    cy = settings.number("cy", usual=height / 2)
     return Camera(pose, fx, fy, cx, cy, width, height)
 
 
-def _known(usual: Camera | None, settings: Mapping, where: str) -> Camera:
+def _known(usual: Camera | None, settings: Fields) -> Camera:
     """The camera that has what the `settings` of an entry lack."""
     if not usual and not {"w", "h"} <= settings.keys():
         expected = "w and h, or scene=..., whose first test camera has them"
-        raise unexpected(where, expected, "neither")
+        raise unexpected(settings.where, expected, "neither")
     return usual or Camera(torch.eye(4)[:3], 0, 0, 0.5, 0.5, 1, 1)
-
-
-def _size(settings: Mapping, where: str, prefix: str = "") -> tuple[int, int]:
-    names = (f"{prefix}{side}" for side in ("width", "height"))
-    width, height = (whole_number(settings.get(name), f"{where}.{name}", 1) for name in names)
-    return width, height
 
 
 def _out_of_model(
@@ -179,7 +174,7 @@ def _out_of_model(
 
 
 def _centres(cameras: Sequence[Camera]) -> Tensor:
-    return torch.stack([camera.c2w[:, 3] for camera in cameras])
+    return torch.stack([camera.centre for camera in cameras])
 
 
 def _moved(cameras: Sequence[Camera], move: Tensor, where: Path) -> list[Camera]:
@@ -193,10 +188,10 @@ def _moved(cameras: Sequence[Camera], move: Tensor, where: Path) -> list[Camera]
     return moved
 
 
-def _centred(pose: Tensor, degrees: object, width: int, height: int, where: str) -> Camera:
+def _centred(pose: Tensor, degrees: object, width: int, height: int, settings: Fields) -> Camera:
     """Square pixels, the principal point at the centre, a vertical field of view."""
-    angle = math.radians(number(degrees, f"{where}.fov", 0, 180))
-    focal = focal_length(angle, height, f"{where}.fov")
+    where = settings.place("fov")
+    focal = focal_length(math.radians(number(degrees, where, 0, 180)), height, where)
     return Camera(pose, focal, focal, width / 2, height / 2, width, height)
 
 
@@ -243,11 +238,11 @@ def _nerfbaselines(cameras: Sequence[Camera], fps: float) -> dict:
     frames = [
         {
             "pose": camera.c2w.flatten().tolist(),
-            "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+            "intrinsics": [*camera.intrinsics],
             "appearance_weights": [],
         }
         for camera in cameras
     ]
-    size = [cameras[0].width, cameras[0].height]
+    size = [*cameras[0].size]
     about = {"format": NERFBASELINES, "camera_model": "pinhole", "image_size": size, "fps": fps}
     return {**about, "source": None, "appearances": [], "frames": frames}

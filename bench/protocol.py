@@ -88,7 +88,7 @@ class EvaluationProtocol:
                 f"background [{got}]: change scene.background, or use another protocol"
             )
         scored = (step.camera for step in trajectory.steps if step.truth is not None)
-        for width, height in {(camera.width, camera.height) for camera in scored}:
+        for width, height in {camera.size for camera in scored}:
             for metric in self.metric_names:
                 metrics.check_size(metric, width, height)
 

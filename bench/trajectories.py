@@ -62,7 +62,7 @@ class Trajectory:
     @property
     def resolution(self) -> str:
         """`WIDTHxHEIGHT` of the frames, or `MIXED`."""
-        return resolution((step.camera.width, step.camera.height) for step in self.steps)
+        return resolution(step.camera.size for step in self.steps)
 
     @property
     def preceding(self) -> list[int]:

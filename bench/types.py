@@ -48,6 +48,11 @@ def check_shape(name: str, value: Tensor, *shape: int | None) -> None:
         raise ValueError(f"{name}: expected shape [{want}], got {got}")
 
 
+def rows(table: Tensor, index: Tensor | slice) -> Tensor:
+    """The rows of a `table` at `index`, one at a time; `table[index]` goes number by number."""
+    return table[index] if isinstance(index, slice) else table.index_select(0, index)
+
+
 def composite(picture: Tensor, background: Tensor) -> Tensor:
     """Composite an 8-bit `picture` [H, W, 3 or 4] onto `background` [3]; float [H, W, 3]."""
     values = picture.float() / 255.0
@@ -69,6 +74,26 @@ class Camera:
     width: int
     height: int
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.width, self.height
+
+    @property
+    def intrinsics(self) -> tuple[float, float, float, float]:
+        """Focal lengths, then the principal point."""
+        return self.fx, self.fy, self.cx, self.cy
+
+    @property
+    def rotation(self) -> Tensor:
+        """[3, 3], of camera axes in the world."""
+        return self.c2w[:, :3]
+
+    @property
+    def centre(self) -> Tensor:
+        """[3], where the camera is."""
+        return self.c2w[:, 3]
+
 
 @dataclass(frozen=True)
 class Rays:
@@ -83,9 +108,7 @@ class Rays:
         return cls(torch.cat(origins), torch.cat(directions))
 
     def take(self, index: Tensor | slice) -> Rays:
-        if isinstance(index, slice):
-            return Rays(self.origins[index], self.directions[index])
-        return Rays(self.origins.index_select(0, index), self.directions.index_select(0, index))
+        return Rays(rows(self.origins, index), rows(self.directions, index))
 
 
 @dataclass(frozen=True)

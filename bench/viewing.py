@@ -93,7 +93,7 @@ class Painter:
     @torch.no_grad()
     def draw(self, who: Hashable, camera: Camera) -> list[Drawn]:
         """Render `camera` with each method; SteerbenchError if values are not finite."""
-        sequence = (who, camera.width, camera.height)
+        sequence = (who, *camera.size)
         if sequence != self._sequence:
             for method in self.methods:
                 method.reset()
@@ -105,10 +105,8 @@ class Painter:
                 frame = method.render(lent(camera), clock)
             frame = taken(frame, camera, method.name, 0)
             (record,) = clock.frames
-            times: dict[str, float] = {}
-            for name, ns in record.stages_ns.items():
-                if ns or name != OTHER:
-                    times[name] = ns / 1e6
+            parts = record.stages_ns.items()
+            times = {name: ns / 1e6 for name, ns in parts if ns or name != OTHER}
             stages = dict(sorted(times.items(), key=lambda item: -item[1]))
             rgb = quantise(frame.rgb.cpu())
             drawn.append(Drawn(rgb, record.total_ns / 1e6, stages))

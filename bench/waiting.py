@@ -57,6 +57,10 @@ def queued(path: Path, threads: int | None, what: str, log: ConsoleLog) -> Itera
     """
     command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
     own = Holder(threads, sorted(os.sched_getaffinity(0)), os.getpid(), command, time.time())
+
+    def write() -> None:
+        file.write_text(json.dumps(vars(own)))
+
     with ExitStack() as place:
         with locked(path, f"waiting: others come to {what}", log):
             for file in _files(path):
@@ -67,7 +71,7 @@ def queued(path: Path, threads: int | None, what: str, log: ConsoleLog) -> Itera
             file = path.with_name(f"{path.stem}-{last + 1:09}.json")
             place.callback(file.unlink, missing_ok=True)
             place.enter_context(locked(file, "", log))
-            file.write_text(json.dumps(vars(own)))
+            write()
         told = 0
         while blocking := own.blocking([x for f in _files(path) if f < file and (x := _read(f))]):
             if (first := blocking[0]).pid not in (0, told):
@@ -83,10 +87,10 @@ def queued(path: Path, threads: int | None, what: str, log: ConsoleLog) -> Itera
             with suppress(OSError):
                 if time.time() > file.stat().st_mtime + WRITE_S:
                     own.progress = progress
-                    file.write_text(json.dumps(vars(own)))
+                    write()
 
         own.since = time.time()
-        file.write_text(json.dumps(vars(own)))
+        write()
         log.followers.append(tell)
         place.callback(log.followers.remove, tell)
         yield

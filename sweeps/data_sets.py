@@ -85,7 +85,7 @@ def _lack(folder: Path, layout: str) -> str:
         else:  # those named in the camera files
             names = [root / camera_file(split) for split in ("train", "test")]
             frames = [one for path in names for one in frames_of(read_json(path), path)]
-            found = find_all(root, [frame["file_path"] for _, frame in frames])
+            found = find_all(root, [frame["file_path"] for frame in frames])
     except SteerbenchError as error:
         return str(error)
     absent = [*found].count(None)

@@ -286,11 +286,10 @@ def _left(
     """The `cells` [M, 3] of `size` [3], counted from `lower` [3], that no picture drops."""
     for camera, image in views:
         corners = (lower + size * (cells[:, None] + _grid(2))).float()  # [M, 8, 3]
-        pixels, depth = project(camera, corners.reshape(-1, 3))
-        pixels, depth = pixels.reshape(-1, 8, 2), depth.reshape(-1, 8)
+        pixels, depth = project(camera, corners)
         first = pixels.amin(1).floor() - 1
         last = pixels.amax(1).floor() + 2  # one past the last pixel
-        limit = first.new_tensor((camera.width, camera.height))
+        limit = first.new_tensor(camera.size)
         inside = ((first >= 0) & (last <= limit)).all(1) & (depth > 0).all(1)
         (u0, v0), (u1, v1) = (edge[inside].long().unbind(1) for edge in (first, last))
         # A summed-area table counts the mask's pixels in any rectangle with four look-ups. NumPy's

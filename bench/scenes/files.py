@@ -5,6 +5,7 @@ The argument `where` is the start of an error message: the file, and the field i
 
 import math
 import sys
+from collections import ChainMap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bench.errors import not_there, unexpected
+from bench.errors import SteerbenchError, not_there, unexpected
 from bench.scenes.remarks import Remarks
 
 SMALLEST_ANGLE = 1e-9  # of view in radians: below any telescope's, but its tangent is not 0
@@ -28,32 +29,68 @@ def data_folder(path: str | Path) -> Path:
     return root.resolve()
 
 
-def entries_of(record: Mapping, name: str, path: Path) -> list[tuple[str, dict]]:
-    """The objects in the list `name` as (position for messages, object); at least one."""
+class Fields(ChainMap[str, Any]):
+    """The fields of an object in a file, and those of the objects around it that it lacks. Errors
+    begin with `where` it is."""
+
+    def __init__(self, where: str, *levels: Any) -> None:
+        super().__init__(*levels)
+        self.where = where
+
+    def place(self, name: str) -> str:
+        return f"{self.where}.{name}"
+
+    def wrong(self, name: str, expected: str) -> SteerbenchError:
+        """The error about a field that is not what is `expected`."""
+        return unexpected(self.place(name), expected, describe(self.get(name)))
+
+    def number(self, name: str, low: float = -math.inf, usual: float | None = None) -> float:
+        """As `number`; without the field, what is `usual`."""
+        return number(self.get(name, usual), self.place(name), low)
+
+    def size(self, name: str, usual: int | None = None) -> int:
+        """A whole number from 1 on; without the field, what is `usual`."""
+        return whole_number(self.get(name, usual), self.place(name), 1)
+
+    def numbers(self, name: str, count: int) -> list[float]:
+        return numbers_of(self.get(name), count, self.place(name))
+
+    def pose(self, name: str, remarks: Remarks) -> Tensor:
+        return rigid_pose(self.get(name), self.place(name), remarks)
+
+
+def entries_of(record: Mapping, name: str, path: Path) -> list[Fields]:
+    """The objects in the list `name`, at least one, with what `record` has beside them."""
     entries = record.get(name)
     if not isinstance(entries, list) or not entries:
         raise unexpected(f"{path}: {name}", "a list with at least one entry", describe(entries))
-    placed = [(f"{path}: {name}[{index}]", entry) for index, entry in enumerate(entries)]
-    for where, entry in placed:
+    placed = []
+    for number, entry in enumerate(entries):
+        where = f"{path}: {name}[{number}]"
         if not isinstance(entry, dict):
             raise unexpected(where, "an object", describe(entry))
+        placed.append(Fields(where, entry, record))
     return placed
 
 
-def frames_of(record: Mapping, path: Path) -> list[tuple[str, dict]]:
+def frames_of(record: Mapping, path: Path) -> list[Fields]:
     """The frames of a `transforms*.json` as from `entries_of`, each with a `file_path`."""
     frames = entries_of(record, "frames", path)
-    for where, frame in frames:
-        if not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
-            raise unexpected(f"{where}.file_path", "a path", describe(frame.get("file_path")))
+    for frame in frames:
+        file = frame.maps[0].get("file_path")
+        if not isinstance(file, str) or not file:
+            raise unexpected(frame.place("file_path"), "a path", describe(file))
     return frames
+
+
+def _real(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def number(value: Any, where: str, low: float = -math.inf, high: float = math.inf) -> float:
     """A finite number with low < value < high."""
-    real = isinstance(value, int | float) and not isinstance(value, bool)
     # Compare before converting: an integer of hundreds of digits overflows a float.
-    if real and low < value < high and abs(value) < sys.float_info.max:
+    if _real(value) and low < value < high and abs(value) < sys.float_info.max:
         return float(value)
     limits = [f"above {low:g}"] * (low > -math.inf) + [f"below {high:g}"] * (high < math.inf)
     expected = f"a finite number {' and '.join(limits)}".rstrip()
@@ -67,8 +104,7 @@ def focal_length(angle: object, size: float, where: str) -> float:
 
 def whole_number(value: Any, where: str, low: int) -> int:
     """A whole number, at least `low`; 3.0 is one, too."""
-    real = isinstance(value, int | float) and not isinstance(value, bool)
-    if real and low <= value <= sys.maxsize and value == int(value):
+    if _real(value) and low <= value <= sys.maxsize and value == int(value):
         return int(value)
     raise unexpected(where, f"a whole number from {low} on", describe(value))
 
@@ -126,11 +162,6 @@ def rigid_pose(value: object, where: str, remarks: Remarks) -> Tensor:
 def _off(rotation: Tensor) -> float:
     """By how much a matrix [3, 3] is not orthonormal."""
     return (rotation.T @ rotation - torch.eye(3, dtype=torch.float64)).abs().max().item()
-
-
-def opengl_pose(frame: Mapping, name: str, where: str, remarks: Remarks) -> Tensor:
-    """The pose in the field `name` of a frame, as from `rigid_pose` but with OpenCV axes."""
-    return opengl_to_opencv(rigid_pose(frame.get(name), f"{where}.{name}", remarks))
 
 
 def opengl_to_opencv(pose: Tensor) -> Tensor:

@@ -131,7 +131,7 @@ def image_size(path: Path, like: tuple[int, int] | None = None) -> tuple[int, in
 
 def fitted_camera(camera: Camera, path: Path) -> Camera:
     """The same view at the size of the picture in `path`, which may be a reduced one."""
-    width, height = image_size(path, (camera.width, camera.height))
+    width, height = image_size(path, camera.size)
     if ASPECT * abs(width * camera.height - height * camera.width) > height * camera.width:
         expected = f"{camera.width} x {camera.height} pixels, or as wide for its height"
         raise unexpected(path, f"a picture of {expected}", f"{width} x {height}")
@@ -140,12 +140,14 @@ def fitted_camera(camera: Camera, path: Path) -> Camera:
 
 def describe(view: View, downscale: int) -> ScaledView:
     """Describe a view as a `ScaledView`; raises if it is none, of another size, or too small."""
-    content, camera = contents(view.path), view.camera
+    content = contents(view.path)
+    camera = view.camera
     with opened(io.BytesIO(content), view.path) as image:
         check_mode(image, view.path)
-        turned, clear = obeyed(image, view), image.has_transparency_data
+        turned = obeyed(image, view)
+        clear = image.has_transparency_data
         size = image.size[::-1] if turned and orientation(image) > 4 else image.size
-        if size != (camera.width, camera.height):
+        if size != camera.size:
             expected = f"{camera.width} x {camera.height} pixels"
             raise unexpected(view.path, expected, "{} x {}".format(*size))
     seen = size
@@ -166,7 +168,7 @@ def obeyed(image: Image.Image, view: View) -> bool | None:
     if (number := orientation(image)) == 1:
         return None
     if number > 4 and image.width != image.height:
-        return image.size != (view.camera.width, view.camera.height)
+        return image.size != view.camera.size
     if not view.stored:
         how = "turn the pixels (mogrify -auto-orient) or remove it (exiftool -Orientation=)"
         got = f"EXIF orientation {number}, which the camera may mean or not: {how}"
@@ -301,8 +303,7 @@ def undistorted_camera(camera: Camera, lens: Lens, where: Path) -> Camera:
 
 
 def _window(camera: Camera, lens: Lens) -> tuple[Tensor, int, int]:
-    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
-    return pinhole_window(camera.width, camera.height, intrinsics, lens)
+    return pinhole_window(*camera.size, camera.intrinsics, lens)
 
 
 @lru_cache(maxsize=2)  # most captures have one lens

@@ -1,29 +1,25 @@
 """Masks of pictures: which pixels count. The others are neither learnt from nor scored."""
 
 import os
-from collections.abc import Mapping
 from pathlib import Path
 
 from torch import Tensor
 from torch.nn import functional
 
-from bench.errors import unexpected
-from bench.scenes.files import describe
+from bench.scenes.files import Fields
 from bench.scenes.images import Pictures, ScaledView, decode, undistort
 from bench.scenes.lookup import found, in_any_case
 
 
-def frame_mask(
-    root: Path, settings: Mapping, picture: Path, where: str
-) -> tuple[Path | None, bool]:
+def frame_mask(root: Path, settings: Fields, picture: Path) -> tuple[Path | None, bool]:
     """`mask` and `hides` of the view of a frame in `transforms.json`: those of its `mask_path` or
     of instant-ngp's mask beside the picture."""
     if (given := settings.get("mask_path")) is None:
         beside = picture.with_name(f"dynamic_mask_{picture.stem}.png")
         return (beside, True) if beside.is_file() else (None, False)
     if not isinstance(given, str):
-        raise unexpected(f"{where}.mask_path", "a path", describe(given))
-    return found(root, given, f"{where}.mask_path", "a picture"), False
+        raise settings.wrong("mask_path", "a path")
+    return found(root, given, settings.place("mask_path"), "a picture"), False
 
 
 def mask_folder(root: Path, images: str, masks: str | None) -> Path | None:

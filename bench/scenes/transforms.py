@@ -2,7 +2,6 @@
 
 import math
 import os
-from collections import ChainMap
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from bench.errors import unexpected
 from bench.records import read_json
 from bench.scenes.assemble import Box, assemble, box_of_cameras, describe_splits, space_of, tight
 from bench.scenes.files import (
+    Fields,
     data_folder,
     describe,
     focal_length,
@@ -22,8 +22,7 @@ from bench.scenes.files import (
     matrix,
     number,
     numbers_of,
-    opengl_pose,
-    whole_number,
+    opengl_to_opencv,
 )
 from bench.scenes.images import Fisheye, Lens, RadialTangential, View, fitted_camera, image_size
 from bench.scenes.lookup import find_all, report, tidy
@@ -113,56 +112,59 @@ def read_views(
     """The pictures of the frames in a `record`, the file `path`, of any size in their proportions.
     Raises if not `every` one is there, or none, unless they are `optional`."""
     frames = frames_of(record, path)
-    names = [frame["file_path"] for _, frame in frames]
+    names = [frame["file_path"] for frame in frames]
     files = find_all(root, names)
     if optional and not any(files):
         log.info(f"{path.name}: none of its {len(files)} pictures are there, split left out")
         return []
     report(root, names, files, f"{path}: frames", log, every)
-    remarks, views = Remarks(), list[tuple[str, View | None]]()
-    remarks.add_unread(path, [record, *(frame for _, frame in frames)], KNOWN)
-    for (where, frame), name, file in zip(frames, map(tidy, names), files, strict=True):
+    remarks = Remarks()
+    views = list[tuple[str, View | None]]()
+    remarks.add_unread(path, [record, *frames], KNOWN)
+    for frame, name, file in zip(frames, map(tidy, names), files, strict=True):
         if not file:
             views.append((name, None))
             continue
-        settings = ChainMap(frame, record)
-        pose = opengl_pose(settings, "transform_matrix", where, remarks)
+        pose = opengl_to_opencv(frame.pose("transform_matrix", remarks))
         width, height = image_size(file)
         usual = Camera(pose, 0, 0, width / 2, height / 2, width, height)  # without a focal length
-        camera = fitted_camera(read_camera(settings, usual, where, remarks), file)
-        lens, mask = read_lens(settings, where), frame_mask(root, settings, file, where)
+        camera = fitted_camera(read_camera(frame, usual, remarks), file)
+        lens = read_lens(frame)
+        mask = frame_mask(root, frame, file)
         views.append((name, View(os.path.relpath(file, root), file, camera, lens, *mask)))
     remarks.tell(log.info)
     return views
 
 
-def read_camera(settings: ChainMap, usual: Camera, where: str, remarks: Remarks) -> Camera:
+def read_camera(settings: Fields, usual: Camera, remarks: Remarks) -> Camera:
     """The pinhole camera of a frame; what is not given is that of `usual`, scaled to its size."""
-    width, height = (
-        whole_number(settings.get(name, size), f"{where}.{name}", 1)
-        for name, size in (("w", usual.width), ("h", usual.height))
-    )
+    width = settings.size("w", usual.width)
+    height = settings.size("h", usual.height)
     usual = scale_camera(usual, width, height)
-    x, y = (focal(settings, *one, where, remarks) for one in (("x", width), ("y", height)))
-    fx, fy = x or y or usual.fx, y or x or usual.fy
+    x = focal(settings, "x", width, remarks)
+    y = focal(settings, "y", height, remarks)
+    fx = x or y or usual.fx
+    fy = y or x or usual.fy
     if not fx:
-        raise unexpected(f"{where}.fl_x", "a focal length, or camera_angle_x", "neither")
-    cx, cy = (
-        number(settings.get(name, x), f"{where}.{name}")  # outside of a picture, if it is a crop
-        for name, x in (("cx", usual.cx), ("cy", usual.cy))
-    )
+        expected = "a focal length, or camera_angle_x"
+        raise unexpected(settings.place("fl_x"), expected, "neither")
+    # Outside of a picture, if it is a crop.
+    cx = settings.number("cx", usual=usual.cx)
+    cy = settings.number("cy", usual=usual.cy)
     return Camera(usual.c2w, fx, fy, cx, cy, width, height)
 
 
-def focal(settings: ChainMap, axis: str, size: float, where: str, remarks: Remarks) -> float | None:
+def focal(settings: Fields, axis: str, size: float, remarks: Remarks) -> float | None:
     """Focal length in pixels, from the frame or else the file; None if not given."""
-    fov, length, angle = f"{axis}_fov", f"fl_{axis}", f"camera_angle_{axis}"
+    fov = f"{axis}_fov"
+    length = f"fl_{axis}"
+    angle = f"camera_angle_{axis}"
     for level in settings.maps:
         given = {name: level[name] for name in (fov, length, angle) if name in level}
         if not given:
             continue
         name, x = next(iter(given.items()))
-        at = f"{where}.{name}"
+        at = settings.place(name)
         if name == length:
             pixels = number(x, at, 0)
         else:
@@ -170,14 +172,15 @@ def focal(settings: ChainMap, axis: str, size: float, where: str, remarks: Remar
         radians = 2 * math.atan(size / 2 / pixels)
         meant = {fov: math.degrees(radians), length: pixels, angle: radians}
         for other, y in given.items():
-            low, high = 0.98 * meant[other], 1.02 * meant[other]
+            low = 0.98 * meant[other]
+            high = 1.02 * meant[other]
             if not (isinstance(y, int | float) and low < y < high):
                 remarks.add(at, f"is taken, not {other}, which contradicts it", describe(y))
         return pixels
     return None
 
 
-def read_lens(settings: Mapping, where: str) -> Lens | None:
+def read_lens(settings: Fields) -> Lens | None:
     """The lens of a frame; None for a pinhole. instant-ngp's `is_fisheye` means OPENCV_FISHEYE.
 
     Raises SteerbenchError if the model is not in `LENSES`, or the file has a term that it does not
@@ -187,12 +190,13 @@ def read_lens(settings: Mapping, where: str) -> Lens | None:
     if settings.get("is_fisheye"):
         model = "OPENCV_FISHEYE"
     if not isinstance(model, str) or model not in LENSES:
-        raise unexpected(f"{where}.camera_model", f"one of {', '.join(LENSES)}", describe(model))
+        raise settings.wrong("camera_model", f"one of {', '.join(LENSES)}")
     kind, names = LENSES[model]
-    coefficients = tuple(number(settings.get(name, 0.0), f"{where}.{name}") for name in names)
+    coefficients = tuple(settings.number(name, usual=0.0) for name in names)
     for name in OTHER_TERMS:
         if name not in names and says_something(settings.get(name)):
-            raise unexpected(f"{where}.{name}", f"a lens of {' '.join(names)}", settings[name])
+            given = settings[name]
+            raise unexpected(settings.place(name), f"a lens of {' '.join(names)}", given)
     return kind(coefficients) if kind is Fisheye or any(coefficients) else None
 
 

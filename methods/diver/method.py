@@ -1,6 +1,5 @@
 """DIVeR (Wu et al. 2022), as a `bench.types.Method`: what is baked for a frame (Section 3.4)."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -21,6 +20,7 @@ from methods.rendering.compaction import to_host
 from methods.rendering.frame import Render
 from methods.students.method import IN_FP32, Student
 from methods.students.networks import encode_directions
+from methods.training.checkpoint import Tensors
 
 Stored = Literal["bf16", "fp32"]
 
@@ -109,11 +109,10 @@ class Diver(Student):
     )
 
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> DiverTraining:
-        generator = torch.Generator().manual_seed(self.teacher.seed)
-        model = CornerModel.taught(teacher, self.resolution, generator)
+        model = CornerModel.taught(teacher, self.resolution, self.teacher.generator())
         return DiverTraining(model, scene, budget, self.training, self.teacher.seed)
 
-    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore(self, tensors: Tensors) -> None:
         device = self.teacher.device
         blank = torch.zeros(0, 3, dtype=torch.int32, device=device)
         model = CornerModel(blank, self.resolution, Decoder().to(device), self.teacher.backend)

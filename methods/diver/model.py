@@ -1,6 +1,5 @@
 """Features at the corners of sparse voxels, and the decoder of their integrals (Wu et al. 2022)."""
 
-from collections.abc import Mapping
 from typing import Self
 
 import torch
@@ -106,12 +105,12 @@ class CornerModel(nn.Module):
             self.table, self.corners, voxel, weights, grad_buffer=grad_buffer, backend=self.backend
         )
 
-    def tensors(self) -> dict[str, Tensor]:
+    def tensors(self) -> checkpoint.Tensors:
         """Everything that was trained."""
         own = {"coordinates": self.voxels.coordinates, "table": self.table.detach()}
         return self.decoder.state_dict(prefix="decoder.") | own
 
-    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore(self, tensors: checkpoint.Tensors) -> None:
         """Restore what `tensors` returned."""
         self.decoder.load_state_dict(checkpoint.part(tensors, "decoder."))
         device = self.table.device

@@ -1,6 +1,5 @@
 """Training of corners and decoder on random pixels of the training pictures."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -118,14 +117,14 @@ class DiverTraining(PixelTraining):
         table = self.model.table.detach()
         sparse_adam_(table, self.grad, self.moments, corner_rate, backend=self.model.backend)
 
-    def watched(self) -> dict[str, Tensor]:
+    def watched(self) -> checkpoint.Tensors:
         moments = self.moments.first + self.moments.second
         decoder = dict(self.model.decoder.named_parameters())
         return {"corner features": self.model.table, "their moments": moments, **decoder}
 
-    def result(self) -> dict[str, Tensor]:
+    def result(self) -> checkpoint.Tensors:
         return self.model.tensors()
 
-    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore_result(self, tensors: checkpoint.Tensors) -> None:
         self.model.restore(tensors)
         self.grad = torch.zeros_like(self.model.table)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.case import Case, Cell
+from bench.case import Case, Cell, Random
 from bench.console import ConsoleLog
 from methods.engines import Engine
 from methods.engines.openvino_engine import OpenVino
@@ -81,8 +81,7 @@ def _network() -> nn.Module:
 
 def _random_inputs(seed: int) -> Tensor:
     """A random picture [1, C, H, W], of -1/2 to 1/2."""
-    generator = torch.Generator().manual_seed(seed)
-    return torch.rand(1, CHANNELS, SIDE, SIDE, generator=generator) - 0.5
+    return Random(seed).share(1, CHANNELS, SIDE, SIDE) - 0.5
 
 
 @cache

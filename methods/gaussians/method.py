@@ -64,7 +64,8 @@ class GaussianSplatting(OnField):
         self.background = scene.background.to(self.setup.device)
 
     def _trained(self, scene: Scene, budget: Budget, log: Log) -> Gaussians:
-        setup, steps = self.setup, self.steps or budget.renderer_steps
+        setup = self.setup
+        steps = self.steps or budget.renderer_steps
         teacher = train_field(setup, scene, budget, log)
         key = {
             "field": setup.key(scene, budget),
@@ -77,7 +78,7 @@ class GaussianSplatting(OnField):
         finished = log.stage_dir("gaussians", key) / "gaussians.safetensors"
 
         def begin() -> GaussianTraining:
-            generator = torch.Generator(setup.device).manual_seed(setup.seed)
+            generator = setup.generator(setup.device)
             points, colours = on_surfaces(teacher, scene, self.count, generator)
             scales = self.fitting.size * spacing(points)
             untrained = Gaussians.at(points, colours, scales, self.fitting.opacity, self.degree)

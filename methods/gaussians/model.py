@@ -72,12 +72,11 @@ class Gaussians(nn.Module):
             ellipses = project_gaussians(*shape, opacities, camera, backend=backend)
         probe.count("gaussians", (ellipses.extents[:, 0] > 0).sum(), len(self))
         with probe.stage("shade"):
-            towards = functional.normalize(self.means.detach() - camera.c2w[:, 3], dim=1)
+            towards = functional.normalize(self.means.detach() - camera.centre, dim=1)
             harmonics = torch.cat((self.base, self.view), dim=1)
             colours = (shade(harmonics, towards, backend=backend) + 0.5).clamp(min=0)
         with probe.stage("blend"):
-            size = camera.width, camera.height
-            return blend(ellipses, opacities, colours, *size, stop=stop, backend=backend)
+            return blend(ellipses, opacities, colours, *camera.size, stop=stop, backend=backend)
 
 
 def rounded(gaussians: Gaussians) -> Gaussians:

@@ -4,7 +4,6 @@ Carlo"). Their number is fixed.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated
@@ -75,7 +74,7 @@ class GaussianTraining(loop.Training):
         self.steps = steps
         self.split, self.background = scene.splits["train"], scene.background.to(setup.device)
         self.endless = scene.space == "all"
-        self.generator = torch.Generator(setup.device).manual_seed(setup.seed)
+        self.generator = setup.generator(setup.device)
         self.views: list[int] = []  # still to come in this pass over the pictures
 
     @cached_property
@@ -94,7 +93,8 @@ class GaussianTraining(loop.Training):
         return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def advance(self) -> dict[str, float]:
-        options, gaussians = self.options, self.gaussians
+        options = self.options
+        gaussians = self.gaussians
         share = self.step / self.steps
         camera, target = self._picture(half=share < options.half)
         pixels = gaussians.render(camera, STOP, NullProbe(), self.backend)
@@ -108,15 +108,17 @@ class GaussianTraining(loop.Training):
         if options.similarity:
             loss = loss + options.similarity * (1 - ssim(picture, target, backend=self.backend))
         # Gaussians that are not needed fade. Far ones are large, and go far.
-        scales, before = gaussians.log_scales.exp(), gaussians.means.detach()
+        scales = gaussians.log_scales.exp()
+        before = gaussians.means.detach()
         if self.endless:
-            before, far = before.clone(), self._distances()
+            before = before.clone()
+            far = self._distances()
             scales = scales / far
         costs = options.opacity_cost * gaussians.opacities.mean()
         costs = costs + options.scale_cost * scales.mean()
         (loss + costs).backward()
 
-        def error() -> dict[str, Tensor]:
+        def error() -> checkpoint.Tensors:
             return {"": functional.mse_loss(picture, target)}
 
         errors = loop.look(self, error, {"picture": picture})
@@ -143,17 +145,20 @@ class GaussianTraining(loop.Training):
         """The next training view and its picture [H, W, 3], NaN where pixels do not count; a pass
         uses every view once."""
         if not self.views:
-            count, generator = len(self.split), self.generator
+            count = len(self.split)
+            generator = self.generator
             order = torch.randperm(count, generator=generator, device=generator.device)
             self.views = order.tolist()
         view = self.views.pop()
-        camera, device = self.split.cameras[view], self.background.device
+        camera = self.split.cameras[view]
+        device = self.background.device
         picture = composite(self.split.images[view].to(device, non_blocking=True), self.background)
         if (mask := self.split.mask(view)) is not None:
             picture[~mask.to(device)] = math.nan
-        if half and min(camera.width, camera.height) > 1:
+        if half and min(camera.size) > 1:
             camera = scale_camera(camera, camera.width // 2, camera.height // 2)
-            planes, size = picture.movedim(-1, 0)[None], (camera.height, camera.width)
+            planes = picture.movedim(-1, 0)[None]
+            size = (camera.height, camera.width)
             shrunk = functional.interpolate(planes, size=size, mode="area")
             picture = shrunk[0].movedim(0, -1).contiguous()
         return place_camera(camera, device), picture
@@ -161,21 +166,20 @@ class GaussianTraining(loop.Training):
     def optimisers(self) -> checkpoint.Optimisers:
         return {"adam": self.optimiser}
 
-    def watched(self) -> dict[str, Tensor]:
+    def watched(self) -> checkpoint.Tensors:
         return dict(self.gaussians.named_parameters())
 
-    def result(self) -> dict[str, Tensor]:
+    def result(self) -> checkpoint.Tensors:
         return {name: value.detach() for name, value in self.gaussians.named_parameters()}
 
-    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore_result(self, tensors: checkpoint.Tensors) -> None:
         self.gaussians.load_state_dict({name: tensors[name] for name in self.result()})
 
-    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        tensors, figures = super().state()
-        return tensors | {"views": torch.tensor(self.views, dtype=torch.int64)}, figures
+    def state(self) -> checkpoint.Tensors:
+        return super().state() | {"views": torch.tensor(self.views, dtype=torch.int64)}
 
-    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        super().restore(tensors, figures)
+    def restore(self, tensors: checkpoint.Tensors) -> None:
+        super().restore(tensors)
         self.views = tensors["views"].tolist()
 
 

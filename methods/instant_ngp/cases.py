@@ -70,12 +70,12 @@ def cases() -> list[Case]:
     rendered = _exactly("field", "pixels, opacity and gradients are finite")
     densities, rates = (-1e4, -100.0, 100.0, 1e4), (10.0, 1e10, 1e30)
     return [
-        *(finite.case(name, partial(_stays_finite, make)) for name, make in pictures.items()),
-        *(good.case(f"learning rate {r:g}", partial(_keeps_a_good_state, r)) for r in rates),
-        *(named.case(f"{x} in the table", partial(_reports, x)) for x in (math.nan, math.inf)),
+        *(finite.case(name, _stays_finite, make) for name, make in pictures.items()),
+        *(good.case(f"learning rate {r:g}", _keeps_a_good_state, r) for r in rates),
+        *(named.case(f"{x} in the table", _reports, x) for x in (math.nan, math.inf)),
         shrunk.case("gradients 1e-20 as large", _shrunk_gradient_error),
         forgotten.case("field explodes, then is empty", _unforgotten),
-        *(rendered.case(f"log density {x:g}", partial(_extreme_density, x)) for x in densities),
+        *(rendered.case(f"log density {x:g}", _extreme_density, x) for x in densities),
     ]
 
 

@@ -13,13 +13,13 @@ from methods.kernels.encode import HashGrid, SampleGradients, collect, encode, p
 from methods.kernels.mlp import mlp
 from methods.kernels.shade import harmonics
 from methods.kernels.spherical import CHANNELS as DIRECTION_CHANNELS
+from methods.kernels.types import cat
 from methods.rendering.field import (
     BATCH_QUANTUM,
     CACHED_SAMPLES,
     CHUNK_SAMPLES,
     LOG_DENSITY_CLAMP,
     ROUND_SAMPLES,
-    cat,
 )
 
 FieldPrecision = Literal["bf16", "fp32"]

@@ -54,15 +54,16 @@ class PixelBatches:
         cameras = split.cameras
         starts = (0, *ends.tolist())
         # Where each picture starts in `_pixels`, its width and height.
-        of_each = [(start, c.width, c.height) for start, c in zip(starts, cameras, strict=False)]
+        of_each = [(start, *c.size) for start, c in zip(starts, cameras, strict=False)]
         self._pictures = torch.tensor(of_each, device=device)
         # In double precision, because corner and steps cancel for the most part.
         poses = torch.stack([c.c2w for c in cameras]).double().cpu()  # [N, 3, 4]
-        inside = [(c.fx, c.fy, c.cx, c.cy) for c in cameras]
-        fx, fy, cx, cy = torch.tensor(inside, dtype=torch.float64).T[..., None]
+        inside = torch.tensor([c.intrinsics for c in cameras], dtype=torch.float64)
+        fx, fy, cx, cy = inside.T[..., None]
         # A step in the picture, to the right and down, the ray through its upper left corner, and
         # the centre: [N, 4, 3].
-        right, down = poses[:, :, 0] / fx, poses[:, :, 1] / fy
+        right = poses[:, :, 0] / fx
+        down = poses[:, :, 1] / fy
         corner = poses[:, :, 2] - cx * right - cy * down
         self._rays = torch.stack((right, down, corner, poses[:, :, 3]), dim=1).float().to(device)
 

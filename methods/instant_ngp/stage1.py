@@ -55,6 +55,10 @@ class Setup:
         place = torch.device(device)
         return cls(grid, training, precision, resolve(backend, place), place, seed)
 
+    def generator(self, device: torch.device | str = "cpu") -> torch.Generator:
+        """Random numbers of the seed."""
+        return torch.Generator(device).manual_seed(self.seed)
+
     def settings(self, method: type) -> dict[str, str]:
         """What a row of `method` shows of how it ran, of one without a 2D network."""
         multiplied = self.precision == "fp32" or multiplies_bf16(self.device.type)
@@ -141,9 +145,11 @@ class TrainedField:
 def train_field(setup: Setup, scene: Scene, budget: Budget, log: Log) -> TrainedField:
     """Train a field on the pictures of `scene`, or load the result of the same training."""
     setup = setup.suited(scene)  # once: it reads pictures
-    generator = torch.Generator().manual_seed(setup.seed)
     field = HashField(
-        setup.grid, precision=setup.precision, backend=setup.backend, generator=generator
+        setup.grid,
+        precision=setup.precision,
+        backend=setup.backend,
+        generator=setup.generator(),
     ).to(setup.device)
     finished = log.stage_dir("field", setup.key(scene, budget)) / "field.safetensors"
 
@@ -151,7 +157,8 @@ def train_field(setup: Setup, scene: Scene, budget: Budget, log: Log) -> Trained
         return FieldTraining(field, scene, budget, setup.training, setup.seed)
 
     tensors, *cost = loop.trained(begin, finished, "field", setup.device, log)
-    grid, field.gradients = new_grid(scene, setup.device), None
+    grid = new_grid(scene, setup.device)
+    field.gradients = None
     with checkpoint.restoring(finished):
         restore_field(field, grid, tensors)
     return TrainedField(field, grid, setup.training.sampling(budget), *cost)

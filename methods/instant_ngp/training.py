@@ -2,7 +2,6 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated
@@ -132,7 +131,7 @@ class PixelTraining(loop.Training, ABC):
         if self.errors is not None:
             self.errors.learn(numbers, each.detach())
 
-        def shown() -> dict[str, Tensor]:
+        def shown() -> checkpoint.Tensors:
             return {"": each[:alike].mean() + 0 * loss}  # not finite if any error is not
 
         errors = loop.look(self, shown, {"loss": loss, "rendered pixels": pixels.values})
@@ -169,15 +168,15 @@ class PixelTraining(loop.Training, ABC):
         change = min(max(self.samples / max(samples, 1), 0.5), 1.25)
         self.rays = min(max(int(self.rays * change), MIN_RAYS), self.options.max_rays)
 
-    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        tensors, _ = super().state()
+    def state(self) -> checkpoint.Tensors:
+        tensors = super().state() | {"rays": torch.tensor(self.rays)}
         if self.errors is not None:
             tensors |= {"errors": self.errors.errors, "error_ends": self.errors.ends}
-        return tensors, {"rays": self.rays}
+        return tensors
 
-    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        super().restore(tensors, figures)
-        self.rays = int(figures["rays"])
+    def restore(self, tensors: checkpoint.Tensors) -> None:
+        super().restore(tensors)
+        self.rays = int(tensors["rays"])
         if self.errors is not None:
             self.errors.errors.copy_(tensors["errors"])
             self.errors.ends.copy_(tensors["error_ends"])
@@ -218,19 +217,19 @@ class FieldTraining(PixelTraining):
         if self.options.rays is None:
             super()._fit_batch(samples)
 
-    def watched(self) -> dict[str, Tensor]:
+    def watched(self) -> checkpoint.Tensors:
         moments = self.optimiser.table
         both = moments.first + moments.second
         return {"table": self.field.table, "table moments": both, **self.field.layers}
 
-    def result(self) -> dict[str, Tensor]:
+    def result(self) -> checkpoint.Tensors:
         return self.field.state_dict(prefix="field.") | {"grid.density": self.grid.density}
 
-    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore_result(self, tensors: checkpoint.Tensors) -> None:
         restore_field(self.field, self.grid, tensors)
 
 
-def restore_field(field: HashField, grid: DensityGrid, tensors: Mapping[str, Tensor]) -> None:
+def restore_field(field: HashField, grid: DensityGrid, tensors: checkpoint.Tensors) -> None:
     """Restore what `FieldTraining.result` returned."""
     field.load_state_dict(checkpoint.part(tensors, "field."))
     field.repack()

@@ -6,6 +6,7 @@ An `Occupancy` says where samples may lie, `Samples` are `Intervals` on rays wit
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar, Self
@@ -15,7 +16,7 @@ from scipy.ndimage import distance_transform_cdt
 from torch import Tensor
 from torch.nn import functional
 
-from bench.types import Rays, check_shape
+from bench.types import Rays, check_shape, rows
 
 BRICK = 4  # cells along the side of a brick; its 64 cells are one word of `Occupancy.words`
 
@@ -112,6 +113,16 @@ def clearance(used: Tensor) -> Tensor:
     return apart.where(apart >= 0, len(used)).clamp(max=255).to(used.device, torch.uint8)
 
 
+def cat(parts: Sequence[Tensor]) -> Tensor:
+    """`torch.cat` of one or more tensors; a single one is not copied."""
+    return parts[0] if len(parts) == 1 else torch.cat(tuple(parts))
+
+
+def joined(parts: Iterable[Sequence[Tensor]]) -> tuple[Tensor, ...]:
+    """The first tensors of all `parts` as one, see `cat`; the second ones; and so on."""
+    return tuple(map(cat, zip(*parts, strict=True)))
+
+
 def total_and_longest(counts: Tensor, offsets: Tensor) -> list[int]:
     """How many samples rays with `counts` [R] have, and how many the one with the most; `offsets`
     are `offsets_of` the counts. The host waits for a GPU, once."""
@@ -185,9 +196,7 @@ class Pixels:
 
     def take(self, index: Tensor | slice) -> Pixels:
         """The rays at `index`."""
-        if isinstance(index, slice):
-            return Pixels(*(x[index] for x in self.columns))
-        return Pixels(*(x.index_select(0, index) for x in self.columns))
+        return Pixels(*(rows(x, index) for x in self.columns))
 
     def copy(self) -> Pixels:
         """Contiguous tensors of their own."""

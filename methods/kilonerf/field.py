@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from bench.types import Probe
-from methods.kernels.types import Occupancy, offsets_of
+from methods.kernels.types import Occupancy, joined, offsets_of
 from methods.kilonerf.kernels.grouped_mlp import (
     DIRECTION_FREQUENCIES,
     SHAPES,
@@ -62,9 +62,11 @@ def place_networks(occupancy: Occupancy, bounds: Tensor, along: int) -> tuple[Gr
     extent = bounds[1] - bounds[0]
     side = extent.max() / along * (1 + 1e-6)  # a little larger: no face is lost by rounding
     shape = (extent / side).ceil().int()
-    corner, device = bounds[0].clone(), bounds.device
+    corner = bounds[0].clone()
+    device = bounds.device
     cells = occupancy.cells.nonzero()  # [C, 3]
-    low, high = cells / occupancy.resolution, (cells + 1) / occupancy.resolution
+    low = cells / occupancy.resolution
+    high = (cells + 1) / occupancy.resolution
     first = ((low - corner) / side).floor().int()
     last = ((high - corner) / side).ceil().int() - 1
     parts = []
@@ -78,7 +80,7 @@ def place_networks(occupancy: Occupancy, bounds: Tensor, along: int) -> tuple[Gr
         start = corner + cube * side
         ends = torch.maximum(low[there], start), torch.minimum(high[there], start + side)
         parts.append((cube, *ends))
-    cube, low, high = (torch.cat(part) for part in zip(*parts, strict=True))
+    cube, low, high = joined(parts)
     x, y, z = shape.tolist()
     index = (cube[:, 0] * y + cube[:, 1]) * z + cube[:, 2]
     used, number, counts = index.unique(return_inverse=True, return_counts=True)

@@ -1,7 +1,6 @@
 """KiloNeRF (Reiser et al. 2021): thousands of small networks, distilled from one field, then
 trained on photos (Section 3.2)."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -76,8 +75,8 @@ class KiloNerf(FieldStudent):
 
     def new_field(self) -> KiloField:
         """Make the networks of the grid that was placed or restored last."""
-        generator = torch.Generator().manual_seed(self.teacher.seed)
-        return KiloField(self.grid, self.teacher.backend, generator).to(self.teacher.device)
+        teacher = self.teacher
+        return KiloField(self.grid, teacher.backend, teacher.generator()).to(teacher.device)
 
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> KiloTraining:
         bounds = scene.cells.to(self.teacher.device)
@@ -87,7 +86,7 @@ class KiloNerf(FieldStudent):
         training.pieces = pieces
         return training
 
-    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore(self, tensors: checkpoint.Tensors) -> None:
         parts = checkpoint.part(tensors, "field.")
         self.grid = Grid(parts["networks"], parts["corner"], parts["side"])
         super().restore(tensors)

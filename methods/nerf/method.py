@@ -32,8 +32,8 @@ class Nerf(FieldStudent):
 
     def new_field(self) -> NerfField:
         teacher = self.teacher
-        generator = torch.Generator().manual_seed(teacher.seed)
-        return NerfField(teacher.precision, teacher.backend, generator).to(teacher.device)
+        field = NerfField(teacher.precision, teacher.backend, teacher.generator())
+        return field.to(teacher.device)
 
     def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
         """The occupied cells and a march through them, or the whole cube and every sample."""

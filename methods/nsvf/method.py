@@ -42,9 +42,8 @@ class Nsvf(FieldStudent):
     def new_field(self) -> NsvfField:
         """Make a field of random embeddings, which `begin` replaces."""
         teacher = self.teacher
-        generator = torch.Generator().manual_seed(teacher.seed)
-        field = NsvfField(self.occupancy, teacher.precision, teacher.backend, generator)
-        return field.to(teacher.device)
+        how = teacher.precision, teacher.backend, teacher.generator()
+        return NsvfField(self.occupancy, *how).to(teacher.device)
 
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> StudentTraining:
         """Make the training of a new field. Every corner begins as the teacher's encoding of its

@@ -1,7 +1,6 @@
 """PlenOctree, as a `bench.types.Method`: its leaves learn from random rays of the photos, with Adam
 (Yu et al. 2021, Section 4.2)."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -90,13 +89,13 @@ class OctreeTraining(PixelTraining):
             given = table, self.gradients[name], self.moments[name], rates[name]
             sparse_adam_(*given, backend=self.backend)
 
-    def watched(self) -> dict[str, Tensor]:
+    def watched(self) -> checkpoint.Tensors:
         return self.tables
 
-    def result(self) -> dict[str, Tensor]:
+    def result(self) -> checkpoint.Tensors:
         return self.octree.tensors()
 
-    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore_result(self, tensors: checkpoint.Tensors) -> None:
         self._take(Octree.of(tensors, self.octree.light.density.device))
 
 
@@ -125,12 +124,11 @@ class PlenOctree(Student):
 
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> OctreeTraining:
         setup = self.teacher
-        generator = torch.Generator(setup.device).manual_seed(setup.seed)
         batches = PixelBatches(scene.splits["train"], setup.device)
-        octree = extract(teacher, batches, self.extraction, generator)
+        octree = extract(teacher, batches, self.extraction, setup.generator(setup.device))
         return OctreeTraining(octree, scene, budget, self.training, setup)
 
-    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore(self, tensors: checkpoint.Tensors) -> None:
         self.octree = Octree.of(tensors, self.teacher.device).visible(self.stored)
 
     def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:

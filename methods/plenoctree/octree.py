@@ -3,7 +3,6 @@ trained field (Yu et al. 2021, Sections 3 and 4): which are needed, how dense th
 colours."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, Self
@@ -23,6 +22,7 @@ from methods.plenoctree.kernels.voxel_light import Light
 from methods.rendering.field import Field, pad
 from methods.rendering.occupancy import LARGEST, RESOLUTION
 from methods.students.voxels import largest_weights
+from methods.training.checkpoint import Tensors
 
 CELL = 4  # leaves along the side of a cell of the occupancy that selects the rays of a frame
 
@@ -62,7 +62,7 @@ class Octree:
         bricks, used = self.voxels.bricks.numel(), len(self.voxels.leaves)
         return {"leaves": width * values, "index": 4 * bricks + used * (BRICK**3 // 8 + 4)}
 
-    def tensors(self) -> dict[str, Tensor]:
+    def tensors(self) -> Tensors:
         """Everything, for a file."""
         return {
             "coordinates": self.voxels.coordinates.to(torch.int16),
@@ -72,7 +72,7 @@ class Octree:
         }
 
     @classmethod
-    def of(cls, tensors: Mapping[str, Tensor], device: torch.device) -> Self:
+    def of(cls, tensors: Tensors, device: torch.device) -> Self:
         """Make an octree of what `tensors` returned."""
         density, harmonics = (tensors[x].to(device, copy=True) for x in ("density", "harmonics"))
         coordinates = tensors["coordinates"].to(device).int()

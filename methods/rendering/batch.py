@@ -9,9 +9,9 @@ from bench.types import Rays
 from methods.kernels.composite import composite, visibility
 from methods.kernels.march import march
 from methods.kernels.march.contraction import HALF
-from methods.kernels.types import Occupancy, Pixels, Samples, offsets_of
+from methods.kernels.types import Occupancy, Pixels, Samples, cat, offsets_of
 from methods.rendering.compaction import compacts
-from methods.rendering.field import CACHED_SAMPLES, CHUNK_SAMPLES, Encoder, Field, cat, pad, query
+from methods.rendering.field import CACHED_SAMPLES, CHUNK_SAMPLES, Encoder, Field, pad, query
 from methods.rendering.sampling import Sampling
 
 FIRST_ROUNDS = (8, 16)

@@ -86,8 +86,3 @@ def pad(samples: Tensor) -> Tensor:
     if not padding or samples.device.type != "cpu":
         return samples
     return functional.pad(samples, (0, 0) * (samples.dim() - 1) + (0, padding))
-
-
-def cat(parts: tuple[Tensor, ...] | list[Tensor]) -> Tensor:
-    """`torch.cat` of one or more tensors; a single one is not copied."""
-    return parts[0] if len(parts) == 1 else torch.cat(parts)

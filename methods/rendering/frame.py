@@ -1,7 +1,7 @@
 """Volume rendering of frames: features, depth and opacity of the pixels of a camera."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Self
 
 import torch
@@ -11,9 +11,9 @@ from bench.cameras import cast, project
 from bench.types import EMPTY_ALPHA, Camera, Frame, Probe, Rays
 from methods.kernels.composite import composite, visibility
 from methods.kernels.march import march
-from methods.kernels.types import BRICK, Occupancy, Pixels, Samples
+from methods.kernels.types import BRICK, Occupancy, Pixels, Samples, joined
 from methods.rendering.compaction import compacts
-from methods.rendering.field import CACHED_SAMPLES, CHUNK_SAMPLES, Field, cat, pad, query
+from methods.rendering.field import CACHED_SAMPLES, CHUNK_SAMPLES, Field, pad, query
 from methods.rendering.sampling import Sampling
 
 CHUNK_RAYS = 1 << 16
@@ -75,8 +75,7 @@ def everywhere(field: Field, occupancy: Occupancy, probe: Probe, how: Sampling) 
     `how.window` [h * w, 2], which is given for all pixels."""
 
     def render(seen: Tensor, rays: Rays) -> Pixels:
-        window = None if how.window is None else how.window[seen]
-        return render_rays(field, rays, occupancy, probe, replace(how, window=window))
+        return render_rays(field, rays, occupancy, probe, how.of(seen))
 
     return render
 
@@ -98,14 +97,13 @@ def sees_matter(camera: Camera, occupancy: Occupancy) -> Tensor:
     bricks = occupancy.bricks.to(device)
     unit = torch.arange(2, device=device)
     corners = (bricks[:, None] + torch.cartesian_prod(unit, unit, unit)) * BRICK
-    projected, depth = project(camera, corners.reshape(-1, 3) / occupancy.resolution)
-    projected, sides = projected.view(-1, 8, 2), (camera.width, camera.height)
-    behind = (depth.view(-1, 8) <= 0).any(dim=1)[:, None]  # [B, 1]
+    projected, depth = project(camera, corners / occupancy.resolution)  # [B, 8, 2], [B, 8]
+    behind = (depth <= 0).any(dim=1)[:, None]  # [B, 1]
 
     low = torch.where(behind, 0, projected.amin(dim=1)).floor()
     high = torch.where(behind, torch.inf, projected.amax(dim=1)).ceil()
     (left, top), (right, bottom) = (
-        [x.clamp(0, size).long() for x, size in zip(ends.unbind(dim=1), sides, strict=True)]
+        [x.clamp(0, size).long() for x, size in zip(ends.unbind(dim=1), camera.size, strict=True)]
         for ends in (low, high)
     )
 
@@ -136,18 +134,18 @@ def render_rays(
     parts = []
     for first in range(0, max(len(rays.origins), 1), size):
         chunk = slice(first, first + size)
-        chunk_how = replace(how, window=None if how.window is None else how.window[chunk])
         # Contiguous, as kernels want them; once.
         some = Rays(rays.origins[chunk].contiguous(), rays.directions[chunk])
-        parts.append(_render_chunk(field, some, occupancy, probe, chunk_how).columns)
-    return Pixels(*map(cat, zip(*parts, strict=True)))
+        parts.append(_render_chunk(field, some, occupancy, probe, how.of(chunk)).columns)
+    return Pixels(*joined(parts))
 
 
 def _render_chunk(
     field: Field, rays: Rays, occupancy: Occupancy, probe: Probe, how: Sampling
 ) -> Pixels:
     """`render_rays` for rays that are rendered together."""
-    count, device, window = len(rays.origins), rays.origins.device, how.window
+    count = len(rays.origins)
+    device = rays.origins.device
     with probe.stage("field"):
         directions = field.encode_directions(rays.directions)
     canvas = Pixels.blank(count, field.channels, device)
@@ -162,7 +160,7 @@ def _render_chunk(
                 rays.take(index),
                 occupancy,
                 how.step,
-                window=None if window is None else window[index],
+                window=how.of(index).window,
                 start=start,
                 limit=limit,
                 backend=field.backend,
@@ -185,12 +183,14 @@ def _render_chunk(
             with probe.stage("composite"):
                 canvas.put(left, front)
                 going = (sees & (resume >= 0)).nonzero().squeeze(1)
-                left, start = left[going], resume[going]
+                left = left[going]
+                start = resume[going]
         return canvas
     limit = taken = most = GPU_SAMPLES
     while taken >= limit:  # else no ray resumes: each would have taken as many as it may
         taken, canvas, resume, sees = advance(slice(None), canvas, start, limit)
-        start, most = torch.where(sees, resume, -1), max(most, taken)
+        start = torch.where(sees, resume, -1)
+        most = max(most, taken)
         limit *= max(most // (2 * taken), 2) if taken else 1
     return canvas
 
@@ -211,7 +211,8 @@ def _evaluated(
             sigma, geometry = field.density(pad(samples.positions))
             sigma = sigma[: len(samples)]
             seen = bright(sigma).nonzero().squeeze(1)
-            shaded, values = len(seen), sigma.new_zeros(len(samples), field.channels)
+            shaded = len(seen)
+            values = sigma.new_zeros(len(samples), field.channels)
             for part in seen.split(CACHED_SAMPLES):
                 index = pad(part)
                 view = encoded.index_select(0, samples.ray.index_select(0, index))
@@ -220,8 +221,9 @@ def _evaluated(
         else:
             columns = samples.positions.split(CHUNK_SAMPLES), samples.ray.split(CHUNK_SAMPLES)
             parts = [query(field, *piece, encoded) for piece in zip(*columns, strict=True)]
-            sigma, values = map(cat, zip(*parts, strict=True))
-            shaded, values = len(samples), torch.where(bright(sigma)[:, None], values, 0)
+            sigma, values = joined(parts)
+            shaded = len(samples)
+            values = torch.where(bright(sigma)[:, None], values, 0)
     probe.count("shaded_samples", shaded, len(samples))
     field.count(probe, len(samples), shaded)
     return sigma, values

@@ -68,8 +68,8 @@ def learnable_cells(bounds: Tensor, cameras: Sequence[Camera], contracted: bool 
     for camera in cameras:
         camera = place_camera(camera, device)
         pixels, depth = project(camera, points)
-        views += (depth > 0) & within(pixels, camera.width, camera.height)
-        at = contract(camera.c2w[:, 3]) if contracted else camera.c2w[:, 3]
+        views += (depth > 0) & within(pixels, *camera.size)
+        at = contract(camera.centre) if contracted else camera.centre
         free &= (centres - at).abs().amax(dim=1) > 1.5 / side
     known = views >= MIN_VIEWS
     if contracted:

@@ -1,6 +1,7 @@
 """How rays are marched: their steps, and where they end."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 from torch import Tensor
 
@@ -35,6 +36,10 @@ class Sampling:
     # one of some is kept and gets the length of all. Which one is left to chance: the expected
     # optical depth and its gradient stay the same.
     thin: float = 0.0
+
+    def of(self, index: Tensor | slice) -> Self:
+        """The same for some of the rays."""
+        return self if self.window is None else replace(self, window=self.window[index])
 
     @property
     def least_weight(self) -> float:

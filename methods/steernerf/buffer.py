@@ -43,7 +43,7 @@ class PointCloud:
         camera, alpha = frame.camera, frame.alpha.flatten()
         depth = frame.depth.flatten().nan_to_num(posinf=0) * alpha  # sum w t again; inf where empty
         depth = torch.where(alpha > 0, depth, 0) + 1e-12
-        corners = pixel_grid(camera.width, camera.height, alpha.device) - 0.5
+        corners = pixel_grid(*camera.size, alpha.device) - 0.5
         points = unproject(camera, corners, depth)  # Eq. 6
         return cls(camera, points, frame.values.flatten(0, 1), alpha)
 
@@ -54,7 +54,7 @@ class PointCloud:
 
     def expected(self) -> Self:
         """The same with depths sum w t / sum w; no view sees points that are not reliable."""
-        alpha, centre = torch.where(self.reliable, self.alpha, torch.nan), self.camera.c2w[:, 3]
+        alpha, centre = torch.where(self.reliable, self.alpha, torch.nan), self.camera.centre
         return replace(self, points=centre + (self.points - centre) / alpha[:, None])
 
     def interval(self, low: Camera, epsilon: float) -> Tensor:
@@ -74,7 +74,7 @@ class PointCloud:
         """The pixel of `camera` that shows each point, and the z-depth of each point there."""
         pixels, depth = project(camera, self.points)  # Eq. 7 at low resolution, Eq. 9 at full
         # + 0.5: corners are rounded to the nearest one
-        return splat(pixels + 0.5, depth, camera.width, camera.height), depth
+        return splat(pixels + 0.5, depth, *camera.size), depth
 
 
 Buffer = deque[PointCloud]

@@ -23,14 +23,18 @@ def distilled_views(
         return Split([], [], []), 0.0
     key = {**setup.key(scene, budget), "views": count, "distillation": digest(distilled_views)}
     path = log.stage_dir("distilled", key) / "views.safetensors"
-    generator = torch.Generator().manual_seed(setup.seed)
-    taken, target = scene.splits["train"].cameras, viewing_target(scene)
+    generator = setup.generator()
+    taken = scene.splits["train"].cameras
+    target = viewing_target(scene)
     cameras = [novel_view(taken, target, generator) for _ in range(count)]
     names = [str(number) for number in range(count)]
     with missing(path, log) as to_render:
         if to_render:
-            began, pictures, probe = time.monotonic(), {}, NullProbe()
-            field, occupancy = trained.field, trained.occupancy
+            began = time.monotonic()
+            pictures = {}
+            probe = NullProbe()
+            field = trained.field
+            occupancy = trained.occupancy
             background = scene.background.to(field.device)
             render = everywhere(field, occupancy, probe, trained.sampling)
             with log.progress("distilling", count) as progress:

@@ -6,7 +6,7 @@ used. After a number of patches they are replaced, by those before another view.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
 
@@ -72,15 +72,20 @@ class Patches:
         options: JointOptions,
         generator: torch.Generator,
     ) -> None:
-        self.pipeline, self.rendering = pipeline, options.rendering(pipeline.model)
-        self.options, self.learning = options, options.field == "joint"
-        self.generator, self._pool = generator, list[Example]()
-        real, self._target = scene.splits["train"], viewing_target(scene)
+        self.pipeline = pipeline
+        self.rendering = options.rendering(pipeline.model)
+        self.options = options
+        self.learning = options.field == "joint"
+        self.generator = generator
+        self._pool = list[Example]()
+        real = scene.splits["train"]
+        self._target = viewing_target(scene)
         self.cameras = [*real.cameras, *distilled.cameras]
         self.pictures = [*real.images, *distilled.images]
         self.masks = [*(real.masks or [None] * len(real)), *[None] * len(distilled)]
-        self._real, self._distilled = len(real), len(distilled)
-        shortest = min(min(camera.width, camera.height) for camera in self.cameras)
+        self._real = len(real)
+        self._distilled = len(distilled)
+        shortest = min(min(camera.size) for camera in self.cameras)
         # Of all patches, in low-resolution pixels; even the smallest picture has one.
         self._side = min(options.patch, -(-shortest // pipeline.model.scale))
 
@@ -143,10 +148,12 @@ class Patches:
         parts = [part for patch in patches for part in self._to_render(patch)]
         chosen = indices_where([mask for _, mask in parts])
         each = [
-            cast(camera, pixel_grid(camera.width, camera.height, some.device)[some])
+            cast(camera, pixel_grid(*camera.size, some.device)[some])
             for (camera, _), some in zip(parts, chosen, strict=True)
         ]
-        rays, field, jitter = Rays.joined(each), self.pipeline.field, None
+        rays = Rays.joined(each)
+        field = self.pipeline.field
+        jitter = None
         if self.options.jitter:
             jitter = torch.rand(len(rays.origins), generator=self.generator)
             jitter = jitter.to(field.device, non_blocking=True)
@@ -182,7 +189,7 @@ class Patches:
             points = [_renewed(old, *next(rendered), background) for old in points]
         return Observation(replace(frame, depth=frame.depth.detach()), points)
 
-    def state(self) -> dict[str, Tensor]:
+    def state(self) -> checkpoint.Tensors:
         """All examples, to be kept in a file."""
         tensors = {}
         for place, example in enumerate(self._pool):
@@ -192,9 +199,10 @@ class Patches:
                 tensors |= {f"{place}.{age}.{name}": x for name, x in parts.items()}
         return tensors
 
-    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore(self, tensors: checkpoint.Tensors) -> None:
         """Restore the examples that `state` returned, with the same views and options."""
-        self._pool, device = [], self.pipeline.background.device
+        self._pool = []
+        device = self.pipeline.background.device
         while example := checkpoint.part(tensors, f"{len(self._pool)}."):
             number, uses = example["figures"].tolist()
             buffer = Buffer(maxlen=self.pipeline.model.frames)

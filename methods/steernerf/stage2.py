@@ -1,11 +1,9 @@
 """Stage 2: the 2D renderer and the field, trained together on patches (Section 3.4)."""
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 
 import torch
-from torch import Tensor
 from torch.nn import functional
 
 from bench.errors import SteerbenchError
@@ -62,7 +60,9 @@ def train_stage2(
     """Train `stage2` on the field that `setup` made for `scene`, or load the result of the same
     training. The field is widened to K features and changed in place. Returns the pipeline, the
     key of its weights, and the seconds and the peak memory of stage 2 up to them."""
-    model, joint, steps = stage2.model, stage2.joint, budget.renderer_steps
+    model = stage2.model
+    joint = stage2.joint
+    steps = budget.renderer_steps
     key = {**setup.key(scene, budget), **stage2.key(budget)}
     finished = log.stage_dir("steernerf", key) / "steernerf.safetensors"
     count = 0 if finished.exists() else joint.distilled(steps)
@@ -70,13 +70,15 @@ def train_stage2(
     meter = MemoryMeter(str(setup.device))
     with meter:
         distilled, distilled_s = distilled_views(setup, trained, scene, budget, count, log)
-    trained.field.widen(model.channels, torch.Generator().manual_seed(setup.seed))
+    trained.field.widen(model.channels, setup.generator())
 
-    renderer, generator = stage2.make(setup), torch.Generator().manual_seed(setup.seed)
+    renderer = stage2.make(setup)
+    generator = setup.generator()
     pipeline = Pipeline(trained, scene.background, renderer, model)
     patches = Patches(pipeline, scene, distilled, joint, generator)
     training = JointTraining(renderer, patches, steps, trained if patches.learning else None)
-    training.seconds, training.meter = distilled_s, meter
+    training.seconds = distilled_s
+    training.meter = meter
 
     with meter:
         loop.train(training, finished, "training the 2D renderer", log)
@@ -148,32 +150,32 @@ class JointTraining(loop.Training):
         final, waves = self.options.final_rate / first, self.options.half_waves
         return first * loop.cosine(self.step / self.steps, final, waves)
 
-    def watched(self) -> dict[str, Tensor]:
+    def watched(self) -> checkpoint.Tensors:
         field = self.trained.field.named_parameters("field") if self.trained else ()
         return dict([*self.renderer.named_parameters("renderer"), *field])
 
-    def result(self) -> dict[str, Tensor]:
+    def result(self) -> checkpoint.Tensors:
         result = self.renderer.state_dict(prefix="renderer.")
         if self.trained:
             result |= self.trained.field.state_dict(prefix="field.")
             result["grid.density"] = self.trained.grid.density
         return result
 
-    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore_result(self, tensors: checkpoint.Tensors) -> None:
         self.renderer.load_state_dict(checkpoint.part(tensors, "renderer."))
         if self.trained:
             restore_field(self.trained.field, self.trained.grid, tensors)
             self.patches.pipeline.occupancy = self.trained.grid.occupancy
 
-    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        tensors, figures = super().state()
+    def state(self) -> checkpoint.Tensors:
+        tensors = super().state()
         tensors |= {f"patches.{name}": x for name, x in self.patches.state().items()}
         if self.trained:
             tensors["visits"] = self._visits.get_state()
-        return tensors, figures
+        return tensors
 
-    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        super().restore(tensors, figures)
+    def restore(self, tensors: checkpoint.Tensors) -> None:
+        super().restore(tensors)
         self.patches.restore(checkpoint.part(tensors, "patches."))
         if self.trained:
             self._visits.set_state(tensors["visits"].cpu())

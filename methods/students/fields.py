@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -82,7 +81,7 @@ class FieldStudent(Student):
         self.occupancy = self.occupied(teacher)
         return StudentTraining(self, teacher, scene, budget)
 
-    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore(self, tensors: checkpoint.Tensors) -> None:
         self.occupancy = Occupancy(tensors["cells"].to(self.teacher.device), self.contracted)
         self.field = self.new_field()
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
@@ -163,13 +162,13 @@ class StudentTraining(PixelTraining):
     def _update(self) -> None:
         loop.step_at(self.optimiser, self.learning_rate())
 
-    def watched(self) -> dict[str, Tensor]:
+    def watched(self) -> checkpoint.Tensors:
         return dict(self.field.named_parameters())
 
-    def result(self) -> dict[str, Tensor]:
+    def result(self) -> checkpoint.Tensors:
         return self.field.state_dict(prefix="field.") | {"cells": self.occupancy.cells}
 
-    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore_result(self, tensors: checkpoint.Tensors) -> None:
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
 
 

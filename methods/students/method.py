@@ -7,7 +7,6 @@ from functools import partial
 from typing import ClassVar
 
 import torch
-from torch import Tensor
 
 from bench.cameras import place_camera
 from bench.errors import unexpected
@@ -55,7 +54,7 @@ class Student(Checked, ABC):
         """Make the training of the model, as it is before its first step."""
 
     @abstractmethod
-    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore(self, tensors: checkpoint.Tensors) -> None:
         """Load the `result` of a training, to render it."""
 
     @abstractmethod

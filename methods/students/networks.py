@@ -9,6 +9,7 @@ from torch.nn import functional
 
 from methods.instant_ngp.field import FieldPrecision
 from methods.kernels import multiplies_bf16
+from methods.kernels.types import joined
 from methods.students.fields import StudentField
 
 DIRECTION_FREQUENCIES = 4  # of NeRF, and of what follows it
@@ -86,7 +87,7 @@ class NetworkField(StudentField):
 
     def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         parts = [self.density_together(part) for part in positions.split(CHUNK)]
-        sigma, geometry = (torch.cat(column) for column in zip(*parts, strict=True))
+        sigma, geometry = joined(parts)
         return sigma, geometry
 
     def features(self, geometry: Tensor, encoded: Tensor) -> Tensor:

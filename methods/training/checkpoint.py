@@ -16,8 +16,10 @@ from bench.sharing import whole
 from bench.types import SteerbenchError
 from methods.kernels.adam import AdamState
 
+Tensors = dict[str, Tensor]  # by name
 
-def write(path: Path, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
+
+def write(path: Path, tensors: Tensors, figures: Mapping[str, float]) -> None:
     """Write a file whole or not at all, even if another process writes the same file; raise
     `SteerbenchError` if it cannot be written."""
     packed = {name: tensor.contiguous() for name, tensor in tensors.items()}
@@ -31,7 +33,7 @@ def write(path: Path, tensors: Mapping[str, Tensor], figures: Mapping[str, float
         raise SteerbenchError(f"{path}: cannot write the checkpoint: {error}") from error
 
 
-def read(path: Path) -> tuple[dict[str, Tensor], dict[str, float]]:
+def read(path: Path) -> tuple[Tensors, dict[str, float]]:
     """Read the tensors and figures of a file; raise `SteerbenchError` if it is damaged, or was not
     written by `write`."""
     try:
@@ -48,7 +50,7 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, float]]:
         ) from error
 
 
-def _sum(tensors: Mapping[str, Tensor], figures: str) -> str:
+def _sum(tensors: Tensors, figures: str) -> str:
     """SHA-256 of the names and the content of `tensors`, and of `figures`."""
     total = hashlib.sha256(figures.encode())
     for name, tensor in sorted(tensors.items()):
@@ -70,7 +72,7 @@ def restoring(path: Path) -> Iterator[None]:
         ) from error
 
 
-def part(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+def part(tensors: Tensors, prefix: str) -> Tensors:
     """The tensors whose names begin with `prefix`, without it."""
     return {name.removeprefix(prefix): x for name, x in tensors.items() if name.startswith(prefix)}
 
@@ -78,9 +80,9 @@ def part(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
 Optimisers = Mapping[str, torch.optim.Optimizer | AdamState]  # those of a training, by name
 
 
-def of_optimisers(optimisers: Optimisers) -> dict[str, Tensor]:
+def of_optimisers(optimisers: Optimisers) -> Tensors:
     """The state of `optimisers`, whose names begin its names."""
-    found: dict[str, Tensor] = {}
+    found: Tensors = {}
     for name, one in optimisers.items():
         if isinstance(one, AdamState):
             found |= {f"{name}.{slot}": x for slot, x in one.tensors().items()}
@@ -90,7 +92,7 @@ def of_optimisers(optimisers: Optimisers) -> dict[str, Tensor]:
     return found
 
 
-def restore_optimisers(optimisers: Optimisers, tensors: Mapping[str, Tensor]) -> None:
+def restore_optimisers(optimisers: Optimisers, tensors: Tensors) -> None:
     """Restore what `of_optimisers` returned."""
     for name, one in optimisers.items():
         own = part(tensors, f"{name}.")
@@ -100,7 +102,7 @@ def restore_optimisers(optimisers: Optimisers, tensors: Mapping[str, Tensor]) ->
             _restore(one, own)
 
 
-def _restore(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
+def _restore(optimiser: torch.optim.Optimizer, tensors: Tensors) -> None:
     state = optimiser.state_dict()
     parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
     for name, value in tensors.items():

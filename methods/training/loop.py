@@ -44,21 +44,21 @@ class Training(Protocol):
     def optimisers(self) -> checkpoint.Optimisers:
         """The optimisers, which a checkpoint keeps."""
 
-    def watched(self) -> Mapping[str, Tensor]:
+    def watched(self) -> checkpoint.Tensors:
         """The tensors that must be finite in a good state, by name."""
 
-    def result(self) -> dict[str, Tensor]:
+    def result(self) -> checkpoint.Tensors:
         """The tensors that the training is for."""
 
-    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+    def restore_result(self, tensors: checkpoint.Tensors) -> None:
         """Restore what `result` returned."""
 
-    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
+    def state(self) -> checkpoint.Tensors:
         """What a checkpoint must hold, besides the result, to go on as if never stopped."""
         tensors = checkpoint.of_optimisers(self.optimisers())
-        return tensors | {"generator": self.generator.get_state()}, {}
+        return tensors | {"generator": self.generator.get_state()}
 
-    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
+    def restore(self, tensors: checkpoint.Tensors) -> None:
         """Restore result and state."""
         self.restore_result(tensors)
         checkpoint.restore_optimisers(self.optimisers(), tensors)
@@ -67,16 +67,18 @@ class Training(Protocol):
 
 def trained(
     begin: Callable[[], Training], finished: Path, label: str, device: torch.device, log: Log
-) -> tuple[dict[str, Tensor], float, float]:
+) -> tuple[checkpoint.Tensors, float, float]:
     """The result of the training on `device` that `begin` makes, seconds and peak memory, of making
     it and of all its steps: read from `finished`, after a `train` if that is missing."""
     if finished.exists():
         log.info(f"trained {label} found: {finished}")
     else:
-        begun, meter = time.monotonic(), MemoryMeter(str(device))
+        begun = time.monotonic()
+        meter = MemoryMeter(str(device))
         with meter:
             training = begin()
-            training.seconds, training.meter = time.monotonic() - begun, meter
+            training.seconds = time.monotonic() - begun
+            training.meter = meter
             train(training, finished, label, log)
     tensors, figures = checkpoint.read(finished)
     with checkpoint.restoring(finished):
@@ -130,11 +132,10 @@ def save(training: Training, path: Path, done: bool = False) -> None:
     """Write the result and, unless `done`, the state. Something that is not finite raises
     `SteerbenchError` and leaves the last good file alone."""
     check_finite(training)
-    more, figures = training.state()
     if training.meter:
         training.peak_bytes = max(training.peak_bytes, training.meter.look())
-    figures |= {name: getattr(training, name) for name in ("step", "seconds", "peak_bytes")}
-    checkpoint.write(path, training.result() | ({} if done else more), figures)
+    figures = {name: getattr(training, name) for name in ("step", "seconds", "peak_bytes")}
+    checkpoint.write(path, training.result() | ({} if done else training.state()), figures)
 
 
 def load(training: Training, path: Path, done: bool = False) -> None:
@@ -145,13 +146,13 @@ def load(training: Training, path: Path, done: bool = False) -> None:
         if done:
             training.restore_result(tensors)
         else:
-            training.restore(tensors, figures)
+            training.restore(tensors)
         training.step, training.seconds = int(figures["step"]), figures["seconds"]
         training.peak_bytes = figures["peak_bytes"]
 
 
 def look(
-    training: Training, errors: Callable[[], Mapping[str, Tensor]], tensors: Mapping[str, Tensor]
+    training: Training, errors: Callable[[], checkpoint.Tensors], tensors: checkpoint.Tensors
 ) -> dict[str, float]:
     """Return the `errors` of a step as numbers; raise `SteerbenchError` if one is not finite, with
     the names of the `tensors` that are not. On a GPU this happens every `LOOK_EVERY` steps, with
@@ -161,7 +162,8 @@ def look(
     if not on_cpu and training.step % LOOK_EVERY:
         return {}
     with torch.no_grad():
-        before, training.asked = training.asked, _ask(errors())
+        before = training.asked
+        training.asked = _ask(errors())
     asked = training.asked if on_cpu else before
     told = {} if asked is None else asked()
     if not all(map(math.isfinite, told.values())):
@@ -169,10 +171,12 @@ def look(
     return told
 
 
-def _ask(errors: Mapping[str, Tensor]) -> Asked:
+def _ask(errors: checkpoint.Tensors) -> Asked:
     """Send the errors to the host, which does not wait for them."""
     together = torch.stack([error.detach() for error in errors.values()])
-    labels, values, arrived = list(errors), together.to("cpu", non_blocking=True), None
+    labels = list(errors)
+    values = together.to("cpu", non_blocking=True)
+    arrived = None
     if together.device.type == "cuda":
         arrived = torch.cuda.current_stream(together.device).record_event()
 
@@ -184,7 +188,7 @@ def _ask(errors: Mapping[str, Tensor]) -> Asked:
     return tell
 
 
-def check_finite(training: Training, more: Mapping[str, Tensor] | None = None) -> None:
+def check_finite(training: Training, more: checkpoint.Tensors | None = None) -> None:
     """Raise `SteerbenchError` naming the step and the tensors that are not finite, if any are."""
     tensors = {**training.watched(), **(more or {})}
     bad = [name for name, tensor in tensors.items() if not tensor.isfinite().all()]

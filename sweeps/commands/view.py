@@ -154,7 +154,7 @@ class Viewer:
 
     def _look(self, at: Any, camera: Camera) -> None:
         """Point a camera of viser, of a browser or the initial one, like `camera`."""
-        position, middle = camera.c2w[:, 3], self.scene.bounds.mean(dim=0)
+        position, middle = camera.centre, self.scene.bounds.mean(dim=0)
         ahead = camera.c2w[:, 2]
         distance = torch.dot(middle - position, ahead).clamp(min=0.1)
         at.position, at.look_at = position.numpy(), (position + distance * ahead).numpy()
@@ -233,7 +233,7 @@ class Viewer:
 
     def _save(self, browser: Browser) -> None:
         last = browser.path[-1]
-        cameras = [c for c in browser.path if (c.width, c.height) == (last.width, last.height)]
+        cameras = [c for c in browser.path if c.size == last.size]
         self.folder.mkdir(parents=True, exist_ok=True)
         numbered = (self.folder / f"path-{number}.json" for number in count(1))
         file = next(path for path in numbered if not path.exists())

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bench.cameras import project
@@ -68,10 +69,12 @@ def render(model: SceneModel, camera: Camera, samples: int) -> Frame:
     mean z-depth weighted by opacity (+inf where alpha is below EMPTY_ALPHA). A single sample is at
     the centre.
     """
-    width, height, offsets = camera.width, camera.height, sample_offsets(samples)
+    width, height = camera.size
+    offsets = sample_offsets(samples)
     x = (torch.arange(width)[:, None] + offsets[:, 0] - camera.cx) / camera.fx
     y = (torch.arange(height)[:, None] + offsets[:, 1] - camera.cy) / camera.fy
-    rgb, (alpha, depth) = torch.zeros(height, width, 3), torch.zeros(2, height, width)
+    rgb = torch.zeros(height, width, 3)
+    alpha, depth = torch.zeros(2, height, width)
     rows = max(BAND_RAYS // (width * samples), 1)
     seen_in = windows(camera, model.boxes())
     for top in range(0, height, rows):
@@ -83,7 +86,7 @@ def render(model: SceneModel, camera: Camera, samples: int) -> Frame:
         ]
         if not spans:
             continue
-        band = Band(camera.c2w[:, 3], camera.c2w[:, :3], x[None], y[top:bottom, None])
+        band = Band(camera.centre, camera.rotation, x[None], y[top:bottom, None])
         for picture, seen in zip((rgb, alpha, depth), model.trace(band, spans), strict=True):
             picture[top:bottom] = seen.mean(2)
     depth = (depth / alpha.clamp(min=EMPTY_ALPHA)).masked_fill(alpha < EMPTY_ALPHA, math.inf)
@@ -101,8 +104,8 @@ def sample_offsets(samples: int) -> Tensor:
 
 def windows(camera: Camera, boxes: Tensor) -> list[list[int]]:
     """The first and last column and row, exclusive, in which a camera may see each of `boxes`."""
-    pixels, depth = (x.reshape(len(boxes), 8, -1) for x in project(camera, boxes.reshape(-1, 3)))
-    ahead, size = depth[..., 0] > 0, pixels.new_tensor((camera.width, camera.height))
+    pixels, depth = project(camera, boxes)
+    ahead, size = depth > 0, pixels.new_tensor(camera.size)
     low, high = pixels.amin(1).floor() - 1, pixels.amax(1).ceil() + 1
     # A part that reaches behind the camera may be visible anywhere.
     whole = ahead.all(1, keepdim=True)
@@ -123,7 +126,8 @@ class Part:
     frame: Tensor = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "frame", rotation(*self.turn))
+        turned = Rotation.from_euler("xyz", self.turn, degrees=True).as_matrix()
+        object.__setattr__(self, "frame", torch.from_numpy(turned).float())
 
 
 class Solids:
@@ -226,16 +230,6 @@ class Solids:
                 found &= owners[under] != number
             dark[under[found]] = True
         return torch.empty_like(dark).index_put_((order,), dark)
-
-
-def rotation(x: float, y: float, z: float) -> Tensor:
-    """[3, 3] rotation by degrees about x, then y, then z."""
-    turns = torch.eye(3, dtype=torch.float64)
-    for axis, degrees in enumerate((x, y, z)):
-        c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-        about_x = torch.tensor([[1, 0, 0], [0, c, -s], [0, s, c]], dtype=torch.float64)
-        turns = about_x.roll((axis, axis), (0, 1)) @ turns
-    return turns.float()
 
 
 @dataclass(frozen=True)

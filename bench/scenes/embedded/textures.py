@@ -43,15 +43,15 @@ def spiral(first: Colour, second: Colour, stripes: int, twist: float, points: Te
     """Stripes around z that turn `twist` radians per unit of height."""
     x, y, z = points.unbind(1)
     phase = (torch.atan2(y, x) + twist * z) * stripes / (2 * math.pi)
-    return pick(phase - phase.floor() < 0.5, first, second)
+    return pick(phase % 1 < 0.5, first, second)
 
 
 @texture
 def chevrons(first: Colour, second: Colour, period: float, slope: float, points: Tensor) -> Tensor:
     """Zigzag stripes along x that repeat every `period`."""
     x, _, z = points.unbind(1)
-    phase = x / period + slope * ((z / period - (z / period).floor()) - 0.5).abs()
-    return pick(phase - phase.floor() < 0.5, first, second)
+    phase = x / period + slope * (z / period % 1 - 0.5).abs()
+    return pick(phase % 1 < 0.5, first, second)
 
 
 @texture
@@ -84,7 +84,7 @@ def wood(light: Colour, dark: Colour, rings: float, points: Tensor) -> Tensor:
     _, y, z = points.unbind(1)
     radius = torch.hypot(y + 0.7, 2 * z + 0.4) + 0.08 * noise(points * 3)
     phase = radius * rings
-    return mix((phase - phase.floor()) ** 2, light, dark)
+    return mix((phase % 1) ** 2, light, dark)
 
 
 @texture
@@ -101,7 +101,7 @@ def noise(points: Tensor) -> Tensor:
     part = points - cell
     # Trilinear at smoothstep coordinates, which avoids creases at the borders of cells.
     place = (cell + part * part * (3 - 2 * part)) / (table.shape[-1] - 1)
-    place = (place - place.floor()) * 2 - 1  # [-1, 1] spans the table from first to last vertex
+    place = (place % 1) * 2 - 1  # [-1, 1] spans the table from first to last vertex
     return grid_sample(table[None, None], place[None, None, None], align_corners=True).reshape(-1)
 
 

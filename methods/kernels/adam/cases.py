@@ -5,12 +5,12 @@ a hash table's gradient are exact in any order.
 """
 
 import math
-from functools import partial
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from bench.case import U32, Bound, Case, Given, Operation, Property, on_backends, uniform
+from bench.case import U32, Bound, Case, Given, Operation, Property, Random, on_backends
 from methods.kernels.adam import BETAS, AdamState, hash_adam_, sparse_adam_
 from methods.kernels.dispatch import served
 from methods.kernels.encode import HashGrid, SampleGradients, encode, pack
@@ -25,8 +25,10 @@ DYADIC = {"levels": 2, "log2_table": 8, "n_min": 5, "n_max": 9}
 SHARES = tuple(1 / (1 - beta) for beta in BETAS)
 """Rounding beta changes 1 - beta by at most this many u of itself, 10 and 100; and 1 - beta^n."""
 
-SECOND = 2 * U32 * (1 - BETAS[1] ** STEPS) * (SHARES[1] + 3 * STEPS)
-FIRST = 2 * U32 * (1 - BETAS[0] ** STEPS) * (SHARES[0] + 3 * STEPS)
+FIRST, SECOND = (
+    2 * U32 * (1 - beta**STEPS) * (share + 3 * STEPS)
+    for beta, share in zip(BETAS, SHARES, strict=True)
+)
 OF_STEP = 1.2 * RATE * (2 * SHARES[0] + SHARES[1] + 16)
 
 BOUNDS = {
@@ -64,45 +66,47 @@ def cases() -> list[Case]:
         on_backends(16, backends=served(__package__)),
     )
     found = [
-        first.case(f"first gradient {gradient:g}", partial(_first_step_error, gradient))
+        first.case(f"first gradient {gradient:g}", _first_step_error, gradient)
         for gradient in (0.0, 1e-40, 1e-30, 1e-15, 1.0, 1e15)
     ]
     for count, share in ((0, 0.5), (1, 1.0), (5000, 0.0), (5000, 0.3), (5000, 1.0), (LARGE, 0.3)):
-        make, items = partial(_dense, count, share, 2), count if count == LARGE else None
-        found += dense.cases(f"{share:.0%} of {count:,}", make, items=items)
+        items = count if count == LARGE else 0
+        found += dense.cases(f"{share:.0%} of {count:,}", _dense, count, share, 2, items=items)
     for features in (1, 3, 48):
-        found += dense.cases(f"30% of 70, {features} features", partial(_dense, 70, 0.3, features))
+        found += dense.cases(f"30% of 70, {features} features", _dense, 70, 0.3, features)
     for samples, features in ((0, 2), (1, 2), (60, 2), (60, 1), (60, 3)):
-        make = partial(_hashed, samples, features)
-        found += hashed.cases(f"{samples} samples, {features} features", make)
+        name = f"{samples} samples, {features} features"
+        found += hashed.cases(name, _hashed, samples, features)
     return found
 
 
 def _dense(count: int, share: float, features: int) -> Given:
-    generator = torch.Generator().manual_seed(count)
-    table = uniform(generator, (count, features))
+    random = Random(count)
+    table = random.signed(count, features)
     grads = [
-        uniform(generator, (count, features)) * (torch.rand(count, 1, generator=generator) < share)
-        for _ in range(STEPS)
+        random.signed(count, features) * (random.share(count, 1) < share) for _ in range(STEPS)
     ]
     return {"table": table, "grads": grads, "most": 1.0}
 
 
-def _dense_steps(given: Given, backend: str) -> tuple[Tensor, ...]:
-    table, state = given["table"].clone(), AdamState.like(given["table"])
-    for grad in given["grads"]:
+def _dense_steps(
+    table: Tensor, grads: Sequence[Tensor], most: float, backend: str
+) -> tuple[Tensor, ...]:
+    table, state = table.clone(), AdamState.like(table)
+    for grad in grads:
         sparse_adam_(table, grad.clone(), state, RATE, backend=backend)
     return table, state.first, state.second, state.steps
 
 
 def _hashed(samples: int, features: int) -> Given:
     grid = HashGrid(**DYADIC, features=features)
-    generator = torch.Generator().manual_seed(samples)
-    table = uniform(generator, (grid.entries, features))
-    steps, most = [], 0.0
+    random = Random(samples)
+    table = random.signed(grid.entries, features)
+    steps = []
+    most = 0.0
     for _ in range(STEPS):
-        positions = torch.randint(33, (samples, 3), generator=generator) / 32
-        grads = torch.randint(-2, 3, (samples, grid.channels), generator=generator) / 4
+        positions = random.whole(0, 33, samples, 3) / 32
+        grads = random.whole(-2, 3, samples, grid.channels) / 4
         steps.append((positions, grads))
         learned = table.clone().requires_grad_()
         encoded = encode(positions, learned, grid, backend="reference")
@@ -111,13 +115,19 @@ def _hashed(samples: int, features: int) -> Given:
     return {"table": table, "steps": steps, "grid": grid, "most": most}
 
 
-def _hash_steps(given: Given, backend: str) -> tuple[Tensor, ...]:
+def _hash_steps(
+    table: Tensor,
+    steps: Sequence[tuple[Tensor, Tensor]],
+    grid: HashGrid,
+    most: float,
+    backend: str,
+) -> tuple[Tensor, ...]:
     """With two features, there is a packed copy; the result says by how much it is off."""
-    table, state = given["table"].clone(), AdamState.like(given["table"])
+    table, state = table.clone(), AdamState.like(table)
     packed = pack(table) if table.shape[1] == 2 else None
-    for positions, grads in given["steps"]:
+    for positions, grads in steps:
         parts = SampleGradients(zip(positions.split(40), grads.split(40), strict=True))
-        hash_adam_(table, parts, given["grid"], state, RATE, packed=packed, backend=backend)
+        hash_adam_(table, parts, grid, state, RATE, packed=packed, backend=backend)
     off = table.new_zeros(0)
     if packed is not None:
         rounded, nearest = (x[:, None].view(torch.bfloat16).float() for x in (packed, pack(table)))

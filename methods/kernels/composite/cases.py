@@ -9,18 +9,18 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from bench.case import (
-    DTYPES,
     U32,
     Bound,
     Case,
     Given,
     Operation,
     Property,
+    Random,
     largest_error,
     on_backends,
     placed,
 )
-from methods.kernels.composite import composite, visibility
+from methods.kernels.composite import Visibility, composite, visibility
 from methods.kernels.dispatch import served
 from methods.kernels.types import Intervals, Pixels, offsets_of
 
@@ -76,19 +76,10 @@ SUM = f"{LIGHT}, and so are the weights together, of n opacities: 4 (n + 10) u +
 OF_A_WEIGHT = f"{LIGHT}; a weight is at most tau_i T: times min(tau_i, 1); an opacity 4 u more"
 
 
-def _intervals(given: Given) -> Intervals:
-    return Intervals(given["t"], given["delta"], offsets_of(given["counts"]))
-
-
-def _composite(given: Given, backend: str) -> tuple[Tensor, ...]:
-    how = {"stop": given["stop"], "carry": given["carry"], "backend": backend}
-    return composite(given["sigma"], given["values"], _intervals(given), **how).columns
-
-
-def _visibility(given: Given, backend: str) -> tuple[Tensor, ...]:
-    front = None if given["carry"] is None else 1 - given["carry"].alpha
-    how = {"stop": given["stop"], "front": front, "backend": backend}
-    return visibility(given["sigma"], _intervals(given), **how)
+def _visibility(
+    values: Tensor, carry: Pixels | None, sigma: Tensor, intervals: Intervals, **how: Any
+) -> Visibility:
+    return visibility(sigma, intervals, front=None if carry is None else 1 - carry.alpha, **how)
 
 
 def _roundings(given: Given) -> float:
@@ -97,7 +88,8 @@ def _roundings(given: Given) -> float:
 
 
 def _longest(given: Given) -> int:
-    return int(given["counts"].max()) if len(given["counts"]) else 0
+    counts = given["intervals"].offsets.diff()
+    return int(counts.max()) if len(counts) else 0
 
 
 def _of_sums(given: Given) -> float:
@@ -105,19 +97,19 @@ def _of_sums(given: Given) -> float:
 
 
 def _of_weights(given: Given) -> Tensor:
-    return _roundings(given) * (given["sigma"] * given["delta"]).clamp(max=1) + 4 * U32
+    return _roundings(given) * (given["sigma"] * given["intervals"].delta).clamp(max=1) + 4 * U32
 
 
 def _of_sigma(given: Given) -> Tensor:
     channels = given["values"].shape[1]
     gain = channels + DEPTH + 1
-    return given["delta"] * gain * (_of_sums(given) + 2 * (channels + 2) * U32)
+    return given["intervals"].delta * gain * (_of_sums(given) + 2 * (channels + 2) * U32)
 
 
 COMPOSITE = Operation(
     "composite",
     served(__package__),
-    _composite,
+    composite,
     {
         "values": Bound(SUM, _of_sums),
         "depth_sum": Bound("by t of at most 2, twice that", lambda given: 2 * _of_sums(given)),
@@ -164,8 +156,8 @@ def cases() -> list[Case]:
         make = partial(_given, **options)
         found += [*COMPOSITE.cases(name, make), *WEIGHTS.cases(name, make)]
     for name, extreme in EXTREMES.items():
-        found.append(pixels.case(name, partial(_extreme_error, extreme, False)))
-        found.append(gradients.case(name, partial(_extreme_error, extreme, True)))
+        found.append(pixels.case(name, _extreme_error, extreme, False))
+        found.append(gradients.case(name, _extreme_error, extreme, True))
     for count in LENGTHS:
         units = 8 + math.log2(count)
         light = Property(
@@ -176,7 +168,7 @@ def cases() -> list[Case]:
         )
         for kind in ("thin", "opaque", "alternating"):
             name = f"{count:,} samples, {kind}"
-            found.append(light.case(name, partial(_light_error, count, kind)))
+            found.append(light.case(name, _light_error, count, kind))
     return found
 
 
@@ -189,28 +181,30 @@ def _given(
     stop: float = 0.0,
 ) -> Given:
     """`rays` of up to `most` samples, which every second one has."""
-    generator = torch.Generator().manual_seed(rays + most)
-    draw = partial(torch.rand, generator=generator)
-    counts = torch.randint(0, most + 1, (rays,), generator=generator)
+    random = Random(rays + most)
+    counts = random.whole(0, most + 1, rays)
     counts[: rays // 2] = most
-    total, alpha = int(counts.sum()), draw(rays)
+    total = int(counts.sum())
+    alpha = random.share(rays)
     front = Pixels(alpha[:, None].expand(rays, channels), DEPTH * alpha, alpha)
     return {
-        "sigma": density * draw(total),
-        "values": draw(total, channels),
-        "t": DEPTH * draw(total),
-        "delta": DEPTH / max(most, 1) * draw(total),
-        "counts": counts,
+        "sigma": density * random.share(total),
+        "values": random.share(total, channels),
+        "intervals": Intervals(
+            t=DEPTH * random.share(total),
+            delta=DEPTH / max(most, 1) * random.share(total),
+            offsets=offsets_of(counts),
+        ),
         "carry": front if carry else None,
         "stop": stop,
     }
 
 
-def _ray(sigma: Tensor, delta: Tensor, values: Tensor, t: Tensor, dtype: torch.dtype) -> Given:
-    """Samples of a single ray."""
-    samples = {"sigma": sigma, "values": values, "t": t, "delta": delta}
-    rounded = {name: x.to(dtype) for name, x in samples.items()}
-    return rounded | {"counts": torch.tensor([len(sigma)]), "carry": None, "stop": 0.0}
+def _ray(sigma: Tensor, delta: Tensor, values: Tensor, t: Tensor, precision: str) -> Given:
+    """Samples of a single ray, rounded."""
+    intervals = Intervals(t, delta, torch.tensor([0, len(sigma)]))
+    samples = {"sigma": sigma, "values": values, "intervals": intervals, "stop": 0.0}
+    return placed(samples, "cpu", precision)
 
 
 def _extreme_error(
@@ -221,19 +215,22 @@ def _extreme_error(
     sigma, delta = torch.full((2, 8), 2.0, dtype=torch.float64)
     delta[:] = 0.1
     sigma[3], delta[3] = extreme
-    values, t = torch.linspace(0, 1, 24).view(8, 3).flip(0), torch.linspace(0, 2, 8)
-    given = _ray(sigma, delta, values, t, DTYPES[precision])
+    values = torch.linspace(0, 1, 24).view(8, 3).flip(0)
+    t = torch.linspace(0, 2, 8)
+    given = _ray(sigma, delta, values, t, precision)
     there = placed(given, device)
     learned = [there[name].requires_grad_(backward) for name in ("sigma", "values")]
-    pixels = _composite(there, backend)
+    pixels = composite(**there, backend=backend).columns
 
-    sigma, values, t, delta = (given[name].double() for name in ("sigma", "values", "t", "delta"))
+    sigma, values, intervals, _ = placed(given, "cpu", "fp64").values()
+    t = intervals.t
+    delta = intervals.delta
     tau = torch.where(delta > 0, sigma * delta, 0)
     behind = torch.exp(-tau.cumsum(0))
     weights = pad(behind[:-1], (1, 0), value=1.0) * -torch.expm1(-tau)
     if not backward:
         want = (weights @ values)[None], (weights @ t)[None], weights.sum()[None]
-        return largest_error([x.cpu() for x in pixels], want)
+        return largest_error(pixels, want)
     total = torch.cat([x.flatten() for x in pixels]).sum()
     of_sigma, of_values = (x.cpu() for x in torch.autograd.grad(total, learned))
     gain = values.sum(dim=1) + t + 1
@@ -247,7 +244,8 @@ def _light_error(count: int, kind: str, backend: str, device: str, precision: st
     """|sum of weights + exact transmittance of the ray - 1|."""
     tau = {"thin": [1e-4], "opaque": [50.0], "alternating": [1e-4, 0.0, 1e-2, 1e-30]}[kind]
     delta, ones = torch.tensor(tau).repeat(-(-count // len(tau)))[:count], torch.ones(count)
-    given = _ray(ones, delta, ones[:, None], ones, DTYPES[precision])
-    left = math.exp(-math.fsum(given["delta"].double().tolist()))
-    sums = torch.cat([x.flatten() for x in _composite(placed(given, device), backend)])
+    given = _ray(ones, delta, ones[:, None], ones, precision)
+    left = math.exp(-math.fsum(given["intervals"].delta.double().tolist()))
+    pixels = composite(**placed(given, device), backend=backend)
+    sums = torch.cat([x.flatten() for x in pixels.columns])
     return (sums.double() + left - 1).abs().max().item()

@@ -1,12 +1,11 @@
 """Cases of the corner features: agreement of backends, NaN."""
 
 import math
-from functools import partial
 
 import torch
 from torch import Tensor
 
-from bench.case import U32, Bound, Case, Given, Operation
+from bench.case import U32, Bound, Case, Given, Operation, Random
 from methods.kernels.corner_gather import CORNERS, OFFSETS, corner_gather
 from methods.kernels.dispatch import served
 
@@ -25,7 +24,7 @@ def _summed(given: Given) -> Tensor:
 GATHER = Operation(
     "corner_gather",
     served(__package__),
-    lambda given, backend: (corner_gather(**given, backend=backend),),
+    corner_gather,
     {
         "features": Bound(
             "8 products of numbers of at most 1, and their sum, by both: 2 x 8 x 9 u", 144 * U32
@@ -46,14 +45,14 @@ def cases() -> list[Case]:
     """Few and many samples, wide and narrow tables, NaN."""
     found = []
     for count, channels in ((0, 32), (1, 32), (257, 1), (257, 27), (257, 32), (VIEW, 32)):
-        name, items = f"{count:,} samples of {channels}", count if count == VIEW else None
-        found += GATHER.cases(name, partial(_given, count, channels), items=items)
+        name = f"{count:,} samples of {channels}"
+        found += GATHER.cases(name, _given, count, channels, items=count)
     return [*found, *GATHER.cases("NaN", _with_nan)]
 
 
 def _given(count: int, channels: int) -> Given:
     """No number is larger than 1; samples on neighbouring rays, ray by ray, half a voxel apart."""
-    generator = torch.Generator().manual_seed(count)
+    random = Random(count)
     voxel = torch.cartesian_prod(*[torch.arange(SIDE)] * 3)
     x, y, z = (voxel[:, None] + OFFSETS).unbind(dim=-1)
     steps = min(count, 2 * SIDE)
@@ -64,10 +63,10 @@ def _given(count: int, channels: int) -> Given:
     place = torch.stack((u[..., None] + 0.2 * t, v[..., None] + 0.1 * t, t), dim=-1)
     i, j, k = place.reshape(-1, 3)[:count].long().unbind(dim=1)
     return {
-        "table": torch.rand((SIDE + 1) ** 3, channels, generator=generator) * 2 - 1,
+        "table": random.signed((SIDE + 1) ** 3, channels),
         "corners": ((x * (SIDE + 1) + y) * (SIDE + 1) + z).int(),
         "voxel": ((i * SIDE + j) * SIDE + k).int(),
-        "weights": torch.rand(count, CORNERS, generator=generator),
+        "weights": random.share(count, CORNERS),
     }
 
 

@@ -2,13 +2,11 @@
 
 import itertools
 import math
-from functools import partial
 
 import torch
 from torch import Tensor
 
 from bench.case import (
-    DTYPES,
     U16,
     U32,
     Bound,
@@ -16,10 +14,10 @@ from bench.case import (
     Given,
     Operation,
     Property,
+    Random,
     largest_error,
     on_backends,
     placed,
-    uniform,
 )
 from methods.kernels.dispatch import served
 from methods.kernels.encode import PRIMES, HashGrid, encode, pack
@@ -70,15 +68,10 @@ def _units(cells: float) -> float:
     return 12 * cells + 11
 
 
-def _encode(given: Given, backend: str) -> tuple[Tensor]:
-    inputs = given["positions"], given["table"], given["grid"]
-    return (encode(*inputs, packed=given["packed"], backend=backend),)
-
-
 ENCODE = Operation(
     "encode",
     served(__package__),
-    _encode,
+    encode,
     {"features": Bound(FEATURES, _of_features)},
     {"table": Bound(SUMS, _of_sums)},
 )
@@ -99,21 +92,21 @@ def cases() -> list[Case]:
         ("view, packed", LARGE, _view(VIEW), True),
         ("random, packed", LARGE, _random(VIEW), True),
     ):
-        make, items = partial(_given, positions, grid, packed), VIEW if grid is LARGE else None
-        found += ENCODE.cases(name, make, precision="bf16" if packed else "fp32", items=items)
+        precision = "bf16" if packed else "fp32"
+        given = (positions, grid, packed)
+        found += ENCODE.cases(name, _given, *given, precision=precision, items=len(positions))
     return [*found, *_extremes()]
 
 
 def _given(positions: Tensor, grid: HashGrid, packed: bool) -> Given:
     """A random table of values of magnitude at most 1."""
-    generator = torch.Generator().manual_seed(len(positions))
-    table = uniform(generator, (grid.entries, grid.features))
+    table = Random(len(positions)).signed(grid.entries, grid.features)
     words = pack(table) if packed else None
     return {"positions": positions, "table": table, "grid": grid, "packed": words}
 
 
 def _random(count: int) -> Tensor:
-    return torch.rand(count, 3, generator=torch.Generator().manual_seed(count))
+    return Random(count).share(count, 3)
 
 
 def _view(count: int) -> Tensor:
@@ -140,7 +133,7 @@ def _extremes() -> list[Case]:
         FEATURES,
         on_backends(_units(GRID.n_max), "fp64") | packed,
     )
-    return [closed_form.case(name, partial(_feature_error, at)) for name, at in kinds.items()]
+    return [closed_form.case(name, _feature_error, at) for name, at in kinds.items()]
 
 
 def _product(*edges: float) -> Tensor:
@@ -169,13 +162,23 @@ def _exact(position: list[float], level: int, table: Tensor) -> Tensor:
 
 
 def _feature_error(positions: Tensor, backend: str, device: str, precision: str) -> float:
-    dtype = torch.float32 if precision == "bf16" else DTYPES[precision]
-    places, generator = positions.to(dtype), torch.Generator().manual_seed(0)
     # Multiples of 1/64, which bfloat16 holds.
-    table = torch.randint(-64, 65, (GRID.entries, GRID.features), generator=generator) / 64
+    table = Random(0).whole(-64, 65, GRID.entries, GRID.features) / 64
     packed = pack(table) if precision == "bf16" else None
-    given = {"positions": places, "table": table.to(dtype), "grid": GRID, "packed": packed}
-    (got,) = _encode(placed(given, device), backend)
-    nearest = places.double().clamp(0, 1).tolist()
-    exact = [_exact(at, level, table) for at in nearest for level in range(GRID.levels)]
-    return largest_error((got.cpu(),), (torch.cat(exact).view(got.shape),))
+    given = {
+        "positions": positions,
+        "table": table,
+        "grid": GRID,
+        "packed": packed,
+    }
+    kind = precision if packed is None else "fp32"
+    there = placed(given, device, kind)
+    got = encode(**there, backend=backend)
+    nearest = there["positions"].cpu().double().clamp(0, 1)
+    exact = [
+        _exact(position, level, table)
+        for position in nearest.tolist()
+        for level in range(GRID.levels)
+    ]
+    want = torch.cat(exact).view(got.shape)
+    return largest_error((got,), (want,))

@@ -3,18 +3,18 @@ corners, or come from very far."""
 
 import math
 from collections.abc import Iterator
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from bench.case import DTYPES, U32, Bound, Case, Given, Operation, Property, placed
+from bench.case import U32, Bound, Case, Operation, Property, Random, placed
 from bench.types import Rays
 from methods.kernels.dispatch import served
 from methods.kernels.march import LEAST_STEP, MAX_SAMPLES, march
-from methods.kernels.types import Occupancy
+from methods.kernels.types import Occupancy, Samples
 
 STEP = math.sqrt(3) / MAX_SAMPLES
 LONG = 4 * STEP  # for agreement: Triton's interpreter takes milliseconds per step
@@ -27,11 +27,11 @@ SIZE = 16  # cells along the grids of the ways
 
 def some_rays(count: int, away: float = 1.5) -> Rays:
     """Rays towards the cube from a sphere around it, every fourth from inside."""
-    generator = torch.Generator().manual_seed(count)
-    outside = normalize(torch.randn(count, 3, generator=generator), dim=-1) * away + 0.5
-    inside = torch.rand(count, 3, generator=generator)
+    random = Random(count)
+    outside = normalize(random.normal(count, 3), dim=-1) * away + 0.5
+    inside = random.share(count, 3)
     origins = torch.where(torch.arange(count)[:, None] % 4 == 3, inside, outside)
-    return Rays(origins, torch.rand(count, 3, generator=generator) - origins)
+    return Rays(origins, random.share(count, 3) - origins)
 
 
 def special_rays() -> Rays:
@@ -57,9 +57,10 @@ def long_rays() -> Rays:
 
 
 MIDDLE = torch.full((3,), 0.5)
+OUTSIDE = MIDDLE - 2 * SOME  # of the cube, whose middle is ahead
 SPECIAL = {
     "along axes": Rays(MIDDLE - 2 * AXES, AXES),
-    "along diagonals": Rays(MIDDLE - 2 * SOME, SOME),
+    "along diagonals": Rays(OUTSIDE, SOME),
     "in planes of the grid": Rays(torch.tensor([[-1.0, 0.25, 0.5]]), AXES[:1]),
     "through a corner of the cube": Rays(-2 * SOME, SOME),
     "through an edge of the cube": Rays(torch.tensor([0.0, 0.0, 0.5]) - 2 * SOME, SOME),
@@ -70,10 +71,10 @@ SPECIAL = {
     "past the cube": Rays(MIDDLE - 2 * AXES + 3 * AXES.roll(1, dims=1), AXES),
     "without direction": Rays(MIDDLE.expand(1, 3), torch.zeros(1, 3)),
     "from 1e6 away": Rays(MIDDLE - 1e6 * SOME, SOME),
-    "of direction 1e-30": Rays(MIDDLE - 2 * SOME, 1e-30 * SOME),
-    "of direction 1e-40": Rays(MIDDLE - 2 * SOME, 1e-40 * SOME),
+    "of direction 1e-30": Rays(OUTSIDE, 1e-30 * SOME),
+    "of direction 1e-40": Rays(OUTSIDE, 1e-40 * SOME),
     "from inside, of direction 1e-40": Rays(MIDDLE.expand(26, 3), 1e-40 * SOME),
-    "of direction 1e30": Rays(MIDDLE - 2 * SOME, 1e30 * SOME),
+    "of direction 1e30": Rays(OUTSIDE, 1e30 * SOME),
     "of directions 1 and 1e-40": Rays(
         MIDDLE + 0.01 - 2 * AXES, AXES + 1e-40 * AXES.roll(1, dims=1)
     ),
@@ -81,7 +82,7 @@ SPECIAL = {
     "along an edge, off it by 1e-30": Rays(torch.zeros(6, 3), AXES.abs() + 1e-30),
 }
 
-TOO_LONG = {f"of direction {size:g}": Rays(MIDDLE - 2 * SOME, size * SOME) for size in (1e37, 3e38)}
+TOO_LONG = {f"of direction {size:g}": Rays(OUTSIDE, size * SOME) for size in (1e37, 3e38)}
 """3e38: all three components are finite, the length is not."""
 
 
@@ -90,7 +91,7 @@ def cells(kind: str, size: int) -> Tensor:
     or at random."""
     axis = (torch.arange(size) + 0.5) / size - 0.5
     radius = (axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2).sqrt()
-    drawn = torch.rand(size, size, size, generator=torch.Generator().manual_seed(3))
+    drawn = Random(3).share(size, size, size)
     one = torch.zeros(size, size, size, dtype=torch.bool)
     one[size - 1, 0, size // 2] = True
     return {
@@ -127,11 +128,8 @@ def _occupancy(kind: str, contracted: bool, device: torch.device) -> Occupancy:
     return Occupancy(cells(kind, 128 if kind == "shell" else 32).to(device), contracted)
 
 
-def _march(given: Given, backend: str) -> tuple[Tensor, ...]:
-    rays, how = given["rays"], given["how"]
-    occupancy = _occupancy(given["grid"], given.get("contracted", False), rays.origins.device)
-    samples = march(rays, occupancy, **how, backend=backend)
-    return tuple(getattr(samples, name) for name in OUTPUTS)
+def _march(rays: Rays, grid: str, contracted: bool = False, **how: Any) -> Samples:
+    return march(rays, _occupancy(grid, contracted, rays.origins.device), **how)
 
 
 EQUAL = Bound("the same operations in the same order: 0", 0.0)
@@ -145,15 +143,15 @@ def cases() -> list[Case]:
 
 def _agreements() -> list[Case]:
     """Rays from inside and outside through a grid of scattered cells; with windows and limits."""
-    generator = torch.Generator().manual_seed(4)
-    near = torch.rand(129, generator=generator)
+    random = Random(4)
+    near = random.share(129)
     everywhere = torch.tensor([-torch.inf, torch.inf]).expand(129, 2)
-    start = torch.randint(-1, 100, (129,), generator=generator).int()
+    start = random.whole(-1, 100, 129).int()
     kinds: dict[str, tuple[Rays, str, dict[str, Any]]] = {
         "no ray": (some_rays(0), "dust", {}),
         "one ray": (some_rays(1), "dust", {}),
         "inside and outside": (some_rays(129), "dust", {}),
-        "jitter": (some_rays(129), "dust", {"jitter": torch.rand(129, generator=generator)}),
+        "jitter": (some_rays(129), "dust", {"jitter": random.share(129)}),
         "window": (some_rays(129), "dust", {"window": torch.stack((near, near + 0.5), dim=1)}),
         "window without bounds": (some_rays(129), "dust", {"window": everywhere}),
         "resumed": (some_rays(129), "dust", {"start": start}),
@@ -167,17 +165,17 @@ def _agreements() -> list[Case]:
     }
     found = []
     for name, (rays, grid, options) in kinds.items():
-        given = {"rays": rays, "grid": grid, "how": {"step": LONG} | options}
-        found += MARCH.cases(name, partial(dict, given))
+        found += MARCH.cases(name, dict, {"rays": rays, "grid": grid, "step": LONG, **options})
+    endless = {"step": LONG, "contracted": True}
     for name in ("inside and outside", "jitter", "window", "resumed", "limit 7"):
         options = {key: x[:33] if key != "limit" else x for key, x in kinds[name][2].items()}
-        given = {"rays": some_rays(33), "grid": "dust", "how": {"step": LONG} | options}
-        found += MARCH.cases(f"all of space, {name}", partial(dict, given, contracted=True))
+        given = {"rays": some_rays(33), "grid": "dust", **endless, **options}
+        found += MARCH.cases(f"all of space, {name}", dict, given)
     for name in ("axes, planes, corners and what is not finite", "long directions"):
-        given = {"rays": kinds[name][0], "grid": "porous shell", "how": {"step": LONG}}
-        found += MARCH.cases(f"all of space, {name}", partial(dict, given, contracted=True))
-    many = {"rays": some_rays(1 << 13), "grid": "shell", "how": {"step": STEP}}
-    return [*found, *MARCH.cases("hollow sphere", partial(dict, many), items=1 << 13)]
+        given = {"rays": kinds[name][0], "grid": "porous shell", **endless}
+        found += MARCH.cases(f"all of space, {name}", dict, given)
+    many = {"rays": some_rays(1 << 13), "grid": "shell", "step": STEP}
+    return [*found, *MARCH.cases("hollow sphere", dict, many, items=1 << 13)]
 
 
 def _ways() -> Iterator[Case]:
@@ -200,13 +198,12 @@ def _ways() -> Iterator[Case]:
                 f"{steps} steps, and t rounded 4 times at the size of the origin: 4 √3 |o| u",
                 {(b, "fp32"): steps * STEP + rounding for b in ("reference", "cpu")},
             )
-            yield way.case(f"{kind}, {grid}", partial(_way_error, grid, rays))
+            yield way.case(f"{kind}, {grid}", _way_error, grid, rays)
 
 
 def _way_error(grid: str, given: Rays, backend: str, device: str, precision: str) -> float:
     """Error of the path length covered by the samples; infinite if they are not in order."""
-    rays, dtype = placed(given, device), DTYPES[precision]
-    rays = Rays(rays.origins.to(dtype), rays.directions.to(dtype))
+    rays = placed(given, device, precision)
     occupied = cells(grid, SIZE)
     samples = march(rays, Occupancy(occupied.to(device)), STEP, backend=backend)
     same = samples.ray[1:] == samples.ray[:-1]

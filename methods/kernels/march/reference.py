@@ -8,19 +8,26 @@ from torch.nn import functional
 
 from methods.kernels.march import LEAST_STEP, Segments, longest_ray
 from methods.kernels.march.contraction import Course, contract
-from methods.kernels.types import PARALLEL, Occupancy, Samples, offsets_of, total_and_longest
+from methods.kernels.types import (
+    PARALLEL,
+    Occupancy,
+    Samples,
+    joined,
+    offsets_of,
+    total_and_longest,
+)
 
 BLOCK = 1 << 12  # rays that are tested at a time: [BLOCK, 1024, 3] positions are 50 MB
 
 
 def march(segments: Segments, occupancy: Occupancy) -> Samples:
     steps = _Steps(segments, occupancy)
-    parts = zip(*steps.taken(occupancy), strict=True)
-    kept, counts, resume = (torch.cat(column) for column in parts)
+    kept, counts, resume = joined(steps.taken(occupancy))
     offsets = offsets_of(counts)
     total, longest = total_and_longest(counts, offsets)
     place = torch.nonzero_static(kept.flatten(), size=total).squeeze(1)
-    ray, k = place // max(steps.most, 1), place % max(steps.most, 1)
+    ray = place // max(steps.most, 1)
+    k = place % max(steps.most, 1)
     t, positions = steps.at(ray, k)
     course = steps.course
     delta = torch.full_like(t, segments.step) if course is None else course.lengths(ray, t)

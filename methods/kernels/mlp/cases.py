@@ -5,13 +5,10 @@ that it is exact in any order, and no activation lies within rounding of the cor
 """
 
 import math
-from collections.abc import Sequence
-from functools import partial
 
-import torch
 from torch import Tensor
 
-from bench.case import DTYPES, Bound, Case, Given, Operation
+from bench.case import Bound, Case, Given, Operation, Random, placed
 from methods.kernels.dispatch import served
 from methods.kernels.mlp import mlp
 
@@ -23,16 +20,16 @@ DENSITY, FEATURES = ((32,), (64, 16)), ((16, 16), (64, 64, 3))
 MANY = 1 << 17
 
 
-def _eighths(generator: torch.Generator, shape: Sequence[int], most: int = 8) -> Tensor:
+def _eighths(random: Random, *shape: int, most: int = 8) -> Tensor:
     """Random multiples of 1/8, of at most `most`/8."""
-    return torch.randint(-most, most + 1, tuple(shape), generator=generator) / 8
+    return random.whole(-most, most + 1, *shape) / 8
 
 
 EXACT = Bound("sums of few bits: 0", 0.0)
 MLP = Operation(
     "mlp",
     served(__package__),
-    lambda given, backend: (mlp(given["inputs"], given["weights"], backend=backend),),
+    mlp,
     {"outputs": EXACT},
     {"inputs": EXACT, "weights": EXACT},
     _eighths,
@@ -56,21 +53,21 @@ def cases() -> list[Case]:
     for count, network, precision in kinds:
         inputs, widths = (", ".join(map(str, channels)) for channels in network)
         name = f"{count:,} of {inputs} to {widths}" + ", bf16" * (precision == "bf16")
-        make, items = partial(_network, count, network, precision), count if count == MANY else None
-        found += MLP.cases(name, make, precision=precision, items=items)
+        given = count, network, precision
+        found += MLP.cases(name, _network, *given, precision=precision, items=count)
     return [*found, *MLP.cases("a sample of NaN", _with_nan)]
 
 
 def _network(count: int, network: Network, precision: str) -> Given:
     inputs, widths = network
-    generator = torch.Generator().manual_seed(count)
+    random = Random(count)
     channels = (sum(inputs), *widths)
     shapes = [(channels[n + 1], channels[n]) for n in range(len(widths))]
-    dtype = DTYPES[precision]
-    return {
-        "inputs": [_eighths(generator, (count, part)).to(dtype) for part in inputs],
-        "weights": [_eighths(generator, shape, 1).to(dtype) for shape in shapes],
+    drawn = {
+        "inputs": [_eighths(random, count, part) for part in inputs],
+        "weights": [_eighths(random, *shape, most=1) for shape in shapes],
     }
+    return placed(drawn, "cpu", precision)
 
 
 def _with_nan() -> Given:

@@ -1,18 +1,15 @@
 """Cases of the sums of harmonics."""
 
-from functools import partial
-
-import torch
 from torch.nn.functional import normalize
 
-from bench.case import U32, Bound, Case, Given, Operation
+from bench.case import U32, Bound, Case, Given, Operation, Random
 from methods.kernels.dispatch import served
 from methods.kernels.shade import SIZES, shade
 
 SHADE = Operation(
     "shade",
     served(__package__),
-    lambda given, backend: (shade(given["coefficients"], given["directions"], backend=backend),),
+    shade,
     {
         "colours": Bound(
             "C products of harmonics below 2, off by 48 u, and coefficients below 6, and their "
@@ -32,16 +29,13 @@ def cases() -> list[Case]:
     """Colours of all degrees, of no, one and many directions, forward and backward."""
     found = []
     for count in (0, 1, 131, 1 << 16):
-        items = count if count > 131 else None
         for size in SIZES if count == 131 else SIZES[-1:]:
-            make = partial(_coloured, count, size)
-            found += SHADE.cases(f"{count:,} colours of {size}", make, items=items)
+            name = f"{count:,} colours of {size}"
+            found += SHADE.cases(name, _coloured, count, size, items=count)
     return found
 
 
 def _coloured(count: int, size: int) -> Given:
-    generator = torch.Generator().manual_seed(count + 1)
-    coefficients = torch.randn(count, size, 3, generator=generator).clamp(-6, 6)
-    generator = torch.Generator().manual_seed(count)
-    directions = normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    coefficients = Random(count + 1).normal(count, size, 3).clamp(-6, 6)
+    directions = normalize(Random(count).normal(count, 3), dim=-1)
     return {"coefficients": coefficients, "directions": directions}

@@ -7,9 +7,8 @@ from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from bench.case import DTYPES, Bound, Case, Given, Operation, Property, on_backends, placed
+from bench.case import Bound, Case, Given, Operation, Property, Random, on_backends, placed
 from bench.types import Rays
 from methods.kernels.dispatch import served
 from methods.kernels.march.cases import SPECIAL, cells, slab_lengths, some_rays, special_rays
@@ -19,14 +18,8 @@ SIZE = 24  # resolution of the grids in most cases; not a power of two, so that 
 
 RESULTS = ("offsets", "ray", "voxel", "near", "far", "t", "delta")
 
-
-def _walk(given: Given, backend: str) -> tuple[Tensor, ...]:
-    crossings = walk(**given, backend=backend)
-    return tuple(getattr(crossings, name) for name in RESULTS)
-
-
 SAME = Bound("t of planes by the same operations, cells by comparing them: 0", 0.0)
-WALK = Operation("voxel_walk", served(__package__), _walk, dict.fromkeys(RESULTS, SAME))
+WALK = Operation("voxel_walk", served(__package__), walk, dict.fromkeys(RESULTS, SAME))
 
 
 def cases() -> list[Case]:
@@ -49,8 +42,7 @@ def _agreements() -> Iterator[Case]:
     for name, kind in kinds.items():
         yield from WALK.cases(name, partial(_given, **kind))
     many = 1 << 13
-    shell = partial(_given, count=many, grid="shell")
-    yield from WALK.cases("hollow sphere in 128^3", shell, items=many)
+    yield from WALK.cases("hollow sphere in 128^3", _given, many, "shell", items=many)
 
 
 def _given(count: int | None = 129, grid: str = "dust", away: float = 1.5) -> Given:
@@ -60,8 +52,8 @@ def _given(count: int | None = 129, grid: str = "dust", away: float = 1.5) -> Gi
 
 def _grid(kind: str) -> Voxels:
     size = 128 if kind == "shell" else SIZE
-    chosen, generator = cells(kind, size).nonzero(), torch.Generator().manual_seed(3)
-    return Voxels(chosen[torch.randperm(len(chosen), generator=generator)], size)
+    chosen = cells(kind, size).nonzero()
+    return Voxels(chosen[torch.randperm(len(chosen), generator=Random(3).generator)], size)
 
 
 def _lengths() -> Iterator[Case]:
@@ -78,14 +70,13 @@ def _lengths() -> Iterator[Case]:
                 "corners are cut as often again: 16 √3 |o| u",
                 on_backends(16 * math.sqrt(3) * size),
             )
-            yield each.case(f"{kind}, {grid}", partial(_length_error, grid, rays))
+            yield each.case(f"{kind}, {grid}", _length_error, grid, rays)
 
 
 def _length_error(grid: str, given: Rays, backend: str, device: str, precision: str) -> float:
     """Largest error of a ray's length in a voxel. Infinite if crossings are not in order, or have
     gaps in the full grid."""
-    (rays, voxels), dtype = placed((given, _grid(grid)), device), DTYPES[precision]
-    rays = Rays(rays.origins.to(dtype), rays.directions.to(dtype))
+    rays, voxels = placed((given, _grid(grid)), device, precision)
     found = walk(rays, voxels, backend=backend)
     same = found.ray[1:] == found.ray[:-1]
     gaps = (found.near[1:] - found.far[:-1])[same]

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from bench.types import Rays
 from methods.kernels.march.reference import crossed, lengths, slopes
-from methods.kernels.types import offsets_of, total_and_longest
+from methods.kernels.types import joined, offsets_of, total_and_longest
 from methods.kernels.voxel_walk import BRICK, Crossings, Voxels
 
 BLOCK = 1 << 11  # rays that are processed at a time
@@ -17,7 +17,7 @@ BLOCK = 1 << 11  # rays that are processed at a time
 def walk(rays: Rays, voxels: Voxels) -> Crossings:
     blocks = zip(rays.origins.split(BLOCK), rays.directions.split(BLOCK), strict=True)
     parts = [_walk_block(*block, voxels) for block in blocks]
-    near, far, voxel, counts = (torch.cat(column) for column in zip(*parts, strict=True))
+    near, far, voxel, counts = joined(parts)
     ray = torch.arange(len(counts), device=counts.device)
     ray = ray.repeat_interleave(counts, output_size=len(near))
     delta = (far - near) * lengths(rays.directions)[ray]

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from bench.cameras import pixel_grid
 from bench.scenes import transforms
 from bench.scenes.assemble import hold_out
+from bench.scenes.files import Fields
 from bench.scenes.images import Fisheye, RadialTangential, undistort, undistorted_camera
 from bench.types import Camera, SteerbenchError
 from tests.bench.scenes.conftest import edit_json, picture, pose
@@ -348,4 +349,4 @@ def test_colours_between_pixels_weigh_by_their_alpha():
     ],
 )
 def test_the_lens_is_that_of_the_camera_model(settings, expected):
-    assert transforms.read_lens(settings, "here") == expected
+    assert transforms.read_lens(Fields("here", settings)) == expected

@@ -2,21 +2,19 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from bench.case import (
-    DTYPES,
     U32,
     Bound,
     Case,
     Given,
     Operation,
     Property,
+    Random,
     largest_error,
     on_backends,
     placed,
@@ -46,7 +44,7 @@ PLACE = (
 WEIGH = Operation(
     "segment_weights",
     served(__package__),
-    lambda given, backend: (segment_weights(**given, backend=backend),),
+    segment_weights,
     {"weights": Bound(f"{WEIGHTS}; {PLACE}; by both: 72 G + 32 u", (72 * SIDE + 32) * U32)},
 )
 
@@ -62,7 +60,7 @@ def _light(given: Given) -> float:
 RENDER = Operation(
     "render_segments",
     served(__package__),
-    lambda given, backend: render_segments(**given, backend=backend)[0].columns,
+    lambda **given: render_segments(**given)[0].columns,
     {
         "values": Bound(
             "as opacities, and colours by 540 / 4 u", lambda given: _light(given) + 540 / 4 * U32
@@ -93,7 +91,7 @@ def cases() -> list[Case]:
     found = [spoilt.case("NaN in a corner", _nan_error)]
     for name, make in {"in a voxel": _inside, "rays through a full grid": _through}.items():
         found += WEIGH.cases(name, make)
-        found.append(exact.case(f"{name}, by quadrature", partial(_quadrature_error, make)))
+        found.append(exact.case(f"{name}, by quadrature", _quadrature_error, make))
     for name, given in {
         "no ray": (SIDE, 0, torch.float32, 0.0, 0.0),
         "one ray": (SIDE, 1, torch.float32, 0.0, 0.0),
@@ -102,8 +100,7 @@ def cases() -> list[Case]:
         "129 rays, stop and faint": (SIDE, 129, torch.float32, 1e-4, 1e-5),
         "8,192 rays in 64^3": (64, 1 << 13, torch.bfloat16, 1e-2, 1e-2),
     }.items():
-        items = given[1] if given[1] > 129 else None
-        found += RENDER.cases(name, partial(scene, *given), items=items)
+        found += RENDER.cases(name, scene, *given, items=given[1])
     return found
 
 
@@ -112,19 +109,29 @@ def _inside() -> Given:
     the middle, also from one of them to itself."""
     places = torch.cartesian_prod(*[torch.tensor([0.0, 0.5, 1.0])] * 3)
     pairs = torch.cartesian_prod(torch.arange(27), torch.arange(27))
-    drawn = torch.rand(2, 1000, 3, generator=torch.Generator().manual_seed(1000))
+    drawn = Random(1000).share(2, 1000, 3)
     entry, leave = torch.cat((drawn, places[pairs.T]), dim=1)
-    count, rays = len(entry), Rays(entry / SIDE, (leave - entry) / SIDE)
-    number, zeros, ones = torch.arange(count), torch.zeros(count), torch.ones(count)
-    offsets, first = torch.arange(count + 1), torch.zeros(count, dtype=torch.int32)
-    crossings = Crossings(ones / 2, ones, offsets, zeros, ones, number.int(), first)
-    voxels = Voxels(torch.zeros(1, 3, dtype=torch.int32), SIDE)
-    return {"rays": rays, "crossings": crossings, "voxels": voxels}
+    count = len(entry)
+    ones = torch.ones(count)
+    crossings = Crossings(
+        t=ones / 2,
+        delta=ones,
+        offsets=torch.arange(count + 1),
+        near=torch.zeros(count),
+        far=ones,
+        ray=torch.arange(count).int(),
+        voxel=torch.zeros(count, dtype=torch.int32),
+    )
+    return {
+        "rays": Rays(entry / SIDE, (leave - entry) / SIDE),
+        "crossings": crossings,
+        "voxels": Voxels(torch.zeros(1, 3, dtype=torch.int32), SIDE),
+    }
 
 
 def _through() -> Given:
     """Rays through a full grid, and their crossings."""
-    ends = torch.rand(2, 100, 3, generator=torch.Generator().manual_seed(5))
+    ends = Random(5).share(2, 100, 3)
     rays = Rays(2 * ends[0] - ends[1], ends[1] - ends[0])
     voxels = Voxels(torch.cartesian_prod(*[torch.arange(SIDE)] * 3), SIDE)
     crossings = walk(rays, voxels, backend="reference")
@@ -134,10 +141,11 @@ def _through() -> Given:
 def _quadrature_error(
     make: Callable[[], Given], backend: str, device: str, precision: str
 ) -> float:
-    given, dtype = placed(make(), device), DTYPES[precision]
-    rays, crossings, voxels = given.values()
-    ray, corner = crossings.ray.long(), voxels.coordinates[crossings.voxel.long()]
-    origins, directions = rays.origins[ray].double(), rays.directions[ray].double()
+    rays, crossings, voxels = placed(list(make().values()), device, precision)
+    ray = crossings.ray.long()
+    corner = voxels.coordinates[crossings.voxel.long()]
+    origins = rays.origins[ray].double()
+    directions = rays.directions[ray].double()
     near, far = (
         ((origins + t.double()[:, None] * directions) * SIDE - corner).clamp(0, 1)
         for t in (crossings.near, crossings.far)
@@ -146,19 +154,17 @@ def _quadrature_error(
     for place, share in zip(*np.polynomial.legendre.leggauss(4), strict=True):
         point = (near + far + place * (far - near))[:, None] / 2  # [S, 1, 3]
         exact += share / 2 * torch.where(OFFSETS.to(device) > 0, point, 1 - point).prod(dim=2)
-    rays = Rays(rays.origins.to(dtype), rays.directions.to(dtype))
-    crossings = replace(crossings, near=crossings.near.to(dtype), far=crossings.far.to(dtype))
     return largest_error((segment_weights(rays, crossings, voxels, backend=backend),), (exact,))
 
 
 def scene(side: int, count: int, dtype: torch.dtype, stop: float, faint: float) -> Given:
     """Every third voxel of a grid, with features from -1 to 1."""
-    generator = torch.Generator().manual_seed(side)
+    random = Random(side)
 
     def between(low: float, high: float, *shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator) * (high - low) + low
+        return random.share(*shape) * (high - low) + low
 
-    cells = (torch.rand(side, side, side, generator=generator) < 1 / 3).nonzero().int()
+    cells = (random.share(side, side, side) < 1 / 3).nonzero().int()
     rows = (cells[:, None] + OFFSETS) @ torch.tensor([(side + 1) ** 2, side + 1, 1])
     table = between(-1, 1, (side + 1) ** 3, FEATURES).to(dtype)
     layers = Layers(
@@ -182,7 +188,7 @@ def scene(side: int, count: int, dtype: torch.dtype, stop: float, faint: float) 
 
 def _nan_error(backend: str, device: str, precision: str) -> float:
     """0 if it holds, else infinity."""
-    given = placed(scene(SIDE, 129, DTYPES[precision], 0.0, 0.0), device)
+    given = placed(scene(SIDE, 129, torch.float32, 0.0, 0.0), device)
     corners = given["corners"]
     whole, _, _ = render_segments(**given, backend=backend)
     row = corners.rows[len(corners.rows) // 2, 0]

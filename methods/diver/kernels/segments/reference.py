@@ -8,7 +8,7 @@ from bench.types import Rays
 from methods.diver.kernels.segments import Corners, Layers, as_intervals
 from methods.kernels.composite import composite, visibility
 from methods.kernels.corner_gather import corner_gather, trilinear
-from methods.kernels.types import Pixels
+from methods.kernels.types import Pixels, joined
 from methods.kernels.voxel_walk import Crossings, Voxels, walk
 
 CHUNK_RAYS = 1 << 15
@@ -40,9 +40,9 @@ def render_segments(
             render_segments(rays.take(some), corners, layers, towards[some], stop, faint)
             for some in chunks
         )
-        columns = ((*vars(pixels).values(), *counts) for pixels, *counts in parts)
-        *joined, crossed, shaded = map(torch.cat, zip(*columns, strict=True))
-        return Pixels(*joined), crossed, shaded
+        columns = ((*whole.columns, *counts) for whole, *counts in parts)
+        values, depth, alpha, crossed, shaded = joined(columns)
+        return Pixels(values, depth, alpha), crossed, shaded
     crossings = walk(rays, corners.voxels, backend="reference")
     ray = crossings.ray.long()
     mean = segment_weights(rays, crossings, corners.voxels)

@@ -1,6 +1,5 @@
 """Cases of the blending of Gaussians: agreement of the backends, and results known in advance."""
 
-from functools import partial
 from typing import Any
 
 import torch
@@ -8,15 +7,16 @@ from torch import Tensor
 
 from bench.cameras import pixel_grid
 from bench.case import (
-    DTYPES,
     U32,
     Bound,
     Case,
     Given,
     Operation,
     Property,
+    Random,
     largest_error,
     on_backends,
+    placed,
 )
 from methods.gaussians.kernels.blending import LARGEST_ALPHA, blend
 from methods.gaussians.kernels.projection import LEAST_ALPHA, Ellipses
@@ -29,10 +29,10 @@ CLEAR = 1e-4
 CROWD = 600  # Gaussians at a pixel of the cases, at most
 
 
-def _pixels(given: Given, backend: str) -> tuple[Tensor, ...]:
-    rest = dict(given)
-    ellipses = Ellipses(*(rest.pop(name) for name in ("centres", "conics", "depth", "extents")))
-    return blend(ellipses, **rest, backend=backend).columns
+def _pixels(
+    centres: Tensor, conics: Tensor, depth: Tensor, extents: Tensor, **rest: Any
+) -> tuple[Tensor, ...]:
+    return blend(Ellipses(centres, conics, depth, extents), **rest).columns
 
 
 WHY = (
@@ -73,10 +73,9 @@ SIZES = {
 
 def cases() -> list[Case]:
     """No, some and crowded Gaussians; a plain loop; stop."""
-    found = BLEND.cases("crowded, to a stop", partial(draw, *SIZES["crowded"], stop=STOP))
+    found = BLEND.cases("crowded, to a stop", draw, *SIZES["crowded"], STOP)
     for name, size in SIZES.items():
-        items = size[0] if size[0] == 2000 else None
-        found += BLEND.cases(name, partial(draw, *size), items=items)
+        found += BLEND.cases(name, draw, *size, items=size[0])
 
     loop = Property(
         BLEND.subject,
@@ -90,11 +89,7 @@ def cases() -> list[Case]:
 def draw(count: int, width: int, height: int, size: int = 1, stop: float = 0.0) -> Given:
     """Gaussians in and around a picture, one to six pixels wide, or `size` times as wide; without
     those whose opacity at some pixel is close to a cut-off, where rounding would decide."""
-    generator = torch.Generator().manual_seed(count + width)
-
-    def rand(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator)
-
+    rand = Random(count + width).share
     centres = (rand(count, 2) * 1.4 - 0.2) * torch.tensor((width, height))
     variances = size**2 * (0.3 + 4 * rand(count, 2))
     tilt = (1.6 * rand(count) - 0.8) * variances.prod(dim=1).sqrt()
@@ -128,20 +123,24 @@ def _alphas(given: Given, width: int, height: int) -> Tensor:
 
 def _loop_error(backend: str, device: str, precision: str) -> float:
     """Of pixels, and of their slopes in the colours: weights, which are 0 behind the stop."""
-    width, height = 13, 9
+    width = 13
+    height = 9
     given = draw(60, width, height, stop=0.3)
     given["opacities"][0] = 1.0  # its alpha is cut
-    depth, shares = given["depth"], torch.zeros(width * height, 60, dtype=torch.float64)
+    depth = given["depth"]
+    shares = torch.zeros(width * height, 60, dtype=torch.float64)
     for row, weights in zip(_alphas(given, width, height).tolist(), shares, strict=True):
         light = 1.0
         for i in depth.argsort().tolist():
             if light > given["stop"] and row[i] >= LEAST_ALPHA:
                 weights[i] = light * min(row[i], LARGEST_ALPHA)
                 light -= weights[i].item()
-    weights, dtype = shares[:, : len(depth)], DTYPES[precision]
-    there = {k: x.to(device, dtype) if isinstance(x, Tensor) else x for k, x in given.items()}
-    got = _pixels(there | {"colours": there["colours"].requires_grad_()}, backend)
+    weights = shares[:, : len(depth)]
+    there = placed(given, device, precision)
+    there["colours"].requires_grad_()
+    got = _pixels(**there, backend=backend)
     (slope,) = torch.autograd.grad(got[0].mean(dim=0).sum(), there["colours"])
-    colours, z = weights @ given["colours"].double(), weights @ depth.double()
+    colours = weights @ given["colours"].double()
+    z = weights @ depth.double()
     want = colours, z, weights.sum(dim=1), weights.mean(dim=0)[:, None].expand(-1, 3)
-    return largest_error([x.detach().cpu() for x in (*got, slope)], want)
+    return largest_error((*got, slope), want)

@@ -6,7 +6,7 @@ from torch import Tensor
 from bench.cameras import pixel_grid
 from methods.gaussians.kernels.blending import LARGEST_ALPHA
 from methods.gaussians.kernels.projection import LEAST_ALPHA, Ellipses
-from methods.kernels.types import Pixels
+from methods.kernels.types import Pixels, joined
 
 BAND = 16  # rows that are blended together, which bounds the memory
 
@@ -18,7 +18,8 @@ def blend(
     bands = []
     for top in range(0, height, BAND):
         rows = min(BAND, height - top)
-        y, half = ellipses.centres[:, 1].detach(), ellipses.extents[:, 1]
+        y = ellipses.centres[:, 1].detach()
+        half = ellipses.extents[:, 1]
         reaching = (half > 0) & (y + half >= top) & (y - half <= top + rows)
         some = order[reaching[order]]
         column, row = pixel_grid(width, rows, opacities.device).to(opacities).unbind(dim=1)
@@ -32,5 +33,5 @@ def blend(
         transmittance = through[:, :-1]  # in front of each
         weight = torch.where(transmittance > stop, transmittance * alpha, 0)
         bands.append((weight @ colours[some], weight @ ellipses.depth[some], weight.sum(dim=1)))
-    values, depth, alpha = (torch.cat(parts) for parts in zip(*bands, strict=True))
+    values, depth, alpha = joined(bands)
     return Pixels(values, depth.detach(), alpha)

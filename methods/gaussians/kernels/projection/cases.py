@@ -1,7 +1,6 @@
 """Cases of the projection of Gaussians: agreement of the backends, ellipses known in advance."""
 
 import math
-from functools import partial
 from typing import Any
 
 import torch
@@ -10,18 +9,19 @@ from torch.func import jacrev, vmap
 
 from bench.cameras import project
 from bench.case import (
-    DTYPES,
     U32,
     Bound,
     Case,
     Given,
     Operation,
     Property,
+    Random,
     largest_error,
     on_backends,
     placed,
 )
 from bench.cases import CAMERAS
+from bench.types import Camera
 from methods.gaussians.kernels.projection import (
     BLUR,
     FRUSTUM,
@@ -39,8 +39,8 @@ AREA = (
 )
 
 
-def _ellipses(given: Given, backend: str) -> tuple[Tensor, ...]:
-    ellipses, size = project_gaussians(**given, backend=backend), given["camera"].width
+def _ellipses(camera: Camera, **given: Any) -> tuple[Tensor, ...]:
+    ellipses, size = project_gaussians(**given, camera=camera), camera.width
     depth = ellipses.depth.detach()  # which has no gradient
     return ellipses.centres / size, ellipses.conics, depth, ellipses.extents / size
 
@@ -65,8 +65,7 @@ def cases() -> list[Case]:
     """No, one and many Gaussians, some behind the camera; circles; slopes by autograd."""
     found = []
     for count in (0, 1, 1000, 1 << 16):
-        name, items = f"{count:,} Gaussians", count if count > 1000 else None
-        found += PROJECT.cases(name, partial(_given, count), items=items)
+        found += PROJECT.cases(f"{count:,} Gaussians", _given, count, items=count)
     slopes = Property(
         PROJECT.subject,
         "the ellipse is that of the derivative of the projection, by autograd",
@@ -75,36 +74,35 @@ def cases() -> list[Case]:
     )
     holds, why = "nothing shows, and no gradient is not finite", "decided by comparisons: 0 wrong"
     hidden = Property(PROJECT.subject, holds, why, on_backends(0, "fp64"))
-    found += (hidden.case(name, partial(_shown, changed)) for name, changed in HIDDEN.items())
+    found += (hidden.case(name, _shown, changed) for name, changed in HIDDEN.items())
     return [*found, slopes.case("in the picture", _slopes_error)]
 
 
 def _given(count: int) -> Given:
     """Gaussians seen by `CAMERA`, one to four pixels wide, in and around its picture; an eighth of
     them are behind it."""
-    generator = torch.Generator().manual_seed(count)
-    depth = 0.5 + 2.5 * torch.rand(count, generator=generator)
-    across = 3 * torch.rand(count, 2, generator=generator) - 1.5  # of half the picture
+    random = Random(count)
+    depth = 0.5 + 2.5 * random.share(count)
+    across = 3 * random.share(count, 2) - 1.5  # of half the picture
     edge = (across.abs() - FRUSTUM).abs() < 0.01  # on which side of it, rounding would decide
     across[edge] *= 0.9
     half = torch.tensor((0.5 * CAMERA.width / CAMERA.fx, 0.5 * CAMERA.height / CAMERA.fy))
     depth[: count // 8] *= -1
     local = torch.cat((depth[:, None] * half * across, depth[:, None]), dim=1)
     return {
-        "means": local @ CAMERA.c2w[:, :3].T + CAMERA.c2w[:, 3],
-        "scales": torch.rand(count, 3, generator=generator) * 0.5 / CAMERA.fx + 1e-3,
-        "rotations": torch.randn(count, 4, generator=generator),
-        "opacities": torch.rand(count, generator=generator),
+        "means": local @ CAMERA.rotation.T + CAMERA.centre,
+        "scales": random.share(count, 3) * 0.5 / CAMERA.fx + 1e-3,
+        "rotations": random.normal(count, 4),
+        "opacities": random.share(count),
         "camera": CAMERA,
     }
 
 
 def _slopes_error(backend: str, device: str, precision: str) -> float:
-    drawn = placed(_given(1000), device)
+    drawn = placed(_given(1000), device, precision)
     camera = drawn.pop("camera")
-    drawn = {name: x.to(DTYPES[precision]) for name, x in drawn.items()}
     pixels, depth = project(camera, drawn["means"])
-    size = pixels.new_tensor((camera.width, camera.height))
+    size = pixels.new_tensor(camera.size)
     seen = (depth > 0.1) & ((pixels > 0) & (pixels < size)).all(dim=1) & (drawn["opacities"] > 0.01)
     drawn = {name: x[seen] for name, x in drawn.items()}
     ellipses = project_gaussians(**drawn, camera=camera, backend=backend)
@@ -119,9 +117,10 @@ def _slopes_error(backend: str, device: str, precision: str) -> float:
     conics = spread.inverse().flatten(1)[:, [0, 1, 3]]
     reach = 2 * (opacities / LEAST_ALPHA).log()[:, None]
     extents = (reach * spread.diagonal(dim1=1, dim2=2)).sqrt()
-    width, (exact, z) = camera.width, project(CAMERA, means)
+    width = camera.width
+    exact, z = project(CAMERA, means)
     got = ellipses.centres / width, ellipses.conics, ellipses.depth, ellipses.extents / width
-    return largest_error([x.cpu() for x in got], (exact / width, conics, z, extents / width))
+    return largest_error(got, (exact / width, conics, z, extents / width))
 
 
 HIDDEN: dict[str, dict[str, float]] = {
@@ -137,13 +136,21 @@ HIDDEN: dict[str, dict[str, float]] = {
 
 def _shown(changed: dict[str, float], backend: str, device: str, precision: str) -> float:
     """How many numbers are shown, or have a gradient that is not finite."""
-    how: Any = {"device": device, "dtype": DTYPES[precision]}
-    place = CAMERA.c2w[:, 3] + changed.get("depth", 1.0) * CAMERA.c2w[:, 2]
-    scales = torch.full((1, 3), changed.get("scale", 0.01), **how)
-    given = place[None].to(**how), scales, torch.tensor([[1.0, 0, 0, 0]], **how)
-    means, scales, rotations = learned = [x.requires_grad_() for x in given]
-    opacity, camera = torch.tensor([changed.get("opacity", 0.5)], **how), placed(CAMERA, device)
-    found = project_gaussians(means, scales, rotations, opacity, camera, backend=backend)
-    slopes = torch.autograd.grad(found.centres.sum() + found.conics.sum(), learned)
-    wrong = found.extents.count_nonzero() + sum((~x.isfinite()).sum() for x in slopes)
+    depth = changed.get("depth", 1.0)
+    shape = {
+        "means": (CAMERA.centre + depth * CAMERA.c2w[:, 2])[None],
+        "scales": torch.full((1, 3), changed.get("scale", 0.01)),
+        "rotations": torch.tensor([[1.0, 0, 0, 0]]),
+    }
+    rest = {
+        "opacities": torch.tensor([changed.get("opacity", 0.5)]),
+        "camera": CAMERA,
+    }
+    shape, rest = placed((shape, rest), device, precision)
+    learned = [x.requires_grad_() for x in shape.values()]
+    found = project_gaussians(**shape, **rest, backend=backend)
+    shown = found.centres.sum() + found.conics.sum()
+    slopes = torch.autograd.grad(shown, learned)
+    wrong = found.extents.count_nonzero()
+    wrong += sum((~x.isfinite()).sum() for x in slopes)
     return float(wrong)

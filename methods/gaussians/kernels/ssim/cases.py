@@ -1,10 +1,6 @@
 """Cases of SSIM: agreement of the backends."""
 
-from functools import partial
-
-import torch
-
-from bench.case import U32, Bound, Case, Given, Operation
+from bench.case import U32, Bound, Case, Given, Operation, Random
 from methods.gaussians.kernels.ssim import ssim
 from methods.kernels.dispatch import served
 
@@ -12,7 +8,7 @@ SIMILARITY = 960 * U32
 SSIM = Operation(
     "ssim",
     served(__package__),
-    lambda given, backend: (ssim(**given, backend=backend),),
+    ssim,
     {
         "similarity": Bound(
             "means of numbers below 1 by 22 products; the variances they leave, off by 48 u, are "
@@ -35,20 +31,27 @@ def cases() -> list[Case]:
     found = []
     for height, width in ((40, 33), (1, 1), (3, 20), (400, 400)):
         for kind in ("noise", "patch", "equal", "black"):
-            items = height * width if (height, kind) == (400, "noise") else None
-            pictures = partial(_pictures, kind, height, width)
-            both = SSIM.cases(f"{kind}, {width} x {height}", pictures, items=items)
+            items = height * width if (height, kind) == (400, "noise") else 0
+            both = SSIM.cases(
+                f"{kind}, {width} x {height}",
+                _pictures,
+                kind,
+                height,
+                width,
+                items=items,
+            )
             found += both[:1] if kind == "equal" else both  # there its gradient is 0
     return found
 
 
 def _pictures(kind: str, height: int, width: int) -> Given:
-    generator = torch.Generator().manual_seed(height)
-    one, other = torch.rand(2, height, width, 3, generator=generator)
+    one, other = Random(height).share(2, height, width, 3)
     if kind == "black":
         one[:, : width // 2] = 0
     if kind == "patch":
-        rows, columns = slice(height // 4, height // 2 + 1), slice(width // 5, width // 2 + 1)
-        patch, other = other[rows, columns], one.clone()
+        rows = slice(height // 4, height // 2 + 1)
+        columns = slice(width // 5, width // 2 + 1)
+        patch = other[rows, columns]
+        other = one.clone()
         other[rows, columns] = patch
     return {"picture": one, "target": one if kind == "equal" else other}

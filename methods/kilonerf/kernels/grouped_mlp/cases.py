@@ -1,11 +1,9 @@
 """Cases of the small networks: sorting, encoding, single layers and whole networks."""
 
-from functools import partial
-
 import torch
 from torch import Tensor
 
-from bench.case import U32, Bound, Case, Given, Operation, uniform
+from bench.case import LEAST_TIMED, U32, Bound, Case, Given, Operation, Random
 from methods.kernels.dispatch import served
 from methods.kilonerf.kernels.grouped_mlp import (
     HIDDEN,
@@ -30,8 +28,6 @@ KINDS = {
 }
 """Numbers of samples and networks."""
 
-MANY = 1000  # samples of more than this are timed
-
 ANGLES = 188 * U32
 """An angle of at most 512 is rounded by none, reduced with an error below 4 u, and its sine within
 4 u; each of 4 doublings doubles the error and adds 4 u: 16 x 8 u + 60 u."""
@@ -40,7 +36,7 @@ EXACT = Bound("whole numbers: 0", 0.0)
 LOCATE = Operation(
     "locate",
     served(__package__),
-    lambda given, backend: locate(**given, backend=backend),
+    locate,
     {
         "networks": Bound("a quotient is rounded alike by all: 0", 0.0),
         "positions": Bound("a quotient below 5 that is rounded once more: 8 u", 8 * U32),
@@ -49,13 +45,13 @@ LOCATE = Operation(
 ORDER = Operation(
     "order",
     served(__package__),
-    lambda given, backend: order(**given, backend=backend),
+    order,
     {"permutation": EXACT, "offsets": EXACT},
 )
 ENCODE = Operation(
     "encode frequencies",
     served(__package__),
-    lambda given, backend: (encode_frequencies(**given, backend=backend),),
+    encode_frequencies,
     {"encoding": Bound("as `ANGLES` says", ANGLES)},
 )
 
@@ -73,7 +69,7 @@ OF_NETWORK = (
 LINEAR = Operation(
     "grouped linear",
     served(__package__),
-    lambda given, backend: (grouped_linear(**given, backend=backend),),
+    grouped_linear,
     {
         "outputs": Bound(
             "I products below 1 / 8 and a bias of at most 16, by both: 2 (I + 1) (I / 8 + 16) u",
@@ -106,7 +102,7 @@ def _grown(off: float, *names: str) -> float:
 DENSITIES = Operation(
     "densities of networks",
     served(__package__),
-    lambda given, backend: densities(**given, backend=backend),
+    densities,
     {
         "densities": Bound(
             "three layers, as `_grown` says, of angles off by 188 u",
@@ -118,7 +114,7 @@ DENSITIES = Operation(
 COLOURS = Operation(
     "colours of networks",
     served(__package__),
-    lambda given, backend: (colours(**given, backend=backend),),
+    colours,
     {
         "colours": Bound(
             "three layers, as `_grown` says; a sigmoid has a quarter of it and 8 u of its own",
@@ -132,22 +128,21 @@ def cases() -> list[Case]:
     """Sorting, encoding, single layers forward and backward, and whole networks."""
     found = []
     for count in (0, 1, 1000, 1 << 18):
-        items = count if count > MANY else None
-        found += LOCATE.cases(f"{count:,} positions", partial(_placed, count), items=items)
-        found += ENCODE.cases(f"{count:,} samples", partial(_angles, count), items=items)
-    for name, (count, networks) in KINDS.items():
-        size, items = (count, networks), count if count > MANY else None
-        found += ORDER.cases(name, partial(_sorted, *size), items=items)
-        found += DENSITIES.cases(name, partial(_in_cubes, *size), items=items)
-        found += COLOURS.cases(name, partial(_seen, *size), items=items)
-        for inputs, outputs in ((63, 32), (32, 1), (5, 50)) if items is None else ((63, 32),):
-            layer = partial(_layer, *size, inputs, outputs)
-            found += LINEAR.cases(f"{name}, {inputs} to {outputs}", layer, items=items)
+        found += LOCATE.cases(f"{count:,} positions", _placed, count, items=count)
+        found += ENCODE.cases(f"{count:,} samples", _angles, count, items=count)
+    for name, size in KINDS.items():
+        count, _ = size
+        found += ORDER.cases(name, _sorted, *size, items=count)
+        found += DENSITIES.cases(name, _in_cubes, *size, items=count)
+        found += COLOURS.cases(name, _seen, *size, items=count)
+        for layer in ((63, 32), (32, 1), (5, 50)) if count < LEAST_TIMED else ((63, 32),):
+            shape = "{}, {} to {}".format(name, *layer)
+            found += LINEAR.cases(shape, _layer, *size, *layer, items=count)
     return found
 
 
 def _uniform(seed: int, *shape: int) -> Tensor:
-    return uniform(torch.Generator().manual_seed(seed), shape)
+    return Random(seed).signed(*shape)
 
 
 def _placed(count: int) -> Given:
@@ -160,9 +155,7 @@ def _placed(count: int) -> Given:
 
 def _sorted(count: int, networks: int) -> Given:
     """A network, or -1 for none, for each sample."""
-    generator = torch.Generator().manual_seed(count)
-    numbers = torch.randint(-1, networks, (count,), generator=generator)
-    return {"networks": numbers, "count": networks}
+    return {"networks": Random(count).whole(-1, networks, count), "count": networks}
 
 
 def _angles(count: int) -> Given:

@@ -1,13 +1,12 @@
 """Cases of voxels with densities and harmonics: pixels, and shaded samples."""
 
-from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from bench.case import U32, Bound, Case, Given, Operation
+from bench.case import U32, Bound, Case, Given, Operation, Random
 from methods.kernels.dispatch import served
 from methods.kernels.march.cases import cells, some_rays
 from methods.kernels.voxel_walk import Voxels
@@ -30,7 +29,7 @@ def _light(given: Given) -> float:
 RENDER = Operation(
     "render_voxels",
     served(__package__),
-    lambda given, backend: render_voxels(**given, backend=backend)[0].columns,
+    lambda **given: render_voxels(**given)[0].columns,
     {
         "values": Bound(
             "as opacities, and colours as `COLOUR` says", lambda given: _light(given) + COLOUR * U32
@@ -55,7 +54,7 @@ def _slopes(given: Given) -> Tensor:
 SHADE = Operation(
     "shade_voxels",
     served(__package__),
-    lambda given, backend: (shade_voxels(**given, backend=backend),),
+    shade_voxels,
     {
         "colours": Bound(
             "the sum of `shade`, of which the sigmoid passes on a quarter, and 8 u of its own",
@@ -75,7 +74,7 @@ SHADE = Operation(
 
 def cases() -> list[Case]:
     """Rays of every kind of light; no, one and many samples of all degrees."""
-    found, many = [], 1 << 13
+    found = []
     scenes: dict[str, tuple[Any, ...]] = {
         "one ray": (24, 1, 20.0),
         "no ray": (24, 0, 20.0),
@@ -85,15 +84,14 @@ def cases() -> list[Case]:
         "voxels without density": (24, 129, 0.0),
         "no voxel": (24, 129, None),
         "stop and faint": (24, 129, 20.0, 1e-4, 1e-5),
-        "a frame of 128^3": (128, many, 20.0, 1e-4, 1e-5),
+        "a frame of 128^3": (128, 1 << 13, 20.0, 1e-4, 1e-5),
     }
     for name, given in scenes.items():
-        items = many if many in given else None
-        found += RENDER.cases(name, partial(_scene, *given), items=items)
+        found += RENDER.cases(name, _scene, *given, items=given[1])
     for count in (0, 1, 300, 1 << 16):
         for size in (1, 4, 9, 16) if count == 300 else (9,):
-            name, items = f"{count:,} of {size} harmonics", count if count > 300 else None
-            found += SHADE.cases(name, partial(_samples, count, size), items=items)
+            name = f"{count:,} of {size} harmonics"
+            found += SHADE.cases(name, _samples, count, size, items=count)
     return found
 
 
@@ -102,20 +100,19 @@ def _scene(
 ) -> Given:
     """Voxels in a thick shell, every second one, of random density and light; or none at all."""
     coordinates = cells("empty" if densest is None else "porous shell", size).nonzero()
-    generator = torch.Generator().manual_seed(size)
-    density = (densest or 0.0) * torch.rand(len(coordinates), generator=generator)
-    harmonics = torch.randn(len(coordinates), 9, 3, generator=generator).clamp(-6, 6)
+    random = Random(size)
+    density = (densest or 0.0) * random.share(len(coordinates))
+    harmonics = random.normal(len(coordinates), 9, 3).clamp(-6, 6)
     light, voxels = Light(density, harmonics), Voxels(coordinates, size)
     return {"rays": some_rays(rays), "voxels": voxels, "light": light, "stop": stop, "faint": faint}
 
 
 def _samples(count: int, size: int) -> Given:
     """Harmonics below 6, three samples of a voxel and five of a ray on average."""
-    generator = torch.Generator().manual_seed(count)
-    voxels, rays = count // 3 + 1, count // 5 + 1
+    random, voxels, rays = Random(count), count // 3 + 1, count // 5 + 1
     return {
-        "harmonics": torch.randn(voxels, size, 3, generator=generator).clamp(-6, 6),
-        "voxel": torch.randint(voxels, (count,), generator=generator).int(),
-        "ray": torch.randint(rays, (count,), generator=generator).sort().values.int(),
-        "directions": normalize(torch.randn(rays, 3, generator=generator), dim=1),
+        "harmonics": random.normal(voxels, size, 3).clamp(-6, 6),
+        "voxel": random.whole(0, voxels, count).int(),
+        "ray": random.whole(0, rays, count).sort().values.int(),
+        "directions": normalize(random.normal(rays, 3), dim=1),
     }
