@@ -28,7 +28,6 @@ from bench.paths import write_path
 from bench.study import study_of
 from bench.types import Camera, composite
 from bench.viewing import Ask, Drawn, Painter, Turns, difference, divided, seen_from
-from reports.tables import Table, decimal
 from sweeps.commands.render import words_of_run
 from sweeps.configured import build, scene_of, trained
 from sweeps.overrides import beside, composed
@@ -290,8 +289,9 @@ def _figures(
 
 def _stages(painter: Painter, drawn: Sequence[Drawn]) -> str:
     height, width = drawn[0].rgb.shape[:2]
-    parts = [f"{width} x {height} pixels"]
+    lines = [f"{width} x {height} pixels", ""]
     for method, picture in zip(painter.methods, drawn, strict=True):
-        lines = [(stage, decimal(ms, 1)) for stage, ms in picture.stages_ms.items()]
-        parts.append(Table("", (method.name, "ms"), lines).markdown())
-    return "\n\n".join(parts)
+        lines += [f"| {method.name} | ms |", "|---|---|"]
+        lines += [f"| {stage} | {ms:.1f} |" for stage, ms in picture.stages_ms.items()]
+        lines.append("")
+    return "\n".join(lines)
