@@ -50,7 +50,7 @@ class StageClock:
     ) -> None:
         self.frames: list[FrameRecord] = []
         # What is not a device of torch is one of another process.
-        self._device = torch.device(device if DEVICE.fullmatch(device) else "cpu")
+        self.device = torch.device(device if DEVICE.fullmatch(device) else "cpu")
         self._clock, self._stages = clock, stages
         self._open: list[str] | None = None  # names of the open stages; None outside a frame
         self._last = 0
@@ -133,8 +133,8 @@ class StageClock:
         self._told: dict[str, Any] = {}  # what another process has told of this frame
 
     def _now(self) -> int:
-        if self._device.type == "cuda":
-            torch.cuda.synchronize(self._device)
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
         return self._clock()
 
     def _charge(self) -> None:

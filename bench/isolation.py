@@ -7,6 +7,7 @@ torch is put back after each call; the method has random numbers of its own.
 
 from __future__ import annotations
 
+import gc
 import os
 import random
 import signal
@@ -21,7 +22,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from PIL import ImageFile
 
+from bench.provenance import is_edited
 from bench.threads import in_parallel
 from bench.types import Budget, Camera, Log, Method, Scene, SteerbenchError
 
@@ -106,6 +109,18 @@ def _checksum(tensor: torch.Tensor) -> int:
 SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM, signal.SIGUSR1
 """Those that programs handle; to look up the handlers of all takes longer than a small frame."""
 
+AUTOCAST = "cpu", "cuda"
+"""The types of device that torch casts for."""
+
+SHARED = (torch, torch.nn.functional, torch.Tensor, np, np.random)
+ORIGINALS = {
+    (owner, name): value
+    for owner in SHARED
+    for name, value in vars(owner).items()
+    if callable(value)
+}
+"""Functions that all methods compute with, as they were when this process began."""
+
 CUDNN = "enabled", "benchmark", "deterministic", "allow_tf32"
 """Options of `torch.backends.cudnn`."""
 
@@ -123,9 +138,14 @@ def _state() -> dict[str, Any]:
         "torch's recording of gradients": torch.is_grad_enabled(),
         "torch's precision of products": torch.get_float32_matmul_precision(),
         "torch's deterministic mode": torch.get_deterministic_debug_mode(),
+        "torch's autocast": [torch.is_autocast_enabled(kind) for kind in AUTOCAST],
+        "torch's use of oneDNN": torch.backends.mkldnn.enabled,
         "cuDNN's options": [getattr(torch.backends.cudnn, name) for name in CUDNN],
         "numpy's handling of errors": np.geterr(),
         "the flushing of denormal numbers": sys.float_info.min / 2 == 0.0,
+        "Pillow's reading of truncated files": ImageFile.LOAD_TRUNCATED_IMAGES,
+        "collection of garbage": gc.isenabled(),
+        "the interval of switching threads": sys.getswitchinterval(),
         "the working folder": _folder(),
         "the environment": dict(os.environ),
         "sys.argv": list(sys.argv),
@@ -163,6 +183,23 @@ def _set_warnings(state: tuple[list[Any], Any]) -> None:
     warnings.filters[:], warnings.showwarning = state  # type: ignore[index]
 
 
+def _set_autocast(kinds: list[bool]) -> None:
+    for kind, enabled in zip(AUTOCAST, kinds, strict=True):
+        torch.set_autocast_enabled(kind, enabled)
+
+
+def _set_onednn(enabled: bool) -> None:
+    torch.backends.mkldnn.enabled = enabled  # type: ignore[assignment]
+
+
+def _set_truncated(allowed: bool) -> None:
+    ImageFile.LOAD_TRUNCATED_IMAGES = allowed
+
+
+def _set_collection(enabled: bool) -> None:
+    (gc.enable if enabled else gc.disable)()
+
+
 def _set_cudnn(values: list[Any]) -> None:
     for name, value in zip(CUDNN, values, strict=True):
         setattr(torch.backends.cudnn, name, value)
@@ -179,6 +216,11 @@ SETTERS: Mapping[str, Callable[[Any], object]] = {
     "torch's recording of gradients": torch.set_grad_enabled,
     "torch's precision of products": torch.set_float32_matmul_precision,
     "torch's deterministic mode": torch.set_deterministic_debug_mode,
+    "torch's autocast": _set_autocast,
+    "torch's use of oneDNN": _set_onednn,
+    "Pillow's reading of truncated files": _set_truncated,
+    "collection of garbage": _set_collection,
+    "the interval of switching threads": sys.setswitchinterval,
     "cuDNN's options": _set_cudnn,
     "numpy's handling of errors": lambda errors: np.seterr(**errors),
     "the flushing of denormal numbers": torch.set_flush_denormal,
@@ -197,6 +239,9 @@ USUAL: Mapping[str, object] = {
     "torch's recording of gradients": True,
     "torch's precision of products": "highest",
     "torch's deterministic mode": "default",
+    "torch's autocast": [False, False],
+    "torch's use of oneDNN": True,
+    "Pillow's reading of truncated files": False,
     "the flushing of denormal numbers": False,
 }
 """What changes figures and is in no key, as it is in a process that has just begun."""
@@ -233,9 +278,27 @@ def put_back(tell: Callable[[str], object] = lambda part: None) -> Iterator[None
                 tell(part)
 
 
+def check_originals() -> None:
+    """Raise SteerbenchError if somebody's own code replaced a function that all methods share: the
+    figures of others would be of it, too, and no key would say so."""
+    for (owner, name), original in ORIGINALS.items():
+        now = vars(owner).get(name)
+        if now is original:
+            continue
+        by = str(getattr(now, "__module__", None))
+        if by == "__main__" or is_edited(getattr(sys.modules.get(by), "__file__", None)):
+            raise SteerbenchError(
+                f"{by} has replaced {owner.__name__}.{name}, which others compute "
+                "with, too: leave it as it is, or measure the method in a process of its own "
+                "(method=external)"
+            )
+
+
 @contextmanager
 def as_begun() -> Iterator[None]:
-    """Compute as in a process that has just begun, whatever its user has set, and put all back."""
+    """Compute as in a process that has just begun, whatever its user has set, and put all back;
+    raises as `check_originals` does."""
+    check_originals()
     with put_back():
         for part, value in USUAL.items():
             SETTERS[part](value)
@@ -288,4 +351,5 @@ def fit(
     guard = guard or Guard(part, log)
     with Isolated(method, seed, log).call():
         method.fit(part, budget, log)
+    check_originals()
     guard.check([method])

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from bench.clock import FrameRecord, StageClock, counted
 from bench.errors import unexpected
-from bench.isolation import Guard, Isolated, fit, lent, moved, sees_scored
+from bench.isolation import Guard, Isolated, check_originals, fit, lent, moved, sees_scored
 from bench.memory import MemoryMeter, give_back
 from bench.metrics import Lpips, psnr_of_mse
 from bench.neighbours import Neighbours, Watch
@@ -34,9 +34,10 @@ from bench.trajectories import Trajectory, spread
 from bench.types import Budget, Frame, Log, Method, NullProbe, Scene
 from bench.waits import CodeLine, device_waits
 
-FEW, NOTABLE_MS, OFTEN = 0.2, 3.0, 0.1
+FEW, NOTABLE_MS, OFTEN = 0.2, 0.5, 0.1
 """A time that a renderer reports is doubted below this share of the wall time, if so many
-milliseconds are missing; a run, if that is so in more than such a share of its frames."""
+milliseconds are missing; a run, if that is so in more than such a share of its frames, and in more
+than one: the system may pause in any."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +116,7 @@ def measure(
         for doubt in take.doubts:
             log.info(f"{take.method.name}: {doubt}")
         measurements.append(measurement)
+    check_originals()
     guard.check(methods)
     return measurements
 
@@ -319,7 +321,8 @@ def _doubted_times(records: Sequence[FrameRecord]) -> str:
         here_ms = ((record.wall_ns or 0) - record.transfer_ns) / 1e6
         if told_ms < FEW * here_ms and here_ms - told_ms > NOTABLE_MS:
             doubted.append((told_ms, here_ms))
-    if len(doubted) <= OFTEN * len(records):
+    once = len(doubted) == 1 < len(records)
+    if once or len(doubted) <= OFTEN * len(records):
         return ""
     told_ms, here_ms = doubted[0]
     return (
@@ -415,6 +418,13 @@ def _draw(take: _Take, task: Task, index: int, first: Tensor | None, *, hairs: i
         frame = method.render(camera, take.clock)
     with _named(method, take.several):
         frame = taken(frame, step.camera, method.name, index)
+        if take.timed_here and frame.rgb.device.type != take.clock.device.type:
+            raise unexpected(
+                f"{method.name}: frame {index}: rgb",
+                f"a tensor on {take.clock.device.type}, whose work the clock waits for, as the "
+                "method's settings() say",
+                frame.rgb.device,
+            )
     if hairs:
         return frame.rgb
     cold = task.trajectory.preceding[index] < method.memory

@@ -8,17 +8,20 @@ these files changes.
 import ast
 import hashlib
 import importlib.util
+import marshal
 import os
 import platform
 import re
+import struct
 import subprocess
 import sys
 import sysconfig
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import cache
 from importlib import metadata
 from pathlib import Path
+from types import CodeType, ModuleType
 from typing import Any, NamedTuple
 
 from bench.errors import SteerbenchError, unexpected
@@ -27,7 +30,7 @@ ROOT = Path(__file__).resolve().parent.parent
 OURS = ("bench", "methods")
 STDLIB = {Path(sysconfig.get_paths()[name]) for name in ("stdlib", "platstdlib")}
 INSTALLED = {"site-packages", "dist-packages"}
-LEFT_OUT = re.compile(r"/(\.|__pycache__/)")  # hidden files and folders, and what Python compiles
+LEFT_OUT = re.compile(r"(^|/)(\.[^/]|__pycache__)")  # hidden, or what Python compiles
 CHECKS = ("cases.py", "experiments.py")  # the checks of their folder, which affect no results
 
 TUNING = re.compile(
@@ -125,13 +128,14 @@ def digest(*things: Any) -> str:
     """SHA-256 of the names and the content of the `sources` of `things`: of Python what it
     computes, whatever its comments and docstrings, of other files their bytes.
 
-    Raises SteerbenchError if a file changed after this process first hashed it: it may still run
-    the old code, and would store its results under the key of the new one.
+    Raises SteerbenchError if a file changed after this process first hashed it, or loaded it: it
+    may still run the old code, and would store its results under the key of the new one.
     """
     total = hashlib.sha256()
     for name, path in sorted(sources(*things).items()):
         content = code_sha256(path)
-        if _loaded(path) != content:
+        ours = name.partition("/")[0] in OURS
+        if _loaded(path) != content or not (ours or is_as_loaded(path, stamp(path))):
             raise SteerbenchError(f"{name} was changed while this process runs: start it again")
         total.update(f"{name} {content}\n".encode())
     return total.hexdigest()
@@ -151,6 +155,17 @@ def sha256(path: Path) -> str:
 def code_sha256(path: Path) -> str:
     """SHA-256 of what a file of Python computes; of another file, as `sha256`."""
     return _module(path, stamp(path)).sha256 if path.suffix == ".py" else sha256(path)
+
+
+def sums_of(places: Iterable[Path], where: str) -> list[str]:
+    """The checksums of files, and of all files below folders; SteerbenchError if one of `places` is
+    not there."""
+    found: set[Path] = set()
+    for place in places:
+        if not place.exists():
+            raise unexpected(where, "files and folders", f"{place}, which is not there")
+        found |= set(files_at(place))
+    return sorted(code_sha256(file) for file in found)
 
 
 def stamp(path: Path) -> tuple[int, ...]:
@@ -271,28 +286,80 @@ def sources(*things: Any) -> dict[str, Path]:
 
 def check_unchanged(loaded: Collection[str], *things: Any) -> None:
     """Raise SteerbenchError if results since `loaded` were the names of all modules may come from
-    code that the key of `things` does not hold: a file was changed, or a module was imported that
-    is not among their `sources`. Such modules are forgotten, so that another run has to import them
-    again, and is refused, too."""
+    code that the key of `things` does not hold: a file was changed, or a module is used that is not
+    among their `sources`, because it was imported later, or by a name that is made by the code.
+
+    Modules that came later are forgotten, so that another run has to import them again, and is
+    refused, too.
+    """
     digest(*things)
-    known = {path.resolve() for path in sources(*things).values()}
+    files = sources(*things)
+    known = {path.resolve() for path in files.values()}
     ours = [ROOT / top for top in (*OURS, "reports", "sweeps")]
-    late: dict[str, str] = {}
-    for name in sys.modules.keys() - loaded:
-        file = getattr(sys.modules[name], "__file__", None)
-        if not file or not is_edited(file):
-            continue
-        path = Path(file).resolve()
-        if path not in known and not set(path.parents).intersection(ours):
-            late[name] = file
-    for name in late:
-        del sys.modules[name]
-    if late:
-        name = min(late)
+
+    def foreign(names: Iterable[str]) -> Iterator[str]:
+        for name in names:
+            file = getattr(sys.modules.get(name), "__file__", None)
+            path = Path(file or "").resolve()
+            if is_edited(file) and path not in known and not set(path.parents).intersection(ours):
+                yield name
+
+    late = sorted(foreign(sys.modules.keys() - loaded))
+    of_others = {str(path) for name, path in files.items() if name.partition("/")[0] not in OURS}
+    used = sorted(foreign(_used_by(of_others)))
+    unknown = [*late, *used]
+    if unknown:
+        file = sys.modules[unknown[0]].__file__
+        for name in late:
+            del sys.modules[name]
         raise SteerbenchError(
-            f"{name} was imported while the run went on, so its key does not hold {late[name]}: "
-            "import it at the top of a file of the method, and run again"
+            f"{unknown[0]} was imported while the run went on, or by a name that is made by the "
+            f"code, so its key does not hold {file}: import it at the top of a file of the method, "
+            "and run again"
         )
+
+
+def _used_by(files: Collection[str]) -> set[str]:
+    """The names of the modules whose things the modules in `files` have as global names."""
+    names: set[str] = set()
+    for module in list(sys.modules.values()):
+        if getattr(module, "__file__", None) in files:
+            for thing in vars(module).values():
+                name = thing.__name__ if isinstance(thing, ModuleType) else None
+                names.add(str(name or getattr(thing, "__module__", None)))
+    return names - {"__main__"}
+
+
+@cache
+def is_as_loaded(path: Path, stamp: tuple[int, ...]) -> bool:
+    """Whether the module in a file, if it is loaded, is that of the present content: Python runs
+    what it compiled from a file of the same time and size, or what it loaded before an edit."""
+    compiled = Path(importlib.util.cache_from_source(str(path)))
+    files = {getattr(module, "__file__", None) for module in list(sys.modules.values())}
+    if str(path) not in files or not compiled.is_file():
+        return True
+    header, code = compiled.read_bytes()[:16], compiled.read_bytes()[16:]
+    flags, time, size = struct.unpack("<4xIII", header)
+    now = path.stat()
+    if not flags and (time, size) != (int(now.st_mtime) & 0xFFFFFFFF, now.st_size & 0xFFFFFFFF):
+        return False
+    try:
+        present = compile(path.read_bytes(), str(path), "exec", dont_inherit=True)
+    except (SyntaxError, ValueError):
+        return False
+    return _alike(marshal.loads(code), present)
+
+
+def _alike(one: CodeType, other: CodeType) -> bool:
+    """Whether two codes compute the same, wherever their lines stand."""
+    names = ("co_code", "co_names", "co_varnames", "co_freevars", "co_cellvars", "co_argcount")
+    if any(getattr(one, name) != getattr(other, name) for name in names):
+        return False
+    pairs = list(zip(one.co_consts, other.co_consts, strict=False))
+    return len(one.co_consts) == len(other.co_consts) and all(
+        _alike(a, b) if isinstance(a, CodeType) and isinstance(b, CodeType) else repr(a) == repr(b)
+        for a, b in pairs
+    )
 
 
 def _files(name: str, home: bool = False) -> dict[str, Path]:
@@ -317,13 +384,32 @@ def _files(name: str, home: bool = False) -> dict[str, Path]:
         return {}
     if spec.submodule_search_locations is None:
         return {Path(str(spec.origin)).name: Path(str(spec.origin))} if spec.has_location else {}
-    files = {}
-    for folder in map(Path, spec.submodule_search_locations):
-        for path in folder.rglob("*"):
-            inside = path.relative_to(folder.parent).as_posix()
-            if path.is_file() and not LEFT_OUT.search(f"/{inside}"):
-                files[inside] = path
-    return files
+    return {
+        path.relative_to(folder.parent).as_posix(): path
+        for folder in map(Path, spec.submodule_search_locations)
+        for path in files_at(folder)
+    }
+
+
+def files_at(place: Path) -> list[Path]:
+    """A file, or all files below a folder, also behind links, but for hidden ones and what Python
+    compiles."""
+    if place.is_file():
+        return [place]
+    found: list[Path] = []
+    seen: set[str] = set()
+    for folder, folders, names in os.walk(place, followlinks=True):
+        real = os.path.realpath(folder)
+        if real in seen:  # a link to a folder above it
+            folders.clear()
+            continue
+        seen.add(real)
+        found += (Path(folder, name) for name in names)
+    return [
+        file
+        for file in found
+        if file.is_file() and not LEFT_OUT.search(file.relative_to(place).as_posix())
+    ]
 
 
 def is_edited(file: str | None) -> bool:
@@ -349,7 +435,17 @@ def _imports(path: Path) -> tuple[str, ...]:
     return _module(path, stamp(path)).imports if path.suffix == ".py" else ()
 
 
-_version = cache(metadata.version)  # of a distribution
+@cache
+def _version(name: str) -> str:
+    """The version of a distribution; of one that was installed from a folder or a file of one's
+    own, which may change under its version, with a checksum of what was installed."""
+    found = metadata.distribution(name)
+    if found.read_text("direct_url.json") is None:
+        return found.version
+    installed = hashlib.sha256((found.read_text("RECORD") or "").encode()).hexdigest()
+    return f"{found.version}+{installed[:12]}"
+
+
 _distributions = cache(metadata.packages_distributions)  # that provide each top-level package
 
 

@@ -22,13 +22,20 @@ OUTSIDE = 0.05
 white background by less, a picture in other units, or of another range, by more."""
 
 
+NEGATIVE, RARE = -0.2, 0.05
+"""Numbers below the one are no overshoot where more than the other share of a picture are."""
+
+
 def taken(frame: Frame, camera: Camera, method: str, index: int) -> Frame:
     """A copy of what a method rendered as frame `index`, which nothing that still runs can change.
 
-    Raises SteerbenchError, which names `method`, if a part has another size than `camera`, is no
-    tensor of floating-point numbers, is not finite, or has another range than it must have.
+    Raises SteerbenchError, which names `method`, if it is no Frame, or if a part has another size
+    than `camera`, is no tensor of floating-point numbers, is not finite, or has another range than
+    it must have.
     """
     where = f"{method}: frame {index}"
+    if not isinstance(frame, Frame):  # whose parts may be made when they are asked for
+        raise unexpected(where, "a bench.types.Frame", type(frame).__name__)
     size = camera.height, camera.width
     rgb = _copied(frame.rgb, f"{where}: rgb", (*size, 3))
     depth = _copied(frame.depth, f"{where}: depth", size)
@@ -61,7 +68,8 @@ def _copied(tensor: object, where: str, shape: tuple[int, ...]) -> Tensor:
 def _check_range(tensor: Tensor, where: str) -> None:
     values = tensor.float()
     outside = (values - values.clamp(0, 1)).abs().mean().item()
-    if not outside <= OUTSIDE or values.mean() < 0:  # also of NaN
+    negative = (values < NEGATIVE).float().mean().item()
+    if not outside <= OUTSIDE or negative > RARE or values.mean() < 0:  # also of NaN
         low, high = values.min().item(), values.max().item()
         got = f"{low:.3g} to {high:.3g}, {outside:.3g} beyond in the mean; divide 0..255 by 255"
         raise unexpected(where, "numbers from 0 to 1", got)

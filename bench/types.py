@@ -34,6 +34,7 @@ from torch import Tensor
 
 from bench.errors import SteerbenchError as SteerbenchError
 from bench.errors import Unavailable as Unavailable
+from bench.errors import unexpected
 
 EMPTY_ALPHA = 1e-3  # pixels with a lower opacity are empty: their depth is +inf
 BACKGROUNDS = {"white": 1.0, "black": 0.0}  # by name, every channel of `Scene.background`
@@ -54,7 +55,10 @@ def rows(table: Tensor, index: Tensor | slice) -> Tensor:
 
 
 def composite(picture: Tensor, background: Tensor) -> Tensor:
-    """Composite an 8-bit `picture` [H, W, 3 or 4] onto `background` [3]; float [H, W, 3]."""
+    """Composite an 8-bit `picture` [H, W, 3 or 4] onto `background` [3]; float [H, W, 3]. Raises
+    SteerbenchError if it has other numbers."""
+    if picture.dtype != torch.uint8:
+        raise unexpected("a picture of the scene", "torch.uint8, 0 to 255", picture.dtype)
     values = picture.float() / 255.0
     if values.shape[-1] == 3:
         return values

@@ -16,8 +16,8 @@ from bench.records import made, read_record
 from bench.results import Store, existing_store
 from bench.sharing import whole
 from reports.regression import LIMITS, Assertion, Figures, Limit, changes, limited
-from reports.runs import unseeded
-from sweeps.measurement import Failure, failures, own_words, portable
+from reports.runs import Run, unseeded
+from sweeps.measurement import PLACES, Failure, failures, own_words, portable
 from sweeps.versions import is_present, standing
 
 SCHEMA = 3  # of baseline files
@@ -59,11 +59,11 @@ class Entry:
         return bool(about) and about.isdisjoint(apart)
 
     def nearest(self, stored: Sequence[Entry], others: Sequence[Entry]) -> Entry | None:
-        """The `same` runs among those `stored`, those with the fewest other defaults; not those of
-        `others`."""
+        """The `same` runs among those `stored`, those used last, which come first: of defaults as
+        they are now; not those of `others`."""
         taken = [x.settings for x in others if x is not self and x.subject == self.subject]
-        there = [x for x in stored if self.same(x) and x.settings not in taken]
-        return min(there, key=lambda each: len(self.differences(each)), default=None)
+        there = (x for x in stored if self.same(x) and x.settings not in taken)
+        return next(there, None)
 
 
 def _stored(store: Store, say: Callable[[str], object]) -> list[Entry]:
@@ -85,8 +85,22 @@ def _stored(store: Store, say: Callable[[str], object]) -> list[Entry]:
         )
         key = json.dumps([entry.subject, entry.settings], sort_keys=True)
         entry = found.setdefault(key, entry)
-        entry.seeds.setdefault(str(run.facts["seed"]), run)
+        other = entry.seeds.setdefault(str(run.facts["seed"]), run)
+        if _places(other) != _places(run):
+            raise SteerbenchError(
+                f"runs {other.key} and {run.key} are of {_places(other)} and {_places(run)}, which "
+                "a baseline knows as one by the last parts of their paths: rename one, or keep "
+                "them in stores of their own"
+            )
     return list(found.values())
+
+
+def _places(run: Run) -> str:
+    """The folder of the scene of a run or, of scored pictures, the command that names both."""
+    if "scene_path" in run.record:
+        return str(run.record["scene_path"])
+    words = shlex.split(str(run.record["command"]))
+    return " ".join(word for word in words if word.partition("=")[0] not in PLACES)
 
 
 def read(path: Path) -> tuple[Mapping[str, Limit], list[Entry]]:

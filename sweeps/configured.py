@@ -22,7 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable, unexpected, unknown
-from bench.isolation import fit
+from bench.isolation import as_begun, fit
 from bench.protocol import EvaluationProtocol
 from bench.provenance import stamp
 from bench.records import coerced, fits
@@ -113,7 +113,7 @@ def trained(
     scene = scene or scene_of(config)
     turn = device_lock(settings.device, log, training_threads(config))
     try:
-        with turn if settings.exclusive else nullcontext():
+        with turn if settings.exclusive else nullcontext(), as_begun():
             fit(method, scene, budget, settings.seed, progress or log)
     except Exception:
         forget_scene()  # the method may have spoilt it
@@ -122,15 +122,20 @@ def trained(
 
 
 def protocol_of(config: DictConfig) -> EvaluationProtocol:
-    """The protocol that `config` describes; raises if it is called like the standard one, but
-    differs from it."""
-    node, standard = config.protocol, OmegaConf.load(CONFIGS / "protocol" / f"{STANDARD}.yaml")
-    changed = [str(name) for name, value in standard.items() if node.get(name) != value]
-    if changed and node.get("name") == STANDARD:
-        raise SteerbenchError(
-            f"protocol.{changed[0]} differs from what {STANDARD} says: give the changed protocol a "
-            "name of its own (protocol.name=...)"
-        )
+    """The protocol that `config` describes; raises if it is called like one of ours, but differs
+    from it."""
+    node = config.protocol
+    file = CONFIGS / "protocol" / f"{node.get('name')}.yaml"
+    if file.is_file():
+        ours = OmegaConf.load(file)
+        known = {**OmegaConf.load(CONFIGS / "protocol" / f"{STANDARD}.yaml"), **ours}
+        known.pop("defaults", None)
+        changed = [str(name) for name, of in known.items() if node.get(name) != of]
+        if changed:
+            raise SteerbenchError(
+                f"protocol.{changed[0]} differs from what {node.name} says: give the changed "
+                "protocol a name of its own (protocol.name=...)"
+            )
     return build(config, "protocol")
 
 
@@ -195,7 +200,7 @@ def _current(read: Any, config: DictConfig) -> Any:
     node, outputs = OmegaConf.to_yaml(config.scene, resolve=True), Path(config.outputs)
     held_out = OmegaConf.select(config, "trajectory.split") == VALIDATION
     found = read(node, outputs, held_out)
-    if found.stamps != _stamps(found.files):
+    if not found.files or found.stamps != _stamps(found.files):  # of which, nobody knows
         read.cache_clear()
         _scene.cache_clear()
         found = read(node, outputs, held_out)

@@ -17,21 +17,22 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable, explained, unexpected
-from bench.isolation import Guard, put_back
+from bench.isolation import Guard, as_begun, put_back
 from bench.measure import MethodFailed, Task, measure, train
+from bench.neighbours import Neighbours
 from bench.provenance import (
     check_unchanged,
-    code_sha256,
     computed_by,
     conditions_apart,
     repositories,
+    sums_of,
 )
 from bench.records import made, read_record
 from bench.results import Store, content_key
 from bench.sharing import whole
 from bench.trajectories import Trajectory, resized
 from bench.types import DEVICE, Log, Method, Scene
-from reports.runs import Run
+from reports.runs import Run, flat
 from sweeps.configured import (
     as_declared,
     build,
@@ -202,7 +203,8 @@ def obtain(jobs: Sequence[Job]) -> tuple[list[str], bool]:
     """
     log = ConsoleLog(jobs[0].outputs)
     try:
-        return _obtained(jobs, log)
+        with as_begun():
+            return _obtained(jobs, log)
     except Exception as error:
         forget_scene()  # a method may have spoilt it
         if not isinstance(error, NotStored):
@@ -265,7 +267,8 @@ class _Ready:
     def check_unchanged(self) -> None:
         """Raise SteerbenchError if its figures may be of other code or files than `parts` hold."""
         check_unchanged(self.loaded, measure, *targets(self.job.settings))
-        if self.parts["files"] != _read_by(self.method, self.task.trajectory):
+        settings = self.job.settings
+        if self.parts["files"] != _read_by(self.method, self.task.trajectory, settings):
             raise SteerbenchError(
                 f"a file that {self.method.name} or its path reads was changed meanwhile: run again"
             )
@@ -327,7 +330,7 @@ def _prepared(job: Job, log: Log) -> _Ready:
         "scene": scene.digest,
         "names": content_key({"names": list(scored.names if scored else ())}),
         "resolved": method.settings(),
-        "files": _read_by(method, trajectory),
+        "files": _read_by(method, trajectory, job.settings),
         **computed_by(measure, *targets(job.settings)),
         "lpips": protocol.find_lpips(weights, log),
         **({"turns": job.turns} if job.turns else {}),
@@ -361,10 +364,19 @@ def became(settings: Mapping[str, Any], method: Method, scene: Scene) -> dict[st
     return resolved(settings, "")
 
 
-def _read_by(method: Method, trajectory: Trajectory) -> list[str]:
-    """The checksums of the files that a method and a path read."""
-    files = (*getattr(method, "reads", ()), *trajectory.reads)
-    return [code_sha256(file) for file in files if file.is_file()]
+def _read_by(method: Method, trajectory: Trajectory, settings: Mapping[str, Any]) -> list[str]:
+    """The checksums of the files that a method and a path read, and of those whose names are
+    settings of the method."""
+    named = [Path(text) for _, text in flat(settings["method"]) if isinstance(text, str)]
+    given = (*getattr(method, "reads", ()), *trajectory.reads)
+    return sums_of((*given, *filter(_is_file, named)), f"{method.name}: its attribute reads")
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # too long for a name, or with a NUL
+        return False
 
 
 def targets(node: Any) -> Iterator[Any]:
@@ -386,9 +398,15 @@ def _told(ready: Sequence[_Ready], measured: bool, log: Log) -> list[str]:
     for each in ready:
         each.job.store.use(each.run, each.job.key)
         if not measured:
+            record = each.job.store.record(each.run)
             log.info(f"already measured: {each.run}; store=always measures again")
-            if apart := conditions_apart(each.job.store.record(each.run)["machine"]):
+            if apart := conditions_apart(record["machine"]):
                 log.info(f"its times are of other conditions: {apart}")
+            neighbours = Neighbours(**record["neighbours"])
+            if neighbours.notable:
+                log.info(f"{neighbours} while its frames were timed")
+            for doubt in record.get("doubts", ()):
+                log.info(f"{each.method.name}: {doubt}")
         each.job.forget_failures()
     return [each.run for each in ready]
 

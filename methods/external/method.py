@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import re
 import shlex
 import shutil
 import subprocess
@@ -22,7 +21,7 @@ import numpy as np
 import torch
 
 from bench.errors import SteerbenchError, explained, some, unexpected
-from bench.provenance import code_sha256, computed_by
+from bench.provenance import code_sha256, computed_by, files_at, sums_of
 from bench.records import read_record
 from bench.results import content_key
 from bench.scenes.export import data_camera, picture_file, write_blender
@@ -32,8 +31,6 @@ from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.external.worker import Header, Worker
 
 WORKERS = Path(__file__).with_name("workers")  # those that come with steerbench
-
-LEFT_OUT = re.compile(r"(^|/)(\.[^/]|__pycache__)")
 
 UNTOLD: dict[str, Any] = {
     **{"device": "cpu", "precision": "unknown", "memory": 0},
@@ -60,6 +57,7 @@ class External:
     seed: int
 
     train_s = 0.0
+    _asking_ns = 0  # the least that a question and its answer have taken, without any work
 
     @property
     def _typed(self) -> list[str]:
@@ -116,10 +114,12 @@ class External:
     @property
     def reads(self) -> list[Path]:
         """The files that its pictures depend on: code that it has loaded, words, and `files`."""
-        words = map(Path, self._typed)
-        given = [file for path in self.files for file in _files_at(Path(path))]
-        loaded = map(Path, self._about["files"])
-        return sorted(file for file in {*loaded, *given, *words} if file.is_file())
+        words = filter(Path.is_file, map(Path, self._typed))
+        given = [Path(path) for path in self.files]
+        for path in given:
+            if not path.exists():
+                raise unexpected("method.files", "files and folders", f"{path}, which is not there")
+        return [*given, *words, *map(Path, self._about["files"])]
 
     @cached_property
     def _packages(self) -> dict[str, object]:
@@ -199,7 +199,7 @@ class External:
             "command": [
                 code_sha256(Path(word)) if Path(word).is_file() else word for word in self._typed
             ],
-            "files": [code_sha256(file) for file in self.reads],
+            "files": sums_of(self.reads, f"{self.name}: its files"),
             "of_worker": [self._packages, dict(self.environment)],
             "device": self._about["device"],
             **computed_by(write_blender),
@@ -245,14 +245,17 @@ class External:
         return {**{name: getattr(camera, name) for name in names}, "c2w": pose}
 
     def reset(self) -> None:
+        begun = time.perf_counter_ns()
         self._worker.ask("reset", self.frame_s, {})
+        passed = time.perf_counter_ns() - begun
+        self._asking_ns = min(self._asking_ns or passed, passed)
 
     def render(self, camera: Camera, probe: Probe) -> Frame:
         """Let it render one frame; the times are its own."""
         described = self._described(camera)
         told, arrays = self._worker.ask("render", self.frame_s, described)
         frame = self._frame(arrays, (camera.height, camera.width))
-        transfer_ns = time.perf_counter_ns() - self._worker.answered_ns
+        transfer_ns = time.perf_counter_ns() - self._worker.answered_ns + self._asking_ns
         stages = told.get("stages", {})
         counters = told.get("counters", {})
         for of in (stages, counters):
@@ -292,7 +295,8 @@ class External:
         told, _ = self._worker.ask("sizes", self.frame_s, {})
         sizes: Any = told.get("sizes")
         self._worker.expect(_counts(sizes), "sizes", "sizes in bytes", told)
-        late = {*told.get("files", ())} - {*self._about["files"], *map(str, self.reads)}
+        known = {str(file) for place in self.reads for file in files_at(place)}
+        late = {*told.get("files", ())} - {*self._about["files"], *known}
         if late:
             raise SteerbenchError(
                 f"{self.name} has loaded {some(sorted(late))} after it was made, so no key holds "
@@ -312,14 +316,6 @@ def _words(setting: str, text: str) -> list[str]:
 def _counts(told: object) -> bool:
     """Whether a worker has told whole numbers from 0 on, by name."""
     return isinstance(told, dict) and all(type(x) is int and x >= 0 for x in told.values())
-
-
-def _files_at(path: Path) -> list[Path]:
-    """A file, or the files below a folder, without hidden ones and what Python compiles."""
-    if not path.exists():
-        raise unexpected("method.files", "files and folders", f"{path}, which is not there")
-    below = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
-    return [file for file in below if not LEFT_OUT.search(str(file.relative_to(path)))]
 
 
 def _close(worker: Worker) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from bench.errors import SteerbenchError
+from bench.errors import SteerbenchError, some
 from bench.results import Store, existing_store
 from reports import export
 from reports.paper_page import write_paper_page
@@ -20,7 +20,7 @@ from sweeps.overrides import unquoted
 from sweeps.plan import Planned, plan, scenes_of
 from sweeps.tables import chosen
 from sweeps.terminal import note
-from sweeps.versions import by_job
+from sweeps.versions import by_job, is_present
 
 DATA = "data="  # prefix of the word that names the folder of a data set
 
@@ -45,6 +45,9 @@ def main(options: argparse.Namespace) -> int:
     runs = by_job(store, note)
     folder = options.report or outputs / (one or "paper")
     measured = gather(jobs, runs)
+    of_lines = {run.key: run for line in measured.values() for run in line.measured}
+    if stale := [key for key, run in of_lines.items() if not is_present(run)]:
+        note(f"of other code than is here now: {some(stale)}")
     page = write_paper_page(tables, measured, folder, missing)
     if options.format or options.command == "table":
         print(export.exported_tables(tables, measured, options.format or "markdown"), end="")

@@ -25,7 +25,11 @@ class Grey:
     name = "grey"
     train_s = 0.0
     memory = 0
-    reads = (Path("shade"),)  # as a checkpoint from elsewhere, if it is there
+
+    @property
+    def reads(self) -> list[Path]:
+        """As a checkpoint from elsewhere, if it is there."""
+        return list(filter(Path.exists, [Path("shade")]))
 
     def __init__(self, seed: int, device: str, backend: str, level: float = 0.5) -> None:
         self.level = level

@@ -66,6 +66,8 @@ def test_a_change_in_a_module_is_a_new_run_of_a_new_process(call, folder, tmp_pa
         refused = call("run", "method=mine", *SMALL)
         assert f"mine/{name} was changed while this process runs" in refused.err
         provenance._loaded.cache_clear()  # as a new process
+        for module in [each for each in sys.modules if each.partition(".")[0] == "mine"]:
+            del sys.modules[module]
         assert call("run", "method=mine", *SMALL).status == 0
         assert len([*tmp_path.glob("outputs/runs/*/record.json")]) == number
 
