@@ -33,6 +33,7 @@ from sweeps.overrides import CONFIGS, VALIDATION, target_of
 from sweeps.processes import device_lock
 
 STANDARD = "steerbench-1"  # the protocol of a run, if no other is asked for
+OF_TIMING = ("warmup", "rounds", "stages", "waits", "compared")  # what changes no score
 
 USUAL_THREADS = torch.get_num_threads()  # number of threads that torch uses by default
 
@@ -129,8 +130,12 @@ def protocol_of(config: DictConfig) -> EvaluationProtocol:
     if file.is_file():
         ours = OmegaConf.load(file)
         known = {**OmegaConf.load(CONFIGS / "protocol" / f"{STANDARD}.yaml"), **ours}
-        known.pop("defaults", None)
-        changed = [str(name) for name, of in known.items() if node.get(name) != of]
+        free = () if node.name == STANDARD else OF_TIMING
+        changed = [
+            str(name)
+            for name, of in known.items()
+            if name not in ("defaults", *free) and node.get(name) != of
+        ]
         if changed:
             raise SteerbenchError(
                 f"protocol.{changed[0]} differs from what {node.name} says: give the changed "

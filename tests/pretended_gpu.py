@@ -27,6 +27,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from bench import isolation
 from methods.kernels.dispatch import availability, multiplies_bf16
 
 GPU, CPU = torch.device("cuda", 0), torch.device("cpu")
@@ -362,6 +363,7 @@ def _patch_torch(patch: pytest.MonkeyPatch, gpu: PretendedGpu) -> None:
     stream = SimpleNamespace(is_capturing=lambda: gpu.graph is not None)
     patch.setattr(torch.accelerator, "current_accelerator", lambda *args, **kwargs: GPU)
     patch.setattr(torch.accelerator, "current_stream", lambda *device: stream)
+    patch.setattr(isolation, "ORIGINALS", {})  # what is replaced here is no fault
     patch.setattr(Tensor, "to", to)
     patch.setattr(Tensor, "cuda", lambda self, *args, **kwargs: self.to(GPU))
     patch.setattr(Tensor, "cpu", lambda self, *args, **kwargs: self.to(CPU))

@@ -155,7 +155,9 @@ def scenes(store: Store, stored_run: str, tmp_path: Path) -> Store:
 def test_folders_show_their_own(scenes, tmp_path, monkeypatch, tiny_scene, folder, digest, found):
     def loaded(*contents: object) -> configured._Read:
         assert digest, f"loads {contents}"
-        return configured._Read(replace(tiny_scene, digest=digest), (), {})
+        file = Path(__file__)
+        stamps = configured._stamps([file])
+        return configured._Read(replace(tiny_scene, digest=digest), [file], stamps)
 
     monkeypatch.setattr(configured, "_scene", loaded)
     (tmp_path / "c" / "mic").mkdir(parents=True)
