@@ -21,7 +21,7 @@ from contextlib import suppress
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from types import CodeType, ModuleType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any, NamedTuple
 
 from bench.errors import SteerbenchError, unexpected
@@ -131,12 +131,16 @@ def digest(*things: Any) -> str:
     Raises SteerbenchError if a file changed after this process first hashed it, or loaded it: it
     may still run the old code, and would store its results under the key of the new one.
     """
-    total = hashlib.sha256()
-    for name, path in sorted(sources(*things).items()):
+    total, files = hashlib.sha256(), sorted(sources(*things).items())
+    of_others = [path for name, path in files if name.partition("/")[0] not in OURS]
+    documented = any(_module(path, stamp(path)).documented for path in of_others)
+    for name, path in files:
         content = code_sha256(path)
-        ours = name.partition("/")[0] in OURS
-        if _loaded(path) != content or not (ours or is_as_loaded(path, stamp(path))):
+        other = path in of_others
+        if _loaded(path) != content or (other and not is_as_loaded(path, stamp(path))):
             raise SteerbenchError(f"{name} was changed while this process runs: start it again")
+        if other and documented:  # one may read the docstrings of another
+            content = sha256(path)
         total.update(f"{name} {content}\n".encode())
     return total.hexdigest()
 
@@ -182,10 +186,11 @@ def _sha256(path: Path, stamp: tuple[int, ...]) -> str:
 
 class _Module(NamedTuple):
     """What is known of a file of Python: the modules, and names from modules, that it imports
-    anywhere in its code; SHA-256 of its syntax tree."""
+    anywhere in its code; SHA-256 of its syntax tree; whether it reads docstrings."""
 
     imports: tuple[str, ...]
     sha256: str
+    documented: bool = False
 
 
 @cache
@@ -203,11 +208,13 @@ def _module(path: Path, stamp: tuple[int, ...]) -> _Module:
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
             imports += (f"{node.module}.{alias.name}" for alias in node.names)
     parts: list[str] = []
+    documented = b"__doc__" in content or b"getdoc" in content
     try:
-        _write_tree(tree, parts, documented=b"__doc__" in content)
+        _write_tree(tree, parts, documented)
     except RecursionError:  # a sum of a thousand terms
-        return _Module(tuple(imports), in_bytes)
-    return _Module(tuple(imports), hashlib.sha256("".join(parts).encode()).hexdigest())
+        return _Module(tuple(imports), in_bytes, documented)
+    computed = hashlib.sha256("".join(parts).encode()).hexdigest()
+    return _Module(tuple(imports), computed, documented)
 
 
 UNREAD = ("ctx", "kind", "type_comment", "type_ignores")  # fields that change nothing
@@ -308,6 +315,8 @@ def check_unchanged(loaded: Collection[str], *things: Any) -> None:
     of_others = {str(path) for name, path in files.items() if name.partition("/")[0] not in OURS}
     used = sorted(foreign(_used_by(of_others)))
     unknown = [*late, *used]
+    if changed := _patched(of_others):
+        raise SteerbenchError(f"{changed} was replaced by code that no key holds: start again")
     if unknown:
         file = sys.modules[unknown[0]].__file__
         for name in late:
@@ -328,6 +337,18 @@ def _used_by(files: Collection[str]) -> set[str]:
                 name = thing.__name__ if isinstance(thing, ModuleType) else None
                 names.add(str(name or getattr(thing, "__module__", None)))
     return names - {"__main__"}
+
+
+def _patched(files: Collection[str]) -> str:
+    """The name of a method, of a class in `files`, whose function a notebook or a script made."""
+    for module in list(sys.modules.values()):
+        if getattr(module, "__file__", None) in files:
+            for name, thing in vars(module).items():
+                members = vars(thing) if isinstance(thing, type) else {}
+                for member, value in members.items():
+                    if isinstance(value, FunctionType) and value.__module__ == "__main__":
+                        return f"{name}.{member}"
+    return ""
 
 
 @cache

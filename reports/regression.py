@@ -90,7 +90,7 @@ class Figures:
             names = averaged["frame"].astype(str) + ": " + averaged["name"].fillna("")
             if averaged[metric].notna().all():
                 frames[metric] = dict(zip(names, averaged[metric].astype(float), strict=True))
-        views = [*map(str, run.views), str(run.facts["protocol"])]
+        views = [*map(str, run.views), run.rules]
         scene = run.record["made_of"].get("config", {}).get("scene", {})
         if scene.get("_target_") == "bench.scenes.embedded.load":
             views[0] = str(run.facts["scene"])

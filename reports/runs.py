@@ -129,7 +129,14 @@ class Run:
     def conditions(self) -> tuple[object, ...]:
         """Equal for runs whose figures are comparable."""
         phase = self.headline["phase"].iloc[0]
-        return (*self.views, phase, self.facts["protocol"], *self.computer)
+        return (*self.views, phase, self.rules, *self.computer)
+
+    @property
+    def rules(self) -> str:
+        """The protocol of a run by its name, and what else says which pixels are compared."""
+        protocol = self.record.get("protocol", {})
+        own = (protocol.get(name, "") for name in ("background", "mask"))
+        return ", ".join((str(self.facts["protocol"]), *own))
 
     def psnr_to(self, other: Run) -> float:
         """Mean PSNR in dB between the pictures that both runs kept; inf if all are equal, nan if

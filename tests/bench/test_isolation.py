@@ -1,5 +1,6 @@
 """What a method is given is its own, and what it leaves behind is put back."""
 
+import gc
 import os
 import random
 import signal
@@ -10,9 +11,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from PIL import ImageFile
 
 from bench.errors import SteerbenchError
-from bench.isolation import Guard, Isolated, fit, given, lent, moved, put_back
+from bench.isolation import Guard, Isolated, as_begun, fit, given, lent, moved, put_back
 from bench.types import Budget
 from tests.conftest import OffsetMethod, camera_on_orbit
 
@@ -104,6 +106,11 @@ def untidy(folder) -> None:
     torch.set_float32_matmul_precision("medium")
     torch.set_deterministic_debug_mode("warn")
     torch.backends.cudnn.benchmark = not torch.backends.cudnn.benchmark
+    torch.set_autocast_enabled("cpu", True)
+    torch.backends.mkldnn.enabled = False
+    ImageFile.LOAD_TRUNCATED_IMAGES = True
+    gc.disable()
+    sys.setswitchinterval(1.0)
     np.seterr(all="raise")
     os.chdir(folder)
     os.environ["LEFT_BEHIND"] = "1"
@@ -119,7 +126,9 @@ def test_global_state_is_put_back_and_each_part_of_it_told(tmp_path):
         of_torch = torch.get_num_threads(), torch.get_default_dtype(), torch.is_grad_enabled()
         of_system = os.getcwd(), os.sched_getaffinity(0), signal.getsignal(signal.SIGUSR1)  # noqa: PTH109
         of_python = dict(os.environ), list(sys.argv), list(warnings.filters)
-        of_libraries = np.geterr(), torch.backends.cudnn.benchmark
+        of_libraries = np.geterr(), torch.backends.cudnn.benchmark, gc.isenabled()
+        of_libraries += torch.is_autocast_enabled("cpu"), ImageFile.LOAD_TRUNCATED_IMAGES
+        of_libraries += torch.backends.mkldnn.enabled, sys.getswitchinterval()
         return device, *of_torch, *of_system, *of_python, *of_libraries
 
     before, told = seen(), []
@@ -127,11 +136,34 @@ def test_global_state_is_put_back_and_each_part_of_it_told(tmp_path):
         untidy(tmp_path)
     assert seen() == before
     several_cores = len(os.sched_getaffinity(0)) > 1
-    assert len(told) == 13 + several_cores
+    assert len(told) == 18 + several_cores
     told.clear()
     with put_back(told.append):
         pass
     assert told == []
+
+
+def test_what_was_set_before_changes_no_figure():
+    """As a plug-in does when it is imported."""
+    with put_back():
+        torch.set_float32_matmul_precision("medium")
+        torch.set_autocast_enabled("cpu", True)
+        ImageFile.LOAD_TRUNCATED_IMAGES = True
+        with as_begun():
+            assert torch.get_float32_matmul_precision() == "highest"
+            assert not torch.is_autocast_enabled("cpu")
+            assert not ImageFile.LOAD_TRUNCATED_IMAGES
+        assert torch.is_autocast_enabled("cpu")
+
+
+def test_a_shared_function_that_was_replaced_is_named_before_anything_is_computed(monkeypatch):
+    monkeypatch.setattr(torch.nn.functional, "softplus", lambda x: x)
+    said = r"test_isolation has replaced torch.nn.functional.softplus, which others compute with"
+    with pytest.raises(SteerbenchError, match=said), as_begun():
+        pass
+    monkeypatch.undo()
+    with as_begun():
+        pass
 
 
 def fail_untidily() -> None:

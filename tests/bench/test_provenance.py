@@ -1,6 +1,7 @@
 """The digest of a thing follows the files it stands on; commit and machine are as they are."""
 
 import importlib
+import os
 import shutil
 import subprocess
 import sys
@@ -297,6 +298,92 @@ def test_a_module_that_is_imported_while_a_run_goes_on_is_refused(plugin, tmp_pa
     with pytest.raises(SteerbenchError, match="imported_late was imported while the run went on"):
         provenance.check_unchanged(loaded, thing)
     assert "imported_late" not in sys.modules  # the next run imports it again, and is refused, too
+
+
+def test_a_module_that_is_imported_by_a_made_name_is_refused(tree, tmp_path, monkeypatch):
+    files = {"odd.py": "import importlib\nhelp = importlib.import_module('odd_' + 'help')\n"}
+    write(tmp_path / "site", files | {"odd_help.py": "A = 1\n"})
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    importlib.import_module("odd")
+    with pytest.raises(SteerbenchError, match=r"odd_help was imported .* does not hold .*odd_help"):
+        provenance.check_unchanged(set(sys.modules), defined_in("odd"))
+    for name in ("odd", "odd_help"):
+        monkeypatch.delitem(sys.modules, name)
+
+
+@pytest.mark.parametrize("edit", ["A = 2222\n", "A = 2\n"])
+def test_code_that_was_loaded_before_an_edit_is_refused_also_at_first(edit, tmp_path, monkeypatch):
+    """As in a notebook; also of the same size and time, which Python itself takes for the same."""
+    file = tmp_path / "loaded_early.py"
+    file.write_text("A = 1\n")
+    times = file.stat()
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    importlib.import_module("loaded_early")
+    thing = defined_in("loaded_early")
+    digest(thing)
+    file.write_text(f"# A comment.\n{edit}" if len(edit) > 6 else edit)
+    os.utime(file, ns=(times.st_atime_ns, times.st_mtime_ns))
+    with pytest.raises(SteerbenchError, match=r"loaded_early.py was changed while this process"):
+        digest(thing)
+    monkeypatch.delitem(sys.modules, "loaded_early")
+    assert digest(thing)
+
+
+def test_a_method_that_a_notebook_replaced_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "patched.py").write_text("class Method:\n    def render(self): ...\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    method = importlib.import_module("patched").Method
+    loaded = set(sys.modules)
+    provenance.check_unchanged(loaded, method)
+    render = lambda self: 0  # noqa: E731
+    render.__module__ = "__main__"
+    method.render = render
+    with pytest.raises(SteerbenchError, match=r"Method\.render was replaced"):
+        provenance.check_unchanged(loaded, method)
+    monkeypatch.delitem(sys.modules, "patched")
+
+
+def test_files_behind_links_count_and_a_link_upwards_ends(tmp_path):
+    write(tmp_path, {"here/a.py": "", "there/b.py": "", "here/.hidden/c.py": ""})
+    (tmp_path / "here/linked").symlink_to(tmp_path / "there")
+    (tmp_path / "there/up").symlink_to(tmp_path / "here")
+    found = provenance.files_at(tmp_path / "here")
+    assert sorted(str(path.relative_to(tmp_path)) for path in found) == [
+        *("here/a.py", "here/linked/b.py")
+    ]
+    (tmp_path / "there/b.py").write_text("A = 1\n")
+    before = provenance.sums_of([tmp_path / "here"], "reads")
+    (tmp_path / "there/b.py").write_text("A = 2\n")
+    assert provenance.sums_of([tmp_path / "here"], "reads") != before
+    with pytest.raises(SteerbenchError, match=r"reads: expected files and folders, got .*nowhere"):
+        provenance.sums_of([tmp_path / "nowhere"], "reads")
+
+
+def test_docstrings_count_where_a_file_of_a_package_reads_them(tmp_path, monkeypatch):
+    write(tmp_path, {"told/__init__.py": "", "told/base.py": "", "told/method.py": '"""One."""\n'})
+    monkeypatch.syspath_prepend(tmp_path)
+    thing = defined_in("told.method")
+    digests = []
+    for reads in ("", "def table(of):\n    return of.__doc__\n"):
+        for text in ("One", "Two"):
+            write(tmp_path, {"told/base.py": reads, "told/method.py": f'"""{text}."""\n'})
+            digests.append(digest(thing))
+    assert [len(set(digests[:2])), len(set(digests[2:]))] == [1, 2]
+
+
+def test_what_was_installed_from_a_folder_counts_by_what_was_installed(tmp_path, monkeypatch):
+    info = tmp_path / "own_library-0.1.dist-info"
+    files = {"METADATA": "Name: own_library\nVersion: 0.1\n", "RECORD": "own.py,sha256=1,5\n"}
+    write(info, files)
+    monkeypatch.syspath_prepend(tmp_path)
+    version = provenance._version.__wrapped__
+    assert version("own_library") == "0.1"  # as from an index, where a version is final
+    (info / "direct_url.json").write_text('{"url": "file:///own", "dir_info": {}}')
+    before = version("own_library")
+    (info / "RECORD").write_text("own.py,sha256=2,5\n")
+    assert version("own_library") != before
+    assert before.startswith("0.1+")
 
 
 def test_what_may_have_changed_times_is_said(monkeypatch):

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -100,6 +101,17 @@ def test_a_frame_is_taken_as_a_copy():
 def test_what_is_no_frame_is_refused_with_the_method_and_the_part(part, value, why):
     with pytest.raises(SteerbenchError, match=f"mine: frame 7: {part}: expected .*{why}"):
         taken(replace(PLAIN, **{part: value}), CAMERA, "mine", 7)
+
+
+def test_a_frame_is_one_of_ours_whose_parts_are_made():
+    lazy = SimpleNamespace(rgb=PLAIN.rgb, depth=PLAIN.depth, alpha=PLAIN.alpha)
+    with pytest.raises(SteerbenchError, match=r"mine: frame 3: expected a bench.types.Frame"):
+        taken(lazy, CAMERA, "mine", 3)
+
+
+def test_a_picture_of_a_scene_that_is_no_bytes_is_refused():
+    with pytest.raises(SteerbenchError, match=r"expected torch.uint8, 0 to 255, got torch.float32"):
+        composite(torch.rand(4, 6, 3), torch.ones(3))
 
 
 def test_a_frame_may_overshoot_a_little():

@@ -237,6 +237,21 @@ def test_only_a_default_that_changed_is_forgiven(old, new, same):
     assert not one.same(Entry(["black"], new, one.settings, {}))
 
 
+def test_of_several_defaults_those_used_last_are_compared():
+    """A stored run of the old default is no reason to pass."""
+    recorded, old, new = (
+        Entry(["grey"], "run", {"method.level": level}, {}) for level in ("0.5", "0.5", "0.25")
+    )
+    assert recorded.nearest([new, old], [recorded]) is new
+    assert recorded.nearest([old, new], [recorded]) is old
+
+
+def test_scenes_that_only_their_folders_tell_apart_are_refused(outputs, copy, tmp_path):
+    rewrite(Store(outputs), copy.name, scene={"digest": "other"}, scene_path="/v1/views.npz")
+    with pytest.raises(SteerbenchError, match="which a baseline knows as one by the last parts"):
+        check(tmp_path / "baseline.json", outputs, "--record")
+
+
 @pytest.mark.parametrize("known_by", ["job", "command"])
 def test_no_run_stands_for_code_that_fails(baseline, outputs, stored_run, capsys, known_by):
     word = f"outputs={outputs}"

@@ -1,7 +1,7 @@
 """Building from a configuration: settings are checked by name and type before anything runs."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -9,6 +9,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from bench.errors import SteerbenchError
+from bench.types import Scene
+from sweeps import configured
 from sweeps.configured import build, protocol_of
 from sweeps.overrides import composed, target_of
 
@@ -103,4 +105,26 @@ def test_a_changed_standard_protocol_needs_a_name_of_its_own():
     assert protocol_of(composed([])).name == "steerbench-1"
     with pytest.raises(SteerbenchError, match=r"protocol\.warmup differs from what steerbench-1"):
         protocol_of(composed(["protocol.warmup=1"]))
+    with pytest.raises(SteerbenchError, match=r"protocol\.mask differs from what study-1 says"):
+        protocol_of(composed(["protocol=study-1", "protocol.mask=none"]))
+    assert protocol_of(composed(["protocol=study-1", "protocol.rounds=1"])).rounds == 1
     assert protocol_of(composed(["protocol.warmup=1", "protocol.name=cool"])).warmup == 1
+
+
+def test_a_scene_that_names_no_files_is_read_each_time(tiny_scene, monkeypatch):
+    """Nobody knows what it was read from."""
+    config = composed([])
+    reads = []
+
+    def read(*_: object, **__: object) -> Scene:
+        reads.append(1)
+        return replace(tiny_scene, files=reads_from)
+
+    monkeypatch.setattr(configured, "build", read)
+    for reads_from in ((Path(__file__),), ()):
+        configured.forget_scene()
+        reads.clear()
+        for _ in range(2):
+            configured.scene_of(config)
+        assert (len(reads) == 1) == bool(reads_from)
+    configured.forget_scene()

@@ -17,7 +17,7 @@ from bench.errors import SteerbenchError, Unavailable
 from sweeps import configured, execute
 from sweeps.execute import Ended
 from sweeps.hydra_runs import label
-from sweeps.measurement import Job, NotStored, became, obtain, stored
+from sweeps.measurement import Job, NotStored, _read_by, became, obtain, stored
 from sweeps.overrides import composed
 from sweeps.plan import plan
 from sweeps.processes import LOCKS, device_lock
@@ -188,6 +188,15 @@ def test_nothing_is_measured_where_the_store_must_have_it(elsewhere, run):
     run("-m", "seed=0,1").ok()
     assert run("-m", "seed=0,1", "store=only").ok().err.count("already measured") == 2
     assert run("-m", "seed=0,1,2", "store=only").err.count("failed: grey (seed=2)") == 1
+
+
+def test_a_file_that_a_setting_names_counts_by_its_content(elsewhere):
+    Path("weights.bin").write_bytes(b"1")
+    settings = {"method": {"checkpoint": "weights.bin"}}
+    method, path = Mock(reads=(), spec=["reads", "name"]), Mock(reads=())
+    before = _read_by(method, path, settings)
+    Path("weights.bin").write_bytes(b"2")
+    assert _read_by(method, path, settings) != before
 
 
 def test_a_damaged_run_is_measured_again(elsewhere):

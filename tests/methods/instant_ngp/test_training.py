@@ -70,7 +70,7 @@ def test_the_error_shown_is_that_of_pixels_drawn_alike(unlit):
     _, colours = unlit.batches.at(unlit.batches.choose(unlit.rays // 2, generator))
     wrong = unlit.errors.draw(unlit.rays // 2, generator)
     shown = unlit.advance()[""]
-    truth = composite(255 * colours, unlit.background)
+    truth = composite((255 * colours).round().byte(), unlit.background)
     assert shown == pytest.approx(truth.square().mean().item())
     assert (unlit.errors.errors[wrong // RUN] != UNSEEN).all()
 
