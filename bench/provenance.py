@@ -137,7 +137,7 @@ def digest(*things: Any) -> str:
     for name, path in files:
         content = code_sha256(path)
         other = path in of_others
-        if _loaded(path) != content or (other and not is_as_loaded(path, stamp(path))):
+        if _loaded(path) != content or (other and not is_as_loaded(path)):
             raise SteerbenchError(f"{name} was changed while this process runs: start it again")
         if other and documented:  # one may read the docstrings of another
             content = sha256(path)
@@ -351,16 +351,21 @@ def _patched(files: Collection[str]) -> str:
     return ""
 
 
-@cache
-def is_as_loaded(path: Path, stamp: tuple[int, ...]) -> bool:
+def is_as_loaded(path: Path) -> bool:
     """Whether the module in a file, if it is loaded, is that of the present content: Python runs
     what it compiled from a file of the same time and size, or what it loaded before an edit."""
     compiled = Path(importlib.util.cache_from_source(str(path)))
     files = {getattr(module, "__file__", None) for module in list(sys.modules.values())}
     if str(path) not in files or not compiled.is_file():
         return True
-    header, code = compiled.read_bytes()[:16], compiled.read_bytes()[16:]
-    flags, time, size = struct.unpack("<4xIII", header)
+    return _is_compiled(path, compiled, stamp(path), stamp(compiled))
+
+
+@cache
+def _is_compiled(path: Path, compiled: Path, *stamps: tuple[int, ...]) -> bool:
+    """Whether what Python has `compiled` of a file is what the file holds."""
+    content = compiled.read_bytes()
+    flags, time, size = struct.unpack("<4xIII", content[:16])
     now = path.stat()
     if not flags and (time, size) != (int(now.st_mtime) & 0xFFFFFFFF, now.st_size & 0xFFFFFFFF):
         return False
@@ -368,7 +373,7 @@ def is_as_loaded(path: Path, stamp: tuple[int, ...]) -> bool:
         present = compile(path.read_bytes(), str(path), "exec", dont_inherit=True)
     except (SyntaxError, ValueError):
         return False
-    return _alike(marshal.loads(code), present)
+    return _alike(marshal.loads(content[16:]), present)
 
 
 def _alike(one: CodeType, other: CodeType) -> bool:
