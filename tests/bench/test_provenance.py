@@ -308,7 +308,7 @@ def test_a_module_that_is_imported_by_a_made_name_is_refused(tree, tmp_path, mon
     with pytest.raises(SteerbenchError, match=r"odd_help was imported .* does not hold .*odd_help"):
         provenance.check_unchanged(set(sys.modules), defined_in("odd"))
     for name in ("odd", "odd_help"):
-        monkeypatch.delitem(sys.modules, name)
+        del sys.modules[name]
 
 
 @pytest.mark.parametrize("edit", ["A = 2222\n", "A = 2\n"])
@@ -326,7 +326,7 @@ def test_code_that_was_loaded_before_an_edit_is_refused_also_at_first(edit, tmp_
     os.utime(file, ns=(times.st_atime_ns, times.st_mtime_ns))
     with pytest.raises(SteerbenchError, match=r"loaded_early.py was changed while this process"):
         digest(thing)
-    monkeypatch.delitem(sys.modules, "loaded_early")
+    del sys.modules["loaded_early"]
     assert digest(thing)
 
 
@@ -341,7 +341,7 @@ def test_a_method_that_a_notebook_replaced_is_refused(tmp_path, monkeypatch):
     method.render = render
     with pytest.raises(SteerbenchError, match=r"Method\.render was replaced"):
         provenance.check_unchanged(loaded, method)
-    monkeypatch.delitem(sys.modules, "patched")
+    del sys.modules["patched"]
 
 
 def test_files_behind_links_count_and_a_link_upwards_ends(tmp_path):
