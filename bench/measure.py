@@ -379,21 +379,22 @@ def _reset(takes: Sequence[_Take]) -> None:
 
 
 def _repeat(take: _Take, task: Task) -> None:
-    """Render the frame in the middle of the path again, alone: of a method without memory it has to
-    be the same as in the path."""
-    if take.method.memory:
-        return
+    """Render the frame in the middle of the path twice more, after as many frames before it as the
+    method uses: both are the same unless they are random and, of a method without memory, as in the
+    path."""
     index = len(task.trajectory.steps) // 2
-    camera = task.trajectory.steps[index].camera
+    method = take.method
+    before = max(0, index - method.memory)
     again = []
     for _ in range(2):
-        take.method.reset()
-        with torch.no_grad():
-            frame = take.method.render(lent(camera), NullProbe())
-        again.append(taken(frame, camera, take.method.name, index).rgb.cpu())
+        method.reset()
+        for step in task.trajectory.steps[before : index + 1]:
+            with torch.no_grad():
+                frame = method.render(lent(step.camera), NullProbe())
+        again.append(taken(frame, step.camera, method.name, index).rgb.cpu())
     if _differ(*again):
         take.doubts.append("it renders one view in several ways: its pictures are random")
-    elif _differ(again[0], take.middle):
+    elif not method.memory and _differ(again[0], take.middle):
         take.doubts.append("its pictures depend on the frames before, though its `memory` is 0")
 
 

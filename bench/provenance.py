@@ -16,13 +16,14 @@ import struct
 import subprocess
 import sys
 import sysconfig
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sized
 from contextlib import suppress
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 from bench.errors import SteerbenchError, unexpected
 
@@ -337,6 +338,42 @@ def _used_by(files: Collection[str]) -> set[str]:
                 name = thing.__name__ if isinstance(thing, ModuleType) else None
                 names.add(str(name or getattr(thing, "__module__", None)))
     return names - {"__main__"}
+
+
+FIRST_SEEN: WeakKeyDictionary[ModuleType, dict[str, object]] = WeakKeyDictionary()
+"""What modules of others and their classes held when this process first used them."""
+
+
+def left_behind(*things: Any) -> list[str]:
+    """What modules and classes of others among the `sources` of `things` hold that is not as this
+    process found it: a run before has left it there, where it may change this one."""
+    files = sources(*things).items()
+    of_others = {str(path) for name, path in files if name.partition("/")[0] not in OURS}
+    found: list[str] = []
+    for module in list(sys.modules.values()):
+        if getattr(module, "__file__", None) in of_others:
+            now = _state_of(module, module.__name__)
+            then = FIRST_SEEN.setdefault(module, now)
+            found += (name for name in now | then if now.get(name) != then.get(name))
+    return sorted(found)
+
+
+def _state_of(owner: Any, place: str) -> dict[str, object]:
+    """Which things, of which length, a module and its classes hold; of functions, how many results
+    they remember."""
+    held: dict[str, object] = {}
+    for name, value in vars(owner).items():
+        inside = f"{place}.{name}"
+        own = getattr(value, "__module__", None) == getattr(owner, "__module__", place)
+        if name.startswith("__") or isinstance(value, ModuleType):
+            continue
+        if isinstance(value, type):
+            held |= _state_of(value, inside) if own and isinstance(owner, ModuleType) else {}
+        elif hasattr(value, "cache_info"):
+            held[inside] = value.cache_info().currsize
+        elif not callable(value):
+            held[inside] = id(value), len(value) if isinstance(value, Sized) else None
+    return held
 
 
 def _patched(files: Collection[str]) -> str:

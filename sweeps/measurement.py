@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.console import ConsoleLog
-from bench.errors import SteerbenchError, Unavailable, explained, unexpected
+from bench.errors import SteerbenchError, Unavailable, explained, some, unexpected
 from bench.isolation import Guard, as_begun, put_back
 from bench.measure import MethodFailed, Task, measure, train
 from bench.neighbours import Neighbours
@@ -24,6 +24,7 @@ from bench.provenance import (
     check_unchanged,
     computed_by,
     conditions_apart,
+    left_behind,
     repositories,
     sums_of,
 )
@@ -263,6 +264,7 @@ class _Ready:
     task: Task
     parts: Mapping[str, Any]
     loaded: frozenset[str]  # the names of all modules before
+    left: Sequence[str]  # what runs before it have left in modules of others
 
     def check_unchanged(self) -> None:
         """Raise SteerbenchError if its figures may be of other code or files than `parts` hold."""
@@ -315,6 +317,7 @@ def _prepared(job: Job, log: Log) -> _Ready:
     settings = checked_settings(config)
     use_threads(settings)
     torch.manual_seed(settings.seed)
+    left = left_behind(*targets(job.settings))
     with put_back():
         method = build(config, "method")
     budget = build(config, "budget")
@@ -336,7 +339,7 @@ def _prepared(job: Job, log: Log) -> _Ready:
         **({"turns": job.turns} if job.turns else {}),
     }
     task = Task(scene, trajectory, protocol, budget, settings.seed, weights, settings.pictures)
-    return _Ready(job, method, task, parts, loaded)
+    return _Ready(job, method, task, parts, loaded, left)
 
 
 def became(settings: Mapping[str, Any], method: Method, scene: Scene) -> dict[str, Any]:
@@ -445,6 +448,14 @@ def _measure(ready: Sequence[_Ready], guard: Guard, log: Log) -> None:
             "axes": {axis.setting: name for name, axis in axes(each.method.name).items()},
             "repositories": repositories(*targets(each.job.settings)),
         }
+        if each.left:
+            doubt = (
+                f"runs before it in this process have changed {some(each.left)}, which it may use: "
+                "keep state in the method itself, or let each job have its process "
+                "(hydra/launcher=joblib)"
+            )
+            record["doubts"] = [*record["doubts"], doubt]
+            log.info(f"{each.method.name}: {doubt}")
         record["neighbours"] |= {"exclusive": each.job.config.exclusive}
         if each.task.protocol.compared:
             record["compared_with"] = ready[0].run

@@ -137,7 +137,7 @@ def test_frames_with_too_little_to_look_back_on_are_cold(run, offset_method, tin
         *("peak_bytes", "train_s", "train_peak_bytes"),
     }
     assert not rows.duplicated(["phase", "metric"]).any()
-    assert offset_method.calls.count("reset") == 2  # the cut is not announced to the method
+    assert offset_method.calls.count("reset") == 4  # of no cut: warm-up, path, and twice alone
 
 
 @pytest.mark.parametrize(("memory", "phase"), [(0, "steady"), (6, "cold")])
@@ -420,7 +420,8 @@ def test_a_method_without_memory_that_is_random_or_looks_back_is_doubted(run, qu
     assert "depend on the frames before" in back.record["doubts"][0]
     remembering = OffsetMethod("cpu", 0.0)
     remembering.memory = 1
-    assert run(rendering(remembering, noisy)).record["doubts"] == []
+    assert run(rendering(remembering, noisy)).record["doubts"] == random.record["doubts"]
+    assert run(rendering(remembering, lambda frame, camera: None)).record["doubts"] == []
 
 
 @pytest.mark.parametrize(

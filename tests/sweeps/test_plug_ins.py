@@ -72,6 +72,17 @@ def test_a_change_in_a_module_is_a_new_run_of_a_new_process(call, folder, tmp_pa
         assert len([*tmp_path.glob("outputs/runs/*/record.json")]) == number
 
 
+def test_what_a_run_leaves_on_a_class_is_said_of_the_next_run_of_the_process(call, folder):
+    with (folder / "mine" / "renderer.py").open("a") as file:
+        file.write("    kept = {}\n\n    def reset(self):\n        self.kept[self.level] = 1\n")
+    first = call("run", "method=mine", *SMALL).ok()
+    assert "runs before it" not in first.err
+    again = call("run", "method=mine", *SMALL, "store=always").ok()
+    said = "runs before it in this process have changed mine.renderer.Mine.kept, which it may use"
+    assert said in again.err
+    assert said in call("run", "method=mine", *SMALL).err  # also of what is stored
+
+
 @pytest.mark.parametrize(
     ("argv", "said"),
     [
