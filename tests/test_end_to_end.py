@@ -45,7 +45,7 @@ def repeatable(folder: Path) -> pd.DataFrame:
 
 
 @pytest.fixture(scope="module")
-def first(tmp_path_factory: pytest.TempPathFactory, lpips_weights: Path) -> tuple[Path, str]:
+def first(tmp_path_factory, lpips_weights) -> tuple[Path, str]:
     """A folder in which the demo has run, and what it printed."""
     folder = tmp_path_factory.mktemp("first")
     done = demo(folder, lpips_weights)

@@ -6,11 +6,8 @@ from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
 
-import pytest
-
 from docs import gpu as report
 from sweeps.cli import dispatch, guard
-from tests.pretended_gpu import PretendedGpu
 
 TINY = [
     *("scene.width=16", "scene.train=4", "scene.test=2", "protocol.lpips=[]", "protocol.warmup=0"),
@@ -28,9 +25,7 @@ def in_this_process(step: report.Step) -> subprocess.CompletedProcess[str]:
     return subprocess.CompletedProcess(step.words, status, printed.getvalue(), said.getvalue())
 
 
-def test_it_goes_to_its_end_and_says_what_failed(
-    gpu: PretendedGpu, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_goes_to_its_end_and_says_what_failed(gpu, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(report, "ran", in_this_process)
     assert report.main(["--filter", "mlp", *TINY]) == 1
@@ -45,9 +40,7 @@ def test_it_goes_to_its_end_and_says_what_failed(
         assert said in text
 
 
-def test_what_is_done_is_not_repeated(
-    gpu: PretendedGpu, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_done_is_not_repeated(gpu, tmp_path, monkeypatch):
     taken: list[str] = []
 
     def noted(step: report.Step) -> subprocess.CompletedProcess[str]:

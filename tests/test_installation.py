@@ -40,7 +40,7 @@ def test_a_foreign_package_of_the_same_name_is_named_in_one_line(tmp_path, found
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def installed(tmp_path_factory) -> Path:
     """The `steerbench` of an environment that has the wheel, and the libraries of this one."""
     source, folder = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
     environment = folder / "environment"

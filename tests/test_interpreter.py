@@ -32,7 +32,7 @@ def _summed(out, x, BLOCK: tl.constexpr):
     tl.atomic_add(out, tl.sum(tl.load(x + tl.program_id(0) * BLOCK + tl.arange(0, BLOCK))))
 
 
-def test_a_kernel_that_leaves_its_tensors_is_refused() -> None:
+def test_a_kernel_that_leaves_its_tensors_is_refused():
     x, out = torch.ones(8)[:7], torch.zeros(16)
     with unforgiving():
         _doubled[2,](out, x, 7, BLOCK=4)
@@ -41,12 +41,12 @@ def test_a_kernel_that_leaves_its_tensors_is_refused() -> None:
             _doubled[3,](out, x, 9, BLOCK=4)
 
 
-def test_programs_that_need_an_order_are_a_race() -> None:
+def test_programs_that_need_an_order_are_a_race():
     with unforgiving(), pytest.raises(RuntimeError, match="race"):
         _first[4,](torch.zeros(1), torch.zeros(4))
 
 
-def test_atomic_sums_are_none() -> None:
+def test_atomic_sums_are_none():
     out = torch.zeros(1)
     with unforgiving():
         _summed[4,](out, torch.ones(16), BLOCK=4)

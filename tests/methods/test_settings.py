@@ -59,6 +59,6 @@ REFUSED: list[tuple[Callable[..., Any], str, Any]] = [
 
 
 @pytest.mark.parametrize(("make", "setting", "value"), REFUSED)
-def test_wrong_settings_are_refused(make: Callable[..., Any], setting: str, value: Any) -> None:
+def test_wrong_settings_are_refused(make, setting, value):
     with pytest.raises(ValueError, match=f"^{setting}: expected"):
         make(**{setting.rpartition(".")[2]: value})

@@ -53,7 +53,7 @@ def rows() -> pd.DataFrame:
 
 
 @pytest.fixture
-def rows_with_cold(rows: pd.DataFrame) -> pd.DataFrame:
+def rows_with_cold(rows) -> pd.DataFrame:
     """The same of a method that looks back: two cold frames, 3 dB worse and half as fast."""
     cold = rows[rows["phase"] == "steady"].assign(phase="cold", n=2)
     figures = ["value", "lo", "hi"]
@@ -104,14 +104,14 @@ def of_scene(run: Run, scene: str, by: float = 0.0, **facts: object) -> Run:
 
 
 @pytest.fixture
-def run(store: Store, stored_run: str) -> Run:
+def run(store, stored_run) -> Run:
     """A run of six scored frames, three of them pictured."""
     (found,) = load_runs(store, [stored_run])
     return found
 
 
 @pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+def drawn(monkeypatch) -> list[Figure]:
     figures: list[Figure] = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
     return figures
@@ -143,7 +143,7 @@ def rename(store: Store, key: str, method: str) -> None:
 
 
 @pytest.fixture
-def several(store: Store, stored_run: str) -> tuple[Store, dict[str, str]]:
+def several(store, stored_run) -> tuple[Store, dict[str, str]]:
     """A store with six runs of the same frames, and the method of each.
 
     The last was made on another machine; all else is the same.

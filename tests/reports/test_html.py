@@ -14,7 +14,6 @@ import pytest
 from markdown_it import MarkdownIt
 from PIL import Image
 
-from bench.results import Store
 from reports import publish
 from reports.images import ComparedFrame, RunView
 from reports.page import write_page
@@ -49,13 +48,13 @@ def cells(page: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def pages(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def pages(tmp_path_factory) -> Path:
     """Where the page of each device is kept: no test changes one."""
     return tmp_path_factory.mktemp("pages")
 
 
 @pytest.fixture
-def page(several: tuple[Store, dict[str, str]], pages: Path, device: str) -> Path:
+def page(several, pages, device) -> Path:
     """The folder of the page of six runs, and of one that failed."""
     if not (pages / device).exists():
         write_page(*several, pages / device, {"gone | lost": "no memory"})
@@ -63,7 +62,7 @@ def page(several: tuple[Store, dict[str, str]], pages: Path, device: str) -> Pat
 
 
 @pytest.fixture
-def parsed(page: Path) -> Parsed:
+def parsed(page) -> Parsed:
     return Parsed((page / "report.html").read_text())
 
 

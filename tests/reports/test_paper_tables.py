@@ -40,7 +40,7 @@ TABLE = PaperTable(
 
 
 @pytest.fixture
-def run(run: Run) -> Run:
+def run(run) -> Run:
     """A run of known figures."""
     figures = {"psnr": 30.456, "frame_ms": 12.0, "stage_ms.other": 8.0}
     return changed(replace(run, rows=run.rows[run.rows["metric"].isin(figures)]), figures)

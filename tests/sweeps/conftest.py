@@ -49,16 +49,14 @@ class Outcome(NamedTuple):
 
 
 @pytest.fixture
-def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def elsewhere(tmp_path, monkeypatch) -> None:
     """The working directory is `tmp_path`, and the stand-ins can be imported."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(HERE)
 
 
 @pytest.fixture
-def steerbench(
-    elsewhere: None, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> Callable[..., Outcome]:
+def steerbench(elsewhere, monkeypatch, capfd) -> Callable[..., Outcome]:
     """Call the command line within this process, `elsewhere`."""
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # which `run` sets: restored after the test
     monkeypatch.setattr(sys, "argv", ["steerbench"])
@@ -74,13 +72,13 @@ def steerbench(
 
 
 @pytest.fixture
-def run(steerbench: Callable[..., Outcome]) -> Callable[..., Outcome]:
+def run(steerbench) -> Callable[..., Outcome]:
     """Call `steerbench run` with the stand-ins and further arguments."""
     return lambda *argv: steerbench("run", *STAND_INS, *argv)
 
 
 @pytest.fixture
-def launched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def launched(monkeypatch) -> list[int]:
     """How many jobs Hydra's usual launcher was handed, each time."""
     counts: list[int] = []
     launch = BasicLauncher.launch
@@ -94,7 +92,7 @@ def launched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.fixture
-def spawn(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+def spawn(tmp_path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
     """Start `steerbench run` with the stand-ins as a process of its own in `tmp_path`; what still
     runs after the test is killed."""
 

@@ -63,7 +63,7 @@ def write_files(document: str, folder: Path) -> set[str]:
 
 
 @pytest.fixture
-def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def mine(tmp_path, monkeypatch) -> Path:
     """The folder that extending.md makes, with views of two greys."""
     written = write_files("extending.md", tmp_path)
     assert {"mean_colour/method.py", "mean_colour/average.py", "npz.py"} <= written

@@ -36,7 +36,7 @@ GREY = """
 
 
 @pytest.fixture
-def write(tmp_path: Path):
+def write(tmp_path):
     """Write `worker.py`: `GREY`, then further lines."""
     shutil.copy(ROOT / "steerbench_worker.py", tmp_path)
 
@@ -51,7 +51,7 @@ def rows(tmp_path: Path) -> pd.DataFrame:
 
 
 @pytest.fixture
-def documented(elsewhere, tmp_path: Path) -> list[str]:
+def documented(elsewhere, tmp_path) -> list[str]:
     """The files of external.md are in the working directory; the words that choose its method."""
     shutil.copy(ROOT / "steerbench_worker.py", tmp_path)
     shutil.copytree(HERE / "configs", tmp_path / "configs")  # Hydra takes one folder

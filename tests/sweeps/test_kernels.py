@@ -28,7 +28,7 @@ WRONG = {
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], int]]:
+def asked(monkeypatch) -> list[tuple[list[str], int]]:
     """The subjects that were timed, and how often; the rows are those above, by subject."""
     calls = []
 

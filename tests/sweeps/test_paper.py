@@ -29,15 +29,13 @@ TABLE3, TABLE5 = (TABLES[name] for name in ("table3", "table5"))
 
 
 @pytest.fixture
-def outputs(store: Store) -> str:
+def outputs(store) -> str:
     """The word for the folder of the store."""
     return f"outputs={store.folder.parent}"
 
 
 @pytest.fixture
-def measured(
-    store: Store, stored_run: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> list[DictConfig]:
+def measured(store, stored_run, tmp_path, monkeypatch) -> list[DictConfig]:
     """Every job but that of L = 3 leaves a run of known figures; the configurations it was asked
     for."""
     asked: list[DictConfig] = []
@@ -132,7 +130,7 @@ def job(folder: Path) -> Planned:
 
 
 @pytest.fixture
-def scenes(store: Store, stored_run: str, tmp_path: Path) -> Store:
+def scenes(store, stored_run, tmp_path) -> Store:
     """A store with the job measured in a/mic and then in b/mic, scenes that differ."""
     for number, name in enumerate("ab"):
         path = tmp_path / name / "mic"
@@ -182,7 +180,7 @@ def test_no_earlier_run_stands_for_what_fails(scenes, tmp_path, elsewhere, error
 
 
 @pytest.fixture
-def psnr(store: Store, stored_run: str, monkeypatch: pytest.MonkeyPatch, elsewhere: None):
+def psnr(store, stored_run, monkeypatch, elsewhere):
     """Gathers lines of Table 5 from the PSNR of each line, scene and seed that was measured."""
     (source,) = load_runs(store, [stored_run])
     monkeypatch.setattr(paper, "of_scene", lambda run, config: True)

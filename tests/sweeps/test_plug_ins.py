@@ -33,7 +33,7 @@ SMALL = (
 
 
 @pytest.fixture
-def folder(steerbench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(steerbench, tmp_path, monkeypatch) -> Path:
     """Of the package `mine` and the configuration of its method; all further calls find it."""
     package = tmp_path / "plug-in's" / "mine"
     package.mkdir(parents=True)
@@ -51,7 +51,7 @@ def folder(steerbench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def call(steerbench, folder: Path):
+def call(steerbench, folder):
     return lambda command, *argv: steerbench(
         command, "--config-dir", str(folder / "configs"), *argv
     )
@@ -110,7 +110,7 @@ def test_the_package_of_the_document_is_installed_listed_and_measured(mine):  # 
 
 
 @pytest.fixture
-def plugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Path | str]]:
+def plugged(tmp_path, monkeypatch) -> Iterator[Callable[..., Path | str]]:
     """Install a package `other` with an entry point of a value, and files of its folder."""
     monkeypatch.syspath_prepend(tmp_path / "site")
 

@@ -86,7 +86,7 @@ def browser(viewer: Viewer) -> Iterator[Page]:
 
 
 @pytest.fixture
-def opened(steerbench: Callable[..., Any], tmp_path: Path) -> Iterator[Callable[..., Viewer]]:
+def opened(steerbench, tmp_path) -> Iterator[Callable[..., Viewer]]:
     viewers = []
 
     def open_(*words: str) -> Viewer:

@@ -59,7 +59,7 @@ def edit_json(path: Path, change: Callable[[dict], object]) -> None:
 
 
 @pytest.fixture
-def blender_folder(tmp_path: Path) -> Path:
+def blender_folder(tmp_path) -> Path:
     """Three training and two test pictures of 8 x 6."""
     root = tmp_path / "chair"
     for split, count, seed in (("train", 3, 0), ("test", 2, 50)):

@@ -27,7 +27,7 @@ POINTS = np.random.default_rng(0).uniform((-1, -2, -3), (1, 2, 3), (400, 3))
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Callable[..., Path]:
+def folder(tmp_path) -> Callable[..., Path]:
     """A capture of ten pictures of 8 x 6, with the camera and a model of the kind asked for."""
 
     def make(model: str = "PINHOLE", params: tuple = PINHOLE, kind: str = "binary") -> Path:

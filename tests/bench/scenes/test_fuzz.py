@@ -128,7 +128,7 @@ def within_a_gigabyte() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory) -> Path:
     """Pictures and camera files of all formats, which a test may overwrite."""
     root = tmp_path_factory.mktemp("scene")
     for i in range(3):

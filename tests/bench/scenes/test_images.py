@@ -160,7 +160,7 @@ def test_a_header_that_announces_more_than_memory_holds_is_refused(tmp_path):
 
 
 @pytest.fixture
-def files(tmp_path: Path) -> list[Path]:
+def files(tmp_path) -> list[Path]:
     """Four pictures of 5 x 4 in files."""
     paths = [tmp_path / f"{number}.png" for number in range(4)]
     for number, path in enumerate(paths):

@@ -16,7 +16,7 @@ MATRIX = "9 0 4.5 0\n0 8 2.5 0\n0 0 1 0\n0 0 0 1\n"
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path) -> Path:
     """Two training, one validation and one test picture of 8 x 6."""
     root = tmp_path / "Truck"
     (root / "rgb").mkdir(parents=True)

@@ -23,7 +23,7 @@ from tests.bench.scenes.conftest import edit_json, picture, pose
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path) -> Path:
     """Ten pictures of 8 x 6, listed out of order, without a lens."""
     root = tmp_path / "desk"
     (root / "images").mkdir(parents=True)

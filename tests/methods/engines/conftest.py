@@ -2,19 +2,17 @@
 
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor, nn
 
-from bench.types import Log
 from methods.engines import Built, Engine
 from tests.methods.engines import tensorrt_double
 
 
 @pytest.fixture
-def build(tmp_path: Path, quiet_log: Log) -> Callable[..., Built]:
+def build(tmp_path, quiet_log) -> Callable[..., Built]:
     """Builds a network with an engine from the inputs of some frames, in a folder."""
 
     def built(
@@ -33,7 +31,7 @@ def build(tmp_path: Path, quiet_log: Log) -> Callable[..., Built]:
 
 
 @pytest.fixture
-def double(monkeypatch: pytest.MonkeyPatch) -> None:
+def double(monkeypatch) -> None:
     """TensorRT and a GPU, both played."""
     monkeypatch.setitem(sys.modules, "tensorrt", tensorrt_double)
     monkeypatch.setattr(tensorrt_double.Builder, "built", 0)

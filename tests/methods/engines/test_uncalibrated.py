@@ -41,7 +41,7 @@ class Layers(nn.Module):
 
 
 @pytest.fixture
-def no_bfloat16(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_bfloat16(monkeypatch) -> None:
     """OpenVINO computes in float32 what it does not quantise, on any CPU."""
     monkeypatch.setattr("methods.engines.openvino_engine._capabilities", lambda openvino: [])
 

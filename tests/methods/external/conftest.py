@@ -27,7 +27,7 @@ GREY = """
 
 
 @pytest.fixture
-def worker(tmp_path: Path) -> Callable[..., Path]:
+def worker(tmp_path) -> Callable[..., Path]:
     """Write a worker: `GREY`, then further lines, the last of which serves `Grey`."""
     folder = tmp_path / "worker"
 

@@ -58,7 +58,7 @@ register({"id": "mean", "method_class": "mean_method:Mean"})
 
 
 @pytest.fixture(scope="module")
-def nerfbaselines(tmp_path_factory: pytest.TempPathFactory) -> str:
+def nerfbaselines(tmp_path_factory) -> str:
     """A Python that has NerfBaselines: $NERFBASELINES_PYTHON, or that of a new environment, because
     it needs an older numpy than ours; skips where pip cannot install it."""
     if given := os.environ.get("NERFBASELINES_PYTHON"):

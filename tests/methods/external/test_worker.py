@@ -106,7 +106,7 @@ def render(method: External, scene: Scene, log: Log) -> None:
 
 
 @pytest.fixture
-def started(monkeypatch: pytest.MonkeyPatch) -> list[psutil.Process]:
+def started(monkeypatch) -> list[psutil.Process]:
     """The processes of all workers, and those that these have started."""
     processes: list[psutil.Process] = []
     end = Worker._end

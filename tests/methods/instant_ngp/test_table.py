@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bench.types import Budget, Log, Scene, Split
+from bench.types import Budget, Split
 from methods.instant_ngp.table import LONG, SHORT, detail, hash_grid
 from methods.kernels.encode import HashGrid
 from tests.methods.trainings import QUICK
@@ -45,8 +45,8 @@ def test_a_length_that_is_given_is_kept():
 
 @pytest.mark.parametrize(("fine", "expected"), [(10**6, SHORT), (0, LONG)])
 def test_a_field_gets_the_table_that_its_scene_needs(
-    ball_scene: Scene, quiet_log: Log, monkeypatch: pytest.MonkeyPatch, fine: int, expected: int
-) -> None:
+    ball_scene, quiet_log, monkeypatch, fine, expected
+):
     monkeypatch.setattr("methods.instant_ngp.table.FINE", fine)
     method = new_ngp(grid=hash_grid(log2_table=None, **SHAPE), training=QUICK, device="cpu")
     method.fit(ball_scene, BUDGET, quiet_log)

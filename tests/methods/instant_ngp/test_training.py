@@ -47,7 +47,7 @@ def stage(scene: Scene, root: Path) -> Path:
 
 
 @pytest.fixture
-def unlit(ball_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> FieldTraining:
+def unlit(ball_scene, monkeypatch) -> FieldTraining:
     """A training that renders every pixel black and learns nothing."""
 
     def render(rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:

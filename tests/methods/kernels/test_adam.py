@@ -9,7 +9,7 @@ from methods.kernels.adam import AdamState, hash_adam_, sparse_adam_
 from methods.kernels.encode import HashGrid, SampleGradients, encode, pack
 
 
-def test_an_entry_makes_the_steps_of_adam_at_which_it_has_a_gradient(backend: str) -> None:
+def test_an_entry_makes_the_steps_of_adam_at_which_it_has_a_gradient(backend):
     """As if it were alone, whatever the others do; torch leaves out what has no gradient."""
     generator = torch.Generator().manual_seed(0)
     table = torch.randn(50, 2, generator=generator)
@@ -31,7 +31,7 @@ def test_an_entry_makes_the_steps_of_adam_at_which_it_has_a_gradient(backend: st
 
 
 @pytest.mark.parametrize("features", [1, 2, 3])
-def test_the_step_of_collected_gradients_is_that_of_their_sum(backend: str, features: int) -> None:
+def test_the_step_of_collected_gradients_is_that_of_their_sum(backend, features):
     """To the bit, as both add up in the order of the samples; over parts, levels and steps."""
     grid = HashGrid(levels=3, features=features, log2_table=12, n_min=4, n_max=64)
     generator = torch.Generator().manual_seed(0)
@@ -55,7 +55,7 @@ def test_the_step_of_collected_gradients_is_that_of_their_sum(backend: str, feat
     assert words is None or torch.equal(words, pack(tables[0]))
 
 
-def test_wrong_arguments_are_named() -> None:
+def test_wrong_arguments_are_named():
     grid = HashGrid(levels=1, features=2, log2_table=6, n_min=4, n_max=4)
     gradients = SampleGradients([(torch.zeros(5, 3), torch.zeros(5, 3))])
     table = torch.zeros(grid.entries, 2)

@@ -19,7 +19,7 @@ def random_table(grid: HashGrid, dtype: torch.dtype = torch.float64) -> Tensor:
     return torch.rand(grid.entries, grid.features, dtype=dtype, generator=generator) - 0.5
 
 
-def test_levels_of_the_released_grid() -> None:
+def test_levels_of_the_released_grid():
     """Resolutions and parameter counts of ngp_pl and of the Instant-NGP paper."""
     new = partial(HashGrid, levels=16, features=2, n_min=16)
     grid = new(log2_table=19, n_max=1024)
@@ -33,7 +33,7 @@ def test_levels_of_the_released_grid() -> None:
     assert new(log2_table=19, n_max=4096).entries * 2 == 12_599_920
 
 
-def test_gradients_in_float64() -> None:
+def test_gradients_in_float64():
     table = random_table(GRID).requires_grad_()
     generator = torch.Generator().manual_seed(2)
     positions = torch.rand(5, 3, dtype=torch.float64, generator=generator).requires_grad_()
@@ -44,8 +44,8 @@ def test_gradients_in_float64() -> None:
 
 @pytest.mark.parametrize("asked", [False, True])
 def test_gradients_of_samples_are_collected_whether_or_not_the_table_asks_for_its_own(
-    backend: str, asked: bool
-) -> None:
+    backend, asked
+):
     table = random_table(GRID, torch.float32).requires_grad_(asked)
     positions = torch.rand(100, 3, generator=torch.Generator().manual_seed(0))
     gradients = SampleGradients()
@@ -60,7 +60,7 @@ def test_gradients_of_samples_are_collected_whether_or_not_the_table_asks_for_it
     assert table.grad is None
 
 
-def test_a_position_that_is_not_a_number_spoils_its_own_features_alone(backend: str) -> None:
+def test_a_position_that_is_not_a_number_spoils_its_own_features_alone(backend):
     table = random_table(GRID, torch.float32).requires_grad_()
     positions = torch.rand(70, 3, generator=torch.Generator().manual_seed(0))
     positions[::7, 1] = torch.nan
@@ -72,7 +72,7 @@ def test_a_position_that_is_not_a_number_spoils_its_own_features_alone(backend: 
     torch.testing.assert_close(*gradients)
 
 
-def test_wrong_arguments_are_named() -> None:
+def test_wrong_arguments_are_named():
     table = random_table(GRID, torch.float32)
     with pytest.raises(ValueError, match=r"positions: expected shape \[any, 3\], got \[4, 2\]"):
         encode(torch.zeros(4, 2), table, GRID)

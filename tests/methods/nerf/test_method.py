@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from bench.types import Log, Scene
 from methods.kernels.composite import STOP
 from methods.nerf.field import NerfField
 from methods.rendering.sampling import Sampling
@@ -14,7 +13,7 @@ from tests.methods.small_students import fitted
 from tests.methods.trainings import EXACT_TEACHER
 
 
-def test_skipping_changes_no_picture_and_saves_products(ball_scene: Scene, shared_log: Log) -> None:
+def test_skipping_changes_no_picture_and_saves_products(ball_scene, shared_log):
     method = fitted("nerf", ball_scene, shared_log, 20, stop=STOP)
     assert method.sizes() == {"network": 4 * 595_844, "occupancy": 128**3 // 8}
     camera = ball_scene.splits["test"].cameras[0]
@@ -63,7 +62,7 @@ def gamma(p: torch.Tensor, frequencies: int) -> torch.Tensor:
     return torch.cat((p, *waves), dim=1)
 
 
-def test_the_network_is_that_of_the_paper() -> None:
+def test_the_network_is_that_of_the_paper():
     generator = torch.Generator().manual_seed(0)
     field = NerfField("fp32", "auto", generator).double()
     paper = PaperNerf().double()

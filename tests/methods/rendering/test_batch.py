@@ -23,13 +23,13 @@ from methods.rendering.batch import (
 )
 from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import Sampling
-from tests.methods.conftest import Cloud, look_at_the_middle
+from tests.methods.conftest import look_at_the_middle
 
 Thick = tuple[HashField, Occupancy, Rays]
 
 
 @pytest.fixture
-def thick(cloud: Cloud, device: str) -> Thick:
+def thick(cloud, device) -> Thick:
     """The cloud a hundred times as dense, so that it hides its own samples, and rays through it."""
     field, occupancy = cloud
     thin = field.density

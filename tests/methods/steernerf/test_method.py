@@ -49,7 +49,7 @@ def new_method(
 
 
 @pytest.fixture
-def log(tmp_path: Path) -> ConsoleLog:
+def log(tmp_path) -> ConsoleLog:
     return ConsoleLog(tmp_path)
 
 

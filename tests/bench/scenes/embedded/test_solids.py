@@ -35,7 +35,7 @@ REACH, STEPS = 6.0, 1500
 
 
 @pytest.fixture(params=SHAPES)
-def shape(request: pytest.FixtureRequest) -> Shape:
+def shape(request) -> Shape:
     """Every kind of shape in turn."""
     return SHAPES[request.param]
 
