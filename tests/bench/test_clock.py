@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bench.clock import FrameRecord, StageClock
-from bench.errors import SteerbenchError
+from tests.common import refusal
 
 
 def clock_reading(times: Iterable[int]) -> StageClock:
@@ -97,7 +97,7 @@ def test_a_time_of_another_clock_replaces_the_stages_beside_what_passed_here(sta
 def test_a_time_that_cannot_have_passed_is_refused(told, why):
     readings = iter([100, 160])
     clock = StageClock("cpu", clock=lambda: next(readings))
-    with pytest.raises(SteerbenchError, match=why), clock.frame():
+    with refusal(why), clock.frame():
         clock.report(*told)
     assert not clock.frames
 
@@ -106,10 +106,10 @@ def test_a_frame_has_one_reported_time_and_counters_from_0_on():
     clock = clock_reading(itertools.count())
     with clock.frame():
         clock.report(1, {})
-        with pytest.raises(SteerbenchError, match="twice"):
+        with refusal("twice"):
             clock.report(1, {})
     for wrong in (-1, 2.5, math.nan, 2**63, torch.tensor(-1)):
-        with pytest.raises(SteerbenchError, match="rays: expected a whole number"), clock.frame():
+        with refusal("rays: expected a whole number"), clock.frame():
             clock.count("rays", wrong)
 
 

@@ -24,15 +24,12 @@ from bench.motion import (
     viewing_target,
 )
 from bench.types import Camera
+from tests.common import assert_near, seeded
 
 TARGET = torch.tensor([0.5, 0.4, 0.6])
 SEEDS = st.integers(0, 2**31)
 FLOAT32 = 2e-6
 """Of a rotation and a centre about 2 units away, both rounded to float32."""
-
-
-def seeded(seed: int) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 def camera_at(offset: list[float], aside: float = 0.0) -> Camera:
@@ -81,7 +78,7 @@ def test_a_motion_keeps_its_speed_its_gaze_and_its_distance(seed, one, other, as
         assert vars(frame) == vars(replace(camera, c2w=frame.c2w))
         assert frame.c2w.dtype == torch.float32
         identity = frame.c2w[:, :3].T @ frame.c2w[:, :3]
-        torch.testing.assert_close(identity, torch.eye(3), atol=FLOAT32, rtol=0)
+        assert_near(identity, torch.eye(3), atol=FLOAT32)
 
 
 @given(SEEDS)
@@ -183,7 +180,7 @@ def test_the_ends_of_the_way_between_two_cameras_are_the_cameras():
     turn = rotation_between(first, second)
     for share, end in ((0.0, first), (1.0, second)):
         reached = between(first, second, turn, share)
-        torch.testing.assert_close(reached.c2w, end.c2w, atol=FLOAT32, rtol=0)
+        assert_near(reached.c2w, end.c2w, atol=FLOAT32)
         assert (reached.fx, reached.cy) == (end.fx, end.cy)
     middle = between(first, second, turn, 0.5)
     assert (middle.fx, middle.cy) == (70.5, 15.5)

@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from bench.types import SteerbenchError, Unavailable
+from bench.types import Unavailable
 from bench.weights import BACKBONES, load_features, locate
+from tests.common import refusal
 
 STATE = {"features.0.weight": torch.ones(2), "classifier.1.weight": torch.zeros(3)}
 
@@ -92,7 +93,7 @@ def test_downloaded_weights_are_kept_if_right(tmp_path, publisher, weights, quie
 
 
 def test_an_unknown_network_and_a_missing_folder_are_errors_not_gaps(tmp_path, quiet_log):
-    with pytest.raises(SteerbenchError, match="expected one of alex, vgg, got 'resnet'"):
+    with refusal("expected one of alex, vgg, got 'resnet'"):
         locate("resnet", None, quiet_log)
-    with pytest.raises(SteerbenchError, match=r"weights_dir: expected a folder, got .*nowhere"):
+    with refusal(r"weights_dir: expected a folder, got .*nowhere"):
         locate("alex", tmp_path / "nowhere", quiet_log)

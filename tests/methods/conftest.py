@@ -15,6 +15,7 @@ from methods.instant_ngp.field import HashField
 from methods.instant_ngp.stage1 import TrainedField, train_field
 from methods.kernels.encode import HashGrid
 from methods.kernels.types import Occupancy
+from tests.common import seeded
 from tests.methods.trainings import TAUGHT, TEACHER
 
 SIZE = 32
@@ -93,7 +94,7 @@ def teacher(ball_scene, shared_log) -> TrainedField:
 @pytest.fixture
 def cloud(device) -> Cloud:
     """A random field, dense enough to stop rays, in a box of the cube."""
-    field = HashField(GRID, precision="fp32", generator=torch.Generator().manual_seed(0))
+    field = HashField(GRID, precision="fp32", generator=seeded(0))
     with torch.no_grad():
         field.table.mul_(3e4)
     cells = torch.zeros(32, 32, 32, dtype=torch.bool, device=device)

@@ -5,6 +5,7 @@ import torch
 from torch import nn
 
 from methods.training.muon import MOMENTUM, Muon
+from tests.common import seeded
 
 SHAPES = [(4, 3, 3, 3), (48, 2, 3, 3)]
 
@@ -12,7 +13,7 @@ SHAPES = [(4, 3, 3, 3), (48, 2, 3, 3)]
 @pytest.mark.parametrize("shape", SHAPES)
 def test_the_first_step_is_the_gradient_with_all_singular_values_set_to_one(shape):
     """One row for each output channel. The published iteration ends between 0.68 and 1.21."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     weight, gradient = (
         torch.randn(shape, generator=generator).to(memory_format=torch.channels_last)
         for _ in range(2)
@@ -39,7 +40,7 @@ def test_steps_are_those_of_torch_for_matrices(shape):
     given = {"weight_decay": 0.0, "momentum": MOMENTUM, "adjust_lr_fn": "match_rms_adamw"}
     both = Muon([weight], 0.1), torch.optim.Muon([matrix], 0.1, **given)
     for seed in range(3):
-        weight.grad = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+        weight.grad = torch.randn(shape, generator=seeded(seed))
         matrix.grad = weight.grad.flatten(1)
         for optimiser in both:
             optimiser.step()

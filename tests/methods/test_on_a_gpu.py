@@ -41,6 +41,7 @@ from methods.steernerf.stage2 import JointTraining
 from methods.steernerf.unet import UNet
 from methods.students.fields import StudentField
 from methods.training import loop
+from tests.common import seeded
 from tests.conftest import EMPTY, QUICK
 from tests.methods.models import small_joint, small_model, small_motion, small_rendering
 from tests.methods.small_students import extraction
@@ -207,7 +208,7 @@ def test_killed_in_stage_2_it_goes_on_as_if_it_had_not_been(gpu, scene, tmp_path
 @pytest.mark.parametrize("places", [("cuda", "cpu"), ("cpu", "cuda")])
 def test_what_was_trained_at_one_place_goes_on_at_the_other(gpu, places, scene, tmp_path):
     def training(device: str) -> FieldTraining:
-        generator = torch.Generator().manual_seed(0)
+        generator = seeded(0)
         field = HashField(GRID, backend="reference", generator=generator).to(device)
         return FieldTraining(field, scene, BUDGET, STAGE1, seed=0)
 

@@ -17,6 +17,7 @@ from methods.instant_ngp.stage1 import Setup
 from methods.instant_ngp.table import detail
 from methods.kernels.encode import HashGrid
 from methods.training import loop
+from tests.common import seeded
 from tests.methods.usual import field_options
 
 PIXEL = 1.6 / 40
@@ -77,7 +78,7 @@ def does_not_see_what_masks_hide(begin: Callable[[Scene], loop.Training], scene:
     """Assert that what masks hide in the pictures of `scene` changes nothing in eight steps of the
     training that `begin` makes, and that everything else would."""
     split = scene.splits["train"]
-    noise = torch.rand(1, 1, 11, 11, generator=torch.Generator().manual_seed(0))
+    noise = torch.rand(1, 1, 11, 11, generator=seeded(0))
     mask = torch.nn.functional.interpolate(noise, size=split.images[0].shape[:2])[0, 0] < 0.6
     spoiled = [torch.where(mask[..., None], image, 255 - image) for image in split.images]
 

@@ -4,10 +4,10 @@ import math
 
 import pytest
 
-from bench.errors import SteerbenchError
 from reports.comparison import comparison, ranks, shown_as
 from reports.lines import as_lines
 from reports.runs import Repeated, Run
+from tests.common import refusal
 from tests.reports.conftest import changed, elsewhere, run_of
 
 FACTS = dict.fromkeys(("split", "trajectory", "budget", "protocol", "device"), "same")
@@ -103,5 +103,5 @@ def test_a_metric_without_a_better_side_has_no_best(make, rows):
 
 
 def test_a_metric_that_does_not_exist_is_refused():
-    with pytest.raises(SteerbenchError, match="pnsr: no such metric; expected one as"):
+    with refusal("pnsr: no such metric; expected one as"):
         shown_as("pnsr")

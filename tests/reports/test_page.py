@@ -9,7 +9,6 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from bench.types import SteerbenchError
 from reports import figures
 from reports.images import Part
 from reports.lines import Lines
@@ -17,6 +16,7 @@ from reports.page import _ablations, write_page
 from reports.publish import publish
 from reports.runs import Repeated
 from reports.tables import Table
+from tests.common import refusal
 from tests.reports.conftest import rewrite, run_of
 
 TABLE = Table("t", ("a", "b"), (("x", "1 < 2"),))
@@ -53,7 +53,7 @@ def test_a_page_is_written_in_both_forms(tmp_path):
 @pytest.mark.parametrize("form", ["report.md", "report.html"])
 def test_a_form_that_cannot_be_written_is_the_same_plain_error(tmp_path, form):
     (tmp_path / form / "in the way").mkdir(parents=True)
-    with pytest.raises(SteerbenchError, match=f"cannot write to {tmp_path}"):
+    with refusal(f"cannot write to {tmp_path}"):
         publish(PARTS, tmp_path)
     assert [path.name for path in tmp_path.glob(".*")] == []
 

@@ -8,6 +8,7 @@ from bench.errors import Unavailable
 from methods.engines.openvino_engine import OpenVino, _capabilities
 from methods.engines.torch_engine import TorchEngine
 from methods.steernerf.unet import UNet
+from tests.common import seeded
 from tests.methods.models import shaken
 
 needs_bf16 = pytest.mark.skipif(
@@ -33,7 +34,7 @@ def unet() -> tuple[nn.Module, list[Tensor]]:
     """The U-Net, and inputs of one size."""
     torch.manual_seed(1000)
     renderer = shaken(UNet(6, 1, 4, width=64, aligned=False)).requires_grad_(False)
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     return renderer.network, list(torch.rand(3, 1, 12, 36, 44, generator=generator))
 
 

@@ -13,6 +13,7 @@ from torch.nn import functional
 from methods.engines import CALIBRATION, Engine
 from methods.engines.openvino_engine import OpenVino
 from methods.engines.tensorrt_engine import TensorRt
+from tests.common import seeded
 from tests.methods.engines.test_engines import CPU, unet
 
 Kind = Callable[[str, str], Engine]
@@ -47,7 +48,7 @@ def no_bfloat16(monkeypatch) -> None:
 
 
 def noise(seed: int) -> Tensor:
-    return torch.randn(1, 4, 8, 8, generator=torch.Generator().manual_seed(seed))
+    return torch.randn(1, 4, 8, 8, generator=seeded(seed))
 
 
 def rounded(x: Tensor, largest: float) -> Tensor:

@@ -9,9 +9,10 @@ import pytest
 
 from bench.clock import StageClock
 from bench.errors import Unavailable
-from bench.types import Budget, Log, Scene, SteerbenchError
+from bench.types import Budget, Log, Scene
 from methods.external.method import External
 from methods.external.worker import Worker
+from tests.common import refusal
 
 BUDGET = Budget("test", steps=7, samples=9)
 
@@ -140,7 +141,7 @@ def test_what_it_does_wrong_is_one_line_with_its_last_words(
     limit_s = 0.5 if lines == HANG else 60.0
     method = external(worker(before=talking(place, lines), after=""), frame_s=limit_s)
     method.start_s = limit_s if place == "hello" else 60.0
-    with pytest.raises(SteerbenchError, match=said) as error:
+    with refusal(said) as error:
         render(method, tiny_scene, quiet_log)
     message = str(error.value)
     assert message.startswith(f"worker {'bad' if place == 'render' else ''}")
@@ -190,14 +191,14 @@ def test_an_exception_is_told_and_its_traceback_is_among_the_last_words(
         raise {raised}
     Grey.render = render
     """
-    with pytest.raises(SteerbenchError, match=f"worker Grey: failed at 'render': {said}") as error:
+    with refusal(f"worker Grey: failed at 'render': {said}") as error:
         render(external(worker(lines)), tiny_scene, quiet_log)
     assert "Error" in str(error.value).rpartition("last words")[2]
 
 
 @pytest.mark.parametrize("command", ["", "worker.py 'a"])
 def test_what_is_no_command_is_refused(external, command):
-    with pytest.raises(SteerbenchError, match=r"method\.command: expected a program and its arg"):
+    with refusal(r"method\.command: expected a program and its arg"):
         external(command).settings()
 
 

@@ -7,11 +7,12 @@ import torch
 
 from methods.kernels.adam import AdamState, hash_adam_, sparse_adam_
 from methods.kernels.encode import HashGrid, SampleGradients, encode, pack
+from tests.common import seeded
 
 
 def test_an_entry_makes_the_steps_of_adam_at_which_it_has_a_gradient(backend):
     """As if it were alone, whatever the others do; torch leaves out what has no gradient."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     table = torch.randn(50, 2, generator=generator)
     entries = [torch.nn.Parameter(entry.clone()) for entry in table]
     optimiser = torch.optim.Adam(entries, lr=1e-2, betas=(0.9, 0.99), eps=1e-15)
@@ -34,7 +35,7 @@ def test_an_entry_makes_the_steps_of_adam_at_which_it_has_a_gradient(backend):
 def test_the_step_of_collected_gradients_is_that_of_their_sum(backend, features):
     """To the bit, as both add up in the order of the samples; over parts, levels and steps."""
     grid = HashGrid(levels=3, features=features, log2_table=12, n_min=4, n_max=64)
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     start = torch.randn(grid.entries, features, generator=generator)
     tables, states = (start.clone(), start), (AdamState.like(start), AdamState.like(start))
     words = pack(start) if features == 2 else None

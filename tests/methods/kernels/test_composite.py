@@ -14,6 +14,7 @@ from bench.case import U32
 from methods.kernels.composite import composite, visibility
 from methods.kernels.composite.experiments import exact, slope
 from methods.kernels.types import Intervals, Pixels, offsets_of
+from tests.common import assert_near, seeded
 
 Inputs = tuple[Tensor, Tensor, Intervals]
 
@@ -21,7 +22,7 @@ Inputs = tuple[Tensor, Tensor, Intervals]
 def samples(
     counts: list[int], channels: int = 3, dtype: torch.dtype = torch.float32, seed: int = 0
 ) -> Inputs:
-    generator = torch.Generator().manual_seed(len(counts) + seed)
+    generator = seeded(len(counts) + seed)
     total = sum(counts)
 
     def draw(*shape: int) -> Tensor:
@@ -108,7 +109,7 @@ def test_visible_samples_are_those_with_a_weight_which_is_the_gradient_of_their_
     (gradient,) = torch.autograd.grad(pixels.values.sum(), values)
     found, counts, left = visibility(sigma, where, stop=0.05, front=1 - alpha, backend=backend)
     torch.testing.assert_close(found, gradient[:, 0], rtol=1e-5, atol=1e-7)
-    torch.testing.assert_close(left, 1 - pixels.alpha, rtol=0, atol=1e-6)
+    assert_near(left, 1 - pixels.alpha, atol=1e-6)
     assert 0 < counts[0] < 40
     ends = zip(found.split([40, 0, 1, 25]), counts.tolist(), strict=True)
     assert all((part[:count] > 0).all() and not part[count:].any() for part, count in ends)

@@ -5,8 +5,9 @@ import torch
 
 from methods.kernels.corner_gather import corner_gather
 from methods.plenoctree.kernels.voxel_light import shade_voxels
+from tests.common import seeded
 
-RANDOM = torch.Generator().manual_seed(0)
+RANDOM = seeded(0)
 WEIGHTS = torch.rand(9, 8, generator=RANDOM)
 VOXEL, RAY = (torch.randint(4, (9,), generator=RANDOM).int() for _ in range(2))
 CORNERS = torch.randint(20, (4, 8), generator=RANDOM).int()
@@ -31,7 +32,7 @@ def test_weights_have_a_gradient_by_the_reference_only():
 def test_a_buffer_gets_the_gradient_whether_or_not_the_table_asks_for_one(
     read, rest, shape, backend
 ):
-    table = torch.rand(shape, generator=torch.Generator().manual_seed(1)).requires_grad_()
+    table = torch.rand(shape, generator=seeded(1)).requires_grad_()
     (gradient,) = torch.autograd.grad(read(table, *rest, backend=backend).sum(), table)
     for asked in (False, True):
         buffer, source = torch.ones(shape), table.detach().requires_grad_(asked)

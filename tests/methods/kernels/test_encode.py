@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 
 from methods.kernels.encode import HashGrid, SampleGradients, encode
+from tests.common import seeded
 
 GRID = HashGrid(levels=4, features=2, log2_table=8, n_min=3, n_max=30)
 
 
 def random_table(grid: HashGrid, dtype: torch.dtype = torch.float64) -> Tensor:
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     return torch.rand(grid.entries, grid.features, dtype=dtype, generator=generator) - 0.5
 
 
@@ -35,7 +36,7 @@ def test_levels_of_the_released_grid():
 
 def test_gradients_in_float64():
     table = random_table(GRID).requires_grad_()
-    generator = torch.Generator().manual_seed(2)
+    generator = seeded(2)
     positions = torch.rand(5, 3, dtype=torch.float64, generator=generator).requires_grad_()
     assert torch.autograd.gradcheck(
         lambda x, t: encode(x, t, GRID, backend="reference"), (positions, table)
@@ -47,7 +48,7 @@ def test_gradients_of_samples_are_collected_whether_or_not_the_table_asks_for_it
     backend, asked
 ):
     table = random_table(GRID, torch.float32).requires_grad_(asked)
-    positions = torch.rand(100, 3, generator=torch.Generator().manual_seed(0))
+    positions = torch.rand(100, 3, generator=seeded(0))
     gradients = SampleGradients()
     for scale, part in zip((1, 2), positions.split(60), strict=True):
         features = encode(part, table, GRID, gradients=gradients, backend=backend)
@@ -62,7 +63,7 @@ def test_gradients_of_samples_are_collected_whether_or_not_the_table_asks_for_it
 
 def test_a_position_that_is_not_a_number_spoils_its_own_features_alone(backend):
     table = random_table(GRID, torch.float32).requires_grad_()
-    positions = torch.rand(70, 3, generator=torch.Generator().manual_seed(0))
+    positions = torch.rand(70, 3, generator=seeded(0))
     positions[::7, 1] = torch.nan
     good = ~positions.isnan().any(dim=1)
     found, want = (encode(x, table, GRID, backend=backend) for x in (positions, positions[good]))

@@ -21,6 +21,7 @@ from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import composite, visibility
 from methods.kernels.encode import HashGrid, encode
 from methods.kernels.types import Intervals
+from tests.common import seeded
 
 pytestmark = pytest.mark.skipif(
     bool(availability()["gpu"]), reason="Triton has no build for this platform"
@@ -46,7 +47,7 @@ def test_what_is_not_a_number_shows_and_what_is_behind_it_does_not():
 
 
 def test_what_is_not_contiguous_is_read_all_the_same():
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     grid = HashGrid(levels=2, features=2, log2_table=6, n_min=4, n_max=20)
     positions = torch.rand(3, 50, generator=generator).to(DEVICE).T
     table = torch.rand(2, grid.entries, generator=generator).to(DEVICE).T.requires_grad_()

@@ -7,11 +7,12 @@ from torch import Tensor
 
 from bench.threads import torch_threads
 from methods.kernels.mlp import mlp
+from tests.common import assert_near, seeded
 
 
 def network(count: int, dtype: torch.dtype = torch.float32) -> tuple[list[Tensor], list[Tensor]]:
     """Two inputs of 5 and 3 channels, and layers of 20 and 4 outputs, which need a gradient."""
-    generator = torch.Generator().manual_seed(count)
+    generator = seeded(count)
     inputs = [torch.randn(count, n, generator=generator).to(dtype) for n in (5, 3)]
     layers = [torch.randn(*n, generator=generator).to(dtype) for n in ((20, 8), (4, 20))]
     return inputs, [layer.requires_grad_() for layer in layers]
@@ -36,7 +37,7 @@ def test_outputs_depend_on_neither_the_number_of_threads_nor_on_who_asks_for_gra
                 found.append(mlp(inputs, layers, backend="cpu"))
     assert torch.equal(*found)
     # Two sums, of 8 and 20 products, in another order.
-    torch.testing.assert_close(found[0], learning.detach(), rtol=0, atol=1e-4)
+    assert_near(found[0], learning.detach(), atol=1e-4)
 
 
 def test_other_types_numbers_and_shapes_are_refused():

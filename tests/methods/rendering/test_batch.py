@@ -23,6 +23,7 @@ from methods.rendering.batch import (
 )
 from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import Sampling
+from tests.common import seeded
 from tests.methods.conftest import look_at_the_middle
 
 Thick = tuple[HashField, Occupancy, Rays]
@@ -54,7 +55,7 @@ def learned(pixels: Pixels, field: HashField) -> list[Tensor]:
 
 def test_leaving_out_hidden_samples_changes_no_gradient(thick, device):
     field, occupancy, rays = thick
-    jitter = torch.rand(len(rays.origins), generator=torch.Generator().manual_seed(0)).to(device)
+    jitter = torch.rand(len(rays.origins), generator=seeded(0)).to(device)
     white = torch.ones(3, device=device)
 
     samples = march(rays, occupancy, STEP, jitter=jitter)

@@ -10,6 +10,7 @@ from methods.rendering.field import BATCH_QUANTUM, pad
 from methods.rendering.frame import render_rays
 from methods.rendering.occupancy import RESOLUTION, DensityGrid
 from methods.rendering.sampling import Sampling
+from tests.common import seeded
 from tests.methods.conftest import Work, look_at_the_middle
 from tests.methods.solids import DENSITY, Solid, ball
 
@@ -34,7 +35,7 @@ def test_rays_of_a_solid_end_at_its_surface():
 def test_the_density_grid_finds_a_solid():
     slice_ = torch.zeros(RESOLUTION, RESOLUTION, RESOLUTION, dtype=torch.bool)
     slice_[62:66] = True  # through the middle of the ball
-    grid, generator = DensityGrid(slice_), torch.Generator().manual_seed(0)
+    grid, generator = DensityGrid(slice_), seeded(0)
     for _ in range(4):
         grid.update(Solid(ball()), generator, samples=2 * int(slice_.sum()))
     axis = (torch.arange(RESOLUTION) + 0.5) / RESOLUTION - 0.5

@@ -16,6 +16,7 @@ from methods.steernerf import distillation
 from methods.steernerf.distillation import distilled_views
 from methods.steernerf.options import MotionOptions
 from methods.steernerf.patches import Patches
+from tests.common import seeded
 from tests.methods.conftest import SIZE, ball
 from tests.methods.models import (
     SMALL_GRID,
@@ -108,7 +109,7 @@ def new_patches(
     ]
     scene = replace(scene, splits={"train": halves[0]})
     options = small_joint(distilled_share=share, motion=motion, **joint)
-    pipeline, generator = new_pipeline(frames=frames), torch.Generator().manual_seed(0)
+    pipeline, generator = new_pipeline(frames=frames), seeded(0)
     return Patches(pipeline, scene, halves[1], options, generator)
 
 

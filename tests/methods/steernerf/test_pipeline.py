@@ -13,6 +13,7 @@ from methods.steernerf.buffer import Buffer, PointCloud
 from methods.steernerf.options import RangeReduction
 from methods.steernerf.pipeline import near_matter
 from methods.steernerf.unet import RIM
+from tests.common import assert_near
 from tests.methods.conftest import Work, look_at_the_middle
 from tests.methods.models import new_pipeline, small_rendering
 
@@ -37,7 +38,7 @@ def test_a_part_of_a_view_looks_as_the_view_does():
         directions = cast(whole).directions.view(whole.height, whole.width, 3)
         there = directions[3 * scale : 7 * scale, 2 * scale : 6 * scale]
         got = cast(some).directions.view(some.height, some.width, 3)
-        torch.testing.assert_close(got, there, rtol=0, atol=1e-6)
+        assert_near(got, there, atol=1e-6)
 
 
 @pytest.mark.parametrize("frames", [0, 1, 3])
@@ -146,7 +147,7 @@ def test_far_from_matter_a_picture_is_background_and_near_it_that_of_the_whole()
     inner = functional.max_pool2d((~drawn)[None].float(), 105, 1, 52)[0] == 0
     assert inner.sum() > 2500
     # Float32, sums of a few hundred products, in another order where the size is another.
-    torch.testing.assert_close(some.rgb[inner], every.rgb[inner], rtol=0, atol=1e-5)
+    assert_near(some.rgb[inner], every.rgb[inner], atol=1e-5)
     assert not torch.equal(some.rgb, every.rgb)
     less, more = (probe.done["products"] for probe in work)
     left_out = (~drawn).float().mean() * pipeline.renderer.network.products(drawn[None, None])

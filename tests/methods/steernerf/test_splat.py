@@ -7,11 +7,12 @@ import torch
 from torch import Tensor
 
 from methods.steernerf.splat import splat
+from tests.common import seeded
 
 
 def scatter_points(count: int, width: int, height: int) -> tuple[Tensor, Tensor]:
     """Points inside and around the picture; many share a depth, some a u or a v, some are equal."""
-    generator = torch.Generator().manual_seed(count)
+    generator = seeded(count)
     size = torch.tensor([width, height])
     pixels = (torch.rand(count, 2, generator=generator) * 1.5 - 0.25) * size
     depth = (4 * torch.rand(count, generator=generator)).round() - 1

@@ -9,10 +9,11 @@ from methods.kernels.corner_gather import OFFSETS
 from methods.kernels.types import Occupancy
 from methods.kernels.voxel_walk import Crossings, Voxels
 from methods.students.voxels import corners_of, largest_weights, occupied_voxels
+from tests.common import seeded
 
 
 def scattered(share: float, size: int = 16) -> Occupancy:
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     return Occupancy(torch.rand(size, size, size, generator=generator) < share)
 
 
@@ -52,7 +53,7 @@ def test_the_largest_weight_of_a_voxel_is_that_over_all_rays(ball_scene, monkeyp
         crossed.append(crossings.voxel.unique())
         return torch.full((len(crossings.voxel),), next(weights))
 
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     found = largest_weights(voxels, weigh, batches, 25, generator, "cpu")
     assert counts == [10, 10, 5]
     want = torch.zeros(512)

@@ -13,6 +13,7 @@ from bench.scenes.embedded.solids import Carved, Ellipsoid
 from bench.scenes.embedded.textures import plain
 from bench.types import EMPTY_ALPHA, Camera
 from tests.bench.scenes.conftest import camera_at
+from tests.common import seeded
 
 RED = plain((1.0, 0.0, 0.0))
 
@@ -80,7 +81,7 @@ def test_the_nearest_of_all_parts_is_seen(monkeypatch, model, eye):
 
 @pytest.mark.parametrize("model", [totem, wires])
 def test_shadows_are_those_of_all_parts_but_of_a_convex_one_on_itself(model):
-    solids, generator = model(), torch.Generator().manual_seed(3)
+    solids, generator = model(), seeded(3)
     points = 2.4 * torch.rand(6000, 3, generator=generator) - 1.2
     owners = torch.randint(len(solids.parts), (6000,), generator=generator).to(torch.int16)
     assert math.hypot(*LIGHT) == pytest.approx(1, abs=1e-6)
