@@ -34,7 +34,7 @@ from sweeps.overrides import CONFIGS
 from tests.pretended_gpu import PretendedGpu, pretended_gpu
 from tests.web import Web
 
-STEERBENCH_1 = instantiate(OmegaConf.load(CONFIGS / "protocol" / "steerbench-1.yaml"))
+STEERBENCH_1 = instantiate(OmegaConf.load(CONFIGS / "protocol/steerbench-1.yaml"))
 QUICK = replace(STEERBENCH_1, name="quick", lpips=())  # without weights, which a test may lack
 
 hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True)

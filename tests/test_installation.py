@@ -54,11 +54,11 @@ def installed(tmp_path_factory) -> Path:
     subprocess.run(built, check=True)
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
     (wheel,) = folder.glob("*.whl")
-    there = ["--python", str(environment / "bin" / "python")]
+    there = ["--python", str(environment / "bin/python")]
     subprocess.run([*pip, *there, "install", *alone, str(wheel)], check=True)
     (libraries,) = environment.glob("lib/python*/site-packages")
     (libraries / "libraries.pth").write_text(sysconfig.get_path("purelib"))
-    return environment / "bin" / "steerbench"
+    return environment / "bin/steerbench"
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def steerbench(installed, tmp_path):
 @pytest.mark.slow
 def test_the_demo_of_the_wheel_writes_its_page(steerbench, tmp_path):
     steerbench("run", "+experiment=demo", *TINY)
-    assert "| gaussians |" in (tmp_path / "outputs" / "demo" / "report.md").read_text()
+    assert "| gaussians |" in (tmp_path / "outputs/demo/report.md").read_text()
 
 
 @pytest.mark.slow

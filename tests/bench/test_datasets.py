@@ -94,7 +94,7 @@ def test_a_scene_is_unpacked_and_only_what_is_on_the_list(monkeypatch, web, tmp_
     data = publish(monkeypatch, FILES, archive=web.address + "{scene}.zip")
     web.files["/mic.zip"] = zipped(FILES | {"../evil": b"!", "mic/notes.txt": b"mine"})
     for _ in range(2):
-        assert get(data, "mic", tmp_path / "data", quiet_log) == tmp_path / "data" / "mic"
+        assert get(data, "mic", tmp_path / "data", quiet_log) == tmp_path / "data/mic"
         assert found(tmp_path) == {f"data/{name}": content for name, content in FILES.items()}
     assert len(web.asked) == 1
     pictures = {name: content for name, content in FILES.items() if "depth" not in name}

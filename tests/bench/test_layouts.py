@@ -106,6 +106,6 @@ def test_what_a_layout_cannot_hold_is_refused(scene, path, tmp_path, quiet_log):
 
 
 def test_the_choices_of_the_command_are_the_layouts():
-    file = Path(__file__).parents[2] / "sweeps" / "commands.toml"
+    file = Path(__file__).parents[2] / "sweeps/commands.toml"
     command = tomllib.loads(file.read_text())["scenes"]
     assert command["arguments"]["--layout"]["choices"] == list(LAYOUTS)

@@ -133,7 +133,7 @@ def plain_lpips(net: str, weights: dict, heads: dict, a: Tensor, b: Tensor) -> f
 def test_lpips_is_the_published_formula(net, file, lpips_weights, quiet_log, device):
     weights = torch.load(lpips_weights / f"{file}_features.pth", weights_only=True)
     package = Path(importlib.util.find_spec("lpips").origin).parent
-    heads = torch.load(package / "weights" / "v0.1" / f"{net}.pth", "cpu", weights_only=True)
+    heads = torch.load(package / f"weights/v0.1/{net}.pth", "cpu", weights_only=True)
     a = noise(50, 44, 7)
     b = (a + 0.2 * (noise(50, 44, 8) - 0.5)).clamp(0, 1)
     measured = Lpips(net, lpips_weights, quiet_log)(a.to(device), b.to(device))

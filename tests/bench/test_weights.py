@@ -28,7 +28,7 @@ def weights(publisher, monkeypatch) -> tuple[str, bytes]:
 
 
 def cache(tmp_path: Path) -> Path:
-    return tmp_path / "torch" / "hub" / "checkpoints"
+    return tmp_path / "torch/hub/checkpoints"
 
 
 def test_weights_dir_precedes_environment_and_cache(publisher, monkeypatch, tmp_path, quiet_log):

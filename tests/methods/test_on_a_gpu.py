@@ -208,8 +208,7 @@ def test_killed_in_stage_2_it_goes_on_as_if_it_had_not_been(gpu, scene, tmp_path
 @pytest.mark.parametrize("places", [("cuda", "cpu"), ("cpu", "cuda")])
 def test_what_was_trained_at_one_place_goes_on_at_the_other(gpu, places, scene, tmp_path):
     def training(device: str) -> FieldTraining:
-        generator = seeded(0)
-        field = HashField(GRID, backend="reference", generator=generator).to(device)
+        field = HashField(GRID, backend="reference", generator=seeded(0)).to(device)
         return FieldTraining(field, scene, BUDGET, STAGE1, seed=0)
 
     first, second = map(training, places)
@@ -219,8 +218,8 @@ def test_what_was_trained_at_one_place_goes_on_at_the_other(gpu, places, scene, 
     for one in (first, second):
         one.advance()
     assert second.field.device.type == places[1]
-    for name, value in first.result().items():
-        assert torch.equal(value.cpu(), second.result()[name].cpu()), name
+    results = ({name: x.cpu() for name, x in one.result().items()} for one in (first, second))
+    assert_equal(*results)
 
 
 @pytest.mark.parametrize("name", ["ngp", "nsvf", "steernerf"])

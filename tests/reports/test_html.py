@@ -93,7 +93,7 @@ def test_every_picture_says_what_it_shows(parsed):
 
 def test_pictures_lose_nothing(several, stored_run, parsed):
     (shown,) = (image for image in parsed.of("img") if FIRST.fullmatch(image["alt"]))
-    stored = several[0].folder / stored_run / "pictures" / "0000-rendered.png"
+    stored = several[0].folder / stored_run / "pictures/0000-rendered.png"
     content = base64.b64decode(shown["src"].partition(",")[2])
     with Image.open(io.BytesIO(content)) as picture, Image.open(stored) as rendered:
         assert np.array_equal(picture.convert("RGB"), rendered.convert("RGB"))
@@ -135,7 +135,7 @@ def test_names_are_text_and_nothing_else(store, stored_run, tmp_path):
     rewrite(store, stored_run, command=HOSTILE, error_map=HOSTILE)
     rename(store, stored_run, HOSTILE)
     write_page(store, [stored_run], tmp_path / "page", {HOSTILE: HOSTILE})
-    text = (tmp_path / "page" / "report.html").read_text()
+    text = (tmp_path / "page/report.html").read_text()
     assert "<script>x" not in text
     assert text.count("&lt;script&gt;x") > 10
     assert len(Parsed(text).of("script")) == 1

@@ -94,12 +94,15 @@ def test_a_page_of_nothing_still_says_what_is_missing(tmp_path):
     assert "![" not in text
 
 
-def test_a_page_of_ones_own_table_has_its_title_and_pictures(run, tmp_path):
-    table = PaperTable("mine", "My table", ["psnr"], {"a": Line("here", {})})
+def test_a_page_of_ones_own_table_has_its_title_figures_and_pictures(run, tmp_path):
+    table = PaperTable(
+        "mine", "My table", ["psnr"], {"a": Line("here", {}), "b": Line("there", {})}
+    )
     text = write_paper_page([table], measured_of(table, {"a": run}), tmp_path).read_text()
     assert text.startswith("# My table\n")
+    assert f"| here | {run.values['psnr']:.2f} |" in text
     assert "![Ground truth, here; a detail of each; error maps]" in text
-    assert "paper" not in text
+    assert "aper" not in text
 
 
 def test_a_curve_has_a_point_for_every_scored_frame_and_hollow_ones_for_cold(run, tmp_path, drawn):

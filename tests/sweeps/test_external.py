@@ -89,15 +89,6 @@ def test_another_worker_or_another_option_is_another_run(run, write, tmp_path):
     assert counts == [1, 2, 3, 3]
 
 
-def test_the_worker_of_the_document_takes_turns_with_ours(steerbench, documented, tmp_path):
-    words = typed("run --config-dir")
-    steerbench(*(word.replace("ngp", "grey") for word in words), *QUICK[1:]).ok()
-    assert set(rows(tmp_path)["method"]) == {"Mean", "grey"}
-    records = [json.loads(x.read_text()) for x in tmp_path.glob("outputs/runs/*/record.json")]
-    first, second = (record["made_of"] for record in records)
-    assert first["beside"] == second["beside"]
-
-
 def test_the_worker_of_the_document_has_a_line_in_a_table(steerbench, documented):
     words = typed("table table1 --config-dir")
     steerbench(*(word.replace("table1", "table9") for word in words), *WHITE, "seed=0").ok()
@@ -152,15 +143,15 @@ def test_a_worker_beside_its_yaml_is_found_from_anywhere_and_gets_variables(
         Grey.render = lambda self, camera: np.full(
             (camera.height, camera.width, 3), float(os.environ["LEVEL"]))
     """)
-    shutil.copytree(HERE / "configs", tmp_path / "one" / "configs")
+    shutil.copytree(HERE / "configs", tmp_path / "one/configs")
     for name in ("worker.py", "steerbench_worker.py"):
-        shutil.move(tmp_path / name, tmp_path / "one" / "configs" / "method")
+        shutil.move(tmp_path / name, tmp_path / "one/configs/method")
     mine = "defaults: [external, _self_]\ncommand: worker.py\nenvironment: {LEVEL: '1.0'}\n"
-    (tmp_path / "one" / "configs" / "method" / "mine.yaml").write_text(mine)
+    (tmp_path / "one/configs/method/mine.yaml").write_text(mine)
     words = ["method=mine", *QUICK[1:], f"outputs={tmp_path / 'outputs'}"]
-    steerbench("run", "--config-dir", str(tmp_path / "one" / "configs"), *words).ok()
+    steerbench("run", "--config-dir", str(tmp_path / "one/configs"), *words).ok()
     shutil.move(tmp_path / "one", tmp_path / "two")
-    steerbench("run", "--config-dir", str(tmp_path / "two" / "configs"), *words).ok()
+    steerbench("run", "--config-dir", str(tmp_path / "two/configs"), *words).ok()
     assert len(list(tmp_path.glob("outputs/runs/*"))) == 1  # the key knows no folder
     psnr = rows(tmp_path).set_index("metric").loc["psnr", "value"]
     assert psnr == math.inf  # white, as the scene is

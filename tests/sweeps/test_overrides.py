@@ -88,8 +88,8 @@ def test_the_hint_works_when_it_is_copied_into_a_shell(word):
 
 @pytest.mark.parametrize("content", [b"a: b: c", b"- 1", b"", b"\xff\xfe", b"_target_: 5", b"7"])
 def test_a_choice_that_is_no_yaml_of_settings_is_named_in_one_line(content, steerbench, tmp_path):
-    (tmp_path / "further" / "method").mkdir(parents=True)
-    (tmp_path / "further" / "method" / "mine.yaml").write_bytes(content)
+    (tmp_path / "further/method").mkdir(parents=True)
+    (tmp_path / "further/method/mine.yaml").write_bytes(content)
     refused = steerbench("run", f"--config-dir={tmp_path / 'further'}", "method=mine").refused()
     assert "mine.yaml: expected" in refused or "method: its YAML file: expected" in refused
     assert refused.count("\n") == 1

@@ -156,7 +156,7 @@ def test_folders_show_their_own(scenes, tmp_path, monkeypatch, tiny_scene, folde
         return configured._Read(replace(tiny_scene, digest=digest), (), {})
 
     monkeypatch.setattr(configured, "_scene", loaded)
-    (tmp_path / "c" / "mic").mkdir(parents=True)
+    (tmp_path / "c/mic").mkdir(parents=True)
     (line,) = gather([job(tmp_path / folder / "mic")], by_job(scenes, print)).values()
     assert [run.record["scene"]["digest"] for run in line.runs] == found
 
@@ -169,7 +169,7 @@ def test_folders_show_their_own(scenes, tmp_path, monkeypatch, tiny_scene, folde
     ],
 )
 def test_no_earlier_run_stands_for_what_fails(scenes, tmp_path, elsewhere, error, kept, said):
-    asked = job(tmp_path / "b" / "mic")
+    asked = job(tmp_path / "b/mic")
     asked.keep_failure(error)
     (line,) = gather([asked], by_job(scenes, print)).values()
     assert len(line.runs) == kept

@@ -208,7 +208,7 @@ def nsvf(folder: Path, pictures: bool = True) -> Path:
         (folder / name).mkdir(parents=True)
     (folder / "bbox.txt").touch()
     if pictures:
-        (folder / "rgb" / "0_00000.png").touch()
+        (folder / "rgb/0_00000.png").touch()
     return folder
 
 
@@ -216,7 +216,7 @@ def test_of_nerf_synthetic_what_is_there_is_found_and_the_rest_is_named(tmp_path
     for name in ("mic", "lego"):
         blender(tmp_path / name)
     blender(tmp_path / "chair", pictures=False)
-    (tmp_path / "lego" / "test" / "r_1.png").unlink()
+    (tmp_path / "lego/test/r_1.png").unlink()
     (tmp_path / "drums").mkdir()
     found = find(str(tmp_path))
     assert (found.layout, list(found.scenes)) == ("blender", ["mic"])
@@ -235,7 +235,7 @@ def test_of_tanks_and_temples_too_and_scenes_of_ones_own_miss_nothing(tmp_path):
     found = find(str(tmp_path))
     assert (found.layout, list(found.scenes)) == ("nsvf", ["Barn", "Truck"])
     assert set(found.missing) == {"Caterpillar", "Family", "Ignatius"}
-    blender(tmp_path / "mine" / "teapot")
+    blender(tmp_path / "mine/teapot")
     assert find(str(tmp_path / "mine")).missing == {}
 
 
@@ -249,8 +249,8 @@ def test_of_tanks_and_temples_too_and_scenes_of_ones_own_miss_nothing(tmp_path):
 )
 def test_no_scenes_or_those_of_two_layouts_have_no_mean(tmp_path, folder, said):
     (tmp_path / "empty").mkdir()
-    blender(tmp_path / "both" / "mic")
-    nsvf(tmp_path / "both" / "Barn")
+    blender(tmp_path / "both/mic")
+    nsvf(tmp_path / "both/Barn")
     with refusal(said):
         find(str(tmp_path / folder))
 

@@ -35,12 +35,12 @@ SMALL = (
 @pytest.fixture
 def folder(steerbench, tmp_path, monkeypatch) -> Path:
     """Of the package `mine` and the configuration of its method; all further calls find it."""
-    package = tmp_path / "plug-in's" / "mine"
+    package = tmp_path / "plug-in's/mine"
     package.mkdir(parents=True)
     (package / "__init__.py").touch()
     (package / "helper.py").write_text("LEVEL = 0.5\n")
     (package / "renderer.py").write_text(RENDERER)
-    config = package.parent / "configs" / "method" / "mine.yaml"
+    config = package.parent / "configs/method/mine.yaml"
     config.parent.mkdir(parents=True)
     config.write_text("# Mine.\n_target_: mine.renderer.Mine\n")
     monkeypatch.syspath_prepend(package.parent)

@@ -31,7 +31,7 @@ def test_every_frame_of_a_run_is_written_and_its_path_can_be_followed_and_timed(
     assert "trained field found" in outcome.err
     there = pictures("there")
     assert [picture.shape for picture in there] == [(24, 24, 3)] * 2
-    kept = Path("outputs/runs") / run / "pictures" / "0000-rendered.png"
+    kept = Path("outputs/runs") / run / "pictures/0000-rendered.png"
     assert np.array_equal(np.asarray(Image.open(kept)), there[0])
 
     path = json.loads(Path("there/path.json").read_text())

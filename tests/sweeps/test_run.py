@@ -104,7 +104,7 @@ def test_an_ablation_is_a_table_over_seeds_in_every_form_and_grows_by_what_is_ne
     table = run(*ABLATION, "report=page", "--format", "markdown").ok().out
     assert "| method | level | seeds | PSNR, dB ↑ |" in table
     assert "| grey | 0.5 | 2 | **6.05** |" in table
-    page = (tmp_path / "page" / "report.md").read_text()
+    page = (tmp_path / "page/report.md").read_text()
     assert table.partition("\n\n")[2].strip() in page
     assert "means over seeds" in page
     keys = stored(tmp_path)

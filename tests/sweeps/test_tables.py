@@ -59,7 +59,7 @@ table:
 
 def declared(folder: Path, more: str = "", text: str = MINE) -> list[str]:
     (folder / "experiment").mkdir()
-    (folder / "experiment" / "mine.yaml").write_text(f"{text}{more}")
+    (folder / "experiment/mine.yaml").write_text(f"{text}{more}")
     return [f"--config-dir={folder}"]
 
 

@@ -112,16 +112,6 @@ def test_a_turned_knob_is_another_method(opened):
         page.until(lambda: page.picture.mean() == before)
 
 
-def test_a_renderer_in_another_process_draws_the_picture(opened, documented):  # noqa: F811
-    viewer = opened(*documented)
-    with browser(viewer) as page:
-        page.look()
-        page.until(lambda: page.picture.size > 0)
-        assert page.picture.min() > 250  # white, as the scene is
-        page.choose("rows", 64)
-        page.until(lambda: len(page.picture) == 64)
-
-
 def test_two_methods_stand_side_by_side(opened):
     viewer = opened("method.level=0.4", "--beside", "shades")
     with browser(viewer) as page:

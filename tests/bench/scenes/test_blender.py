@@ -41,7 +41,7 @@ def test_cameras_are_opencv_and_the_units_can_be_undone(blender_folder, log):
 
 def test_opaque_pictures_take_the_whole_space(blender_folder, log):
     for k in range(3):
-        Image.fromarray(picture(k, channels=3)).save(blender_folder / "train" / f"r_{k}.png")
+        Image.fromarray(picture(k, channels=3)).save(blender_folder / f"train/r_{k}.png")
     scene = blender.load(blender_folder, log=log)
     assert scene.unit_length == 3
     assert scene.bounds.tolist() == [[0, 0, 0], [1, 1, 1]]
@@ -56,7 +56,7 @@ def test_a_validation_split_has_all_its_pictures_or_none(blender_folder, log):
     assert set(scene.splits) == {"train", "test"}
     assert log.messages == ["transforms_val.json: none of its 3 pictures are there, split left out"]
     shutil.copytree(blender_folder / "train", blender_folder / "val")
-    (blender_folder / "val" / "r_1.png").unlink()
+    (blender_folder / "val/r_1.png").unlink()
     with refusal(r"transforms_val.json: frames: .* 1 of 3 not there: no"):
         blender.load(blender_folder, log=log)
 
@@ -65,7 +65,7 @@ def test_the_digest_depends_on_content_and_options_not_on_the_place(blender_fold
     def digest(**options) -> str:
         return blender.load(copy, **options, log=log).digest
 
-    copy = tmp_path / "elsewhere" / "chair"
+    copy = tmp_path / "elsewhere/chair"
     shutil.copytree(blender_folder, copy)
     assert digest() == blender.load(blender_folder, log=log).digest
     flat = [[-1.5, -1.5, -0.5], [1.5, 1.5, 0.5]]  # centre and longest side are those of "full"
@@ -73,7 +73,7 @@ def test_the_digest_depends_on_content_and_options_not_on_the_place(blender_fold
     digests = [digest(**some) for some in options]
     edit_json(copy / "transforms_test.json", lambda r: r.update(camera_angle_x=0.71))
     digests.append(digest())
-    Image.fromarray(picture(99)).save(copy / "test" / "r_1.png")
+    Image.fromarray(picture(99)).save(copy / "test/r_1.png")
     digests.append(digest())
     assert len(set(digests)) == 7
 

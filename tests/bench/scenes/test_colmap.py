@@ -45,7 +45,7 @@ def folder(tmp_path) -> Callable[..., Path]:
             found.add_image_with_trivial_frame(image, pycolmap.Rigid3d(opencv).inverse())
         for point in POINTS:
             found.add_point3D(point, pycolmap.Track(), np.zeros(3, np.uint8))
-        getattr(found, f"write_{kind}")(root / "sparse" / "0")
+        getattr(found, f"write_{kind}")(root / "sparse/0")
         return root
 
     return make
@@ -54,7 +54,7 @@ def folder(tmp_path) -> Callable[..., Path]:
 def test_cameras_see_the_points_where_colmap_does(folder, log):
     root = folder()
     scene = colmap.load(root, log=log)
-    found = pycolmap.Reconstruction(root / "sparse" / "0")
+    found = pycolmap.Reconstruction(root / "sparse/0")
     assert list(scene.splits["test"].names) == ["000.png", "008.png"]
     assert len(scene.splits["train"]) == 8
     split = scene.splits["train"]
@@ -71,7 +71,7 @@ def test_cameras_see_the_points_where_colmap_does(folder, log):
 
 def test_the_box_is_that_of_the_points_without_outliers_and_of_a_ply_the_same(folder, log):
     root = folder()
-    model, scene = root / "sparse" / "0", colmap.load(root, space="box", log=log)
+    model, scene = root / "sparse/0", colmap.load(root, space="box", log=log)
     box = pycolmap.Reconstruction(model).compute_bounding_box(colmap.STRAY, 1 - colmap.STRAY)
     expected = Box(torch.tensor(box.min), torch.tensor(box.max)).grown()
     assert scene.unit_length == expected.side
@@ -86,7 +86,7 @@ def test_smaller_pictures_have_smaller_cameras(folder, log):
     root = folder()
     (root / "images_2").mkdir()
     for number in range(10):
-        Image.fromarray(picture(number, 4, 3, 3)).save(root / "images_2" / f"{number:03}.png")
+        Image.fromarray(picture(number, 4, 3, 3)).save(root / f"images_2/{number:03}.png")
     full, half = (colmap.load(root, images=name, log=log) for name in ("images", "images_2"))
     first, second = (scene.splits["test"].cameras[0] for scene in (full, half))
     assert (second.width, second.height) == (4, 3)
@@ -162,14 +162,14 @@ def test_what_does_not_fit_is_named(folder, log):
     root = folder()
     with refusal(r"expected cameras.bin or cameras.txt in sparse/1"):
         colmap.load(root, model="sparse/1", log=log)
-    Image.fromarray(picture(5, 9, 9, 3)).save(root / "images" / "005.png")
+    Image.fromarray(picture(5, 9, 9, 3)).save(root / "images/005.png")
     with refusal(r"005.png: expected a picture of 8 x 6 .* got 9 x 9"):
         colmap.load(root, log=log)
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
 def test_a_damaged_list_is_an_error_that_names_it(folder, log, name):
-    path = folder() / "sparse" / "0" / f"{name}.bin"
+    path = folder() / f"sparse/0/{name}.bin"
     content = path.read_bytes()
     path.write_bytes(content[: len(content) // 2])
     with refusal(rf"{name}.bin: expected a whole list, got a damaged"):
@@ -191,7 +191,7 @@ def test_every_image_of_a_text_is_read_by_its_whole_name(folder, log, change):
     binary, root = colmap.load(folder(), log=log), folder(kind="text")
     for path in (root / "images").iterdir():
         path.rename(path.with_name(f"my  photo ({path.stem}).png"))
-    images, cameras = (root / "sparse/0" / f"{name}.txt" for name in ("images", "cameras"))
+    images, cameras = (root / f"sparse/0/{name}.txt" for name in ("images", "cameras"))
     text = re.sub(r"(\d+)\.png", r"my  photo (\1).png", images.read_text())
     images.write_bytes(change(text).encode())
     cameras.write_text(cameras.read_text() + "9 NONE that no picture uses\n")
@@ -225,7 +225,7 @@ IMAGE, CAMERA = "3 1 0 0 0 0 0 0 002.png", "expected CAMERA_ID MODEL"
     ],
 )
 def test_a_bad_entry_of_a_text_is_named(folder, log, name, pattern, new, message):
-    path = folder(kind="text") / "sparse" / "0" / f"{name}.txt"
+    path = folder(kind="text") / f"sparse/0/{name}.txt"
     path.write_text(re.sub(pattern, new, path.read_text(), flags=re.MULTILINE))
     with refusal(f"{name}.txt: {message}"):
         colmap.load(path.parents[2], space="box", log=log)
@@ -233,7 +233,7 @@ def test_a_bad_entry_of_a_text_is_named(folder, log, name, pattern, new, message
 
 def test_only_what_is_needed_of_a_binary_model_must_be_right(folder, log):
     root = folder()
-    wanted, model = colmap.load(root, space="box", log=log), root / "sparse" / "0"
+    wanted, model = colmap.load(root, space="box", log=log), root / "sparse/0"
     cameras = (model / "cameras.bin").read_bytes()
     bad = struct.pack("<IiQQ4d", 9, 1, 0, 0, *[float("nan")] * 4)
     (model / "cameras.bin").write_bytes(struct.pack("<Q", 2) + cameras[8:] + bad)
@@ -247,7 +247,7 @@ def test_only_what_is_needed_of_a_binary_model_must_be_right(folder, log):
 @pytest.mark.parametrize("content", ["", None])
 def test_without_points_the_box_must_be_given(folder, log, content):
     root = folder(kind="text")
-    path = root / "sparse" / "0" / "points3D.txt"
+    path = root / "sparse/0/points3D.txt"
     path.unlink() if content is None else path.write_text(content)
     with refusal(r"expected points3D.* or scene\.bounds"):
         colmap.load(root, space="box", log=log)

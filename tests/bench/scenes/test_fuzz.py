@@ -136,8 +136,8 @@ def folder(tmp_path_factory) -> Path:
     (root / "pose").mkdir()
     (root / "rgb").mkdir()
     for name in ("0_a", "0_b", "2_c"):
-        (root / "rgb" / f"{name}.png").write_bytes(encoded("RGBA", "PNG"))
-        (root / "pose" / f"{name}.txt").write_text(TEXTS["pose/0_a.txt"])
+        (root / f"rgb/{name}.png").write_bytes(encoded("RGBA", "PNG"))
+        (root / f"pose/{name}.txt").write_text(TEXTS["pose/0_a.txt"])
     (root / "transforms_test.json").write_text(json.dumps(RECORD))
     return root
 

@@ -24,10 +24,10 @@ def folder(tmp_path) -> Path:
     (root / "bbox.txt").write_text("-1 -2 -1 1 2 1 0.4\n")
     (root / "intrinsics.txt").write_text(MATRIX)
     for k, name in enumerate(("0_000", "0_001", "1_002", "2_003")):
-        Image.fromarray(picture(k, channels=3)).save(root / "rgb" / f"{name}.png")
+        Image.fromarray(picture(k, channels=3)).save(root / f"rgb/{name}.png")
         pose = np.eye(4)
         pose[:3, 3] = (k, 0, -5)
-        np.savetxt(root / "pose" / f"{name}.txt", pose)
+        np.savetxt(root / f"pose/{name}.txt", pose)
     return root
 
 
@@ -58,7 +58,7 @@ def test_folders_may_be_links_and_have_another_case(folder, log):
 
 
 def test_without_2_the_1_are_the_test_split(folder, log):
-    (folder / "rgb" / "2_003.png").unlink()
+    (folder / "rgb/2_003.png").unlink()
     scene = nsvf.load(folder, log=log)
     assert {split: len(views) for split, views in scene.splits.items()} == {"train": 2, "test": 1}
     missing, remark = log.messages

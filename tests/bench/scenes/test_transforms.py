@@ -30,7 +30,7 @@ def folder(tmp_path) -> Path:
     (root / "images").mkdir(parents=True)
     frames = []
     for k in reversed(range(10)):
-        Image.fromarray(picture(k, channels=3)).save(root / "images" / f"{k:03}.png")
+        Image.fromarray(picture(k, channels=3)).save(root / f"images/{k:03}.png")
         frames.append({"file_path": f"images/{k:03}.png", "transform_matrix": pose(k)})
     record = {"fl_x": 9.0, "fl_y": 8.0, "cx": 4.5, "cy": 2.5, "w": 8, "h": 6, "aabb_scale": 2}
     (root / "transforms.json").write_text(json.dumps({**record, "frames": frames}))
@@ -111,7 +111,7 @@ def test_what_is_put_right_or_doubted_is_said_once(folder, log, change, lens, sa
 
 
 def test_pictures_of_several_sizes(folder, log):
-    Image.fromarray(picture(0, 12, 10, 3)).save(folder / "images" / "000.png")
+    Image.fromarray(picture(0, 12, 10, 3)).save(folder / "images/000.png")
     edit_json(folder / "transforms.json", of_picture(0, w=12, h=10))
     first, second = transforms.load(folder, log=log).splits["test"].images
     assert (tuple(first.shape), tuple(second.shape)) == ((10, 12, 3), (6, 8, 3))
@@ -119,7 +119,7 @@ def test_pictures_of_several_sizes(folder, log):
 
 def test_missing_pictures_are_named_once_and_left_out(folder, log):
     for k in (3, 7):
-        (folder / "images" / f"{k:03}.png").unlink()
+        (folder / f"images/{k:03}.png").unlink()
     scene = transforms.load(folder, log=log)
     assert len(scene.splits["train"]) == 6
     assert scene.splits["test"].names == ["images/000.png", "images/008.png"]
@@ -142,7 +142,7 @@ def test_masked_pixels_do_not_count(folder, log, where):
     before = transforms.load(folder, log=log)
     if where == "dynamic_mask":
         white = Image.fromarray(np.where(BLACK == 0, 255, 0).astype(np.uint8))
-        white.save(folder / "images" / "dynamic_mask_008.png")
+        white.save(folder / "images/dynamic_mask_008.png")
     else:
         bright = 25 if where == "m.jpg" else 1  # its black is nearly black
         Image.fromarray(bright * BLACK).save(folder / where, quality=50)
@@ -159,8 +159,8 @@ def test_masked_pixels_do_not_count(folder, log, where):
 def test_a_pixel_of_an_undistorted_smaller_picture_counts_if_all_of_it_does(folder, log):
     spots = np.uint8(255 * (np.random.default_rng(0).random((76, 100)) < 0.02))
     for k in range(10):
-        Image.fromarray(spots).convert("RGB").save(folder / "images" / f"{k:03}.png")
-        Image.fromarray(spots).save(folder / "images" / f"dynamic_mask_{k:03}.png")
+        Image.fromarray(spots).convert("RGB").save(folder / f"images/{k:03}.png")
+        Image.fromarray(spots).save(folder / f"images/dynamic_mask_{k:03}.png")
     record = {"w": 100, "h": 76, "fl_x": 90, "fl_y": 84, "cx": 52.3, "cy": 37.1, "k1": 0.06}
     edit_json(folder / "transforms.json", lambda r: r.update(record))
     whole, half = (transforms.load(folder, downscale=k, log=log).splits["test"] for k in (1, 2))
@@ -219,12 +219,12 @@ def test_in_all_of_space_the_box_is_the_middle_half_of_the_cube(folder, log):
 
 def test_a_background_is_what_is_neither_transparent_nor_plain(folder, log):
     assert transforms.load(folder, log=log).space == "all"
-    Image.fromarray(picture(1)).save(folder / "images" / "001.png")
+    Image.fromarray(picture(1)).save(folder / "images/001.png")
     assert transforms.load(folder, log=log).space == "box"
     white = np.full((6, 8, 3), 250, np.uint8)
     white[2:4, 3:5] = 0
     for k in range(10):
-        Image.fromarray(white).save(folder / "images" / f"{k:03}.png")
+        Image.fromarray(white).save(folder / f"images/{k:03}.png")
     assert transforms.load(folder, log=log).space == "box"
     assert transforms.load(folder, background="black", log=log).space == "all"
     with refusal(r"scene.space: .* auto or box or all, got 'no'"):
@@ -273,7 +273,7 @@ def test_too_few_pictures_and_a_bad_split_are_refused(folder, log):
     for value in (0, 1, 2.5, "8"):
         with refusal(r"split_every: expected a whole number from 2"):
             transforms.load(folder, split_every=value, log=log)
-    first, *others = (folder / "images" / f"{k:03}.png" for k in range(10))
+    first, *others = (folder / f"images/{k:03}.png" for k in range(10))
     for path in others:
         path.unlink()
     with refusal(r"expected a picture to train on"):

@@ -212,7 +212,7 @@ def test_pictures_that_do_not_overlap_are_refused(ball_scene):
 
 def test_a_checkpoint_that_cannot_be_written_says_so(tmp_path):
     with refusal(r"gone.*cannot write the checkpoint"):
-        checkpoint.write(tmp_path / "gone" / "field.safetensors", {}, {})
+        checkpoint.write(tmp_path / "gone/field.safetensors", {}, {})
 
 
 def test_a_random_background_is_one_colour_for_a_ray_and_its_truth(ball_scene):

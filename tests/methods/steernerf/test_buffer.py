@@ -21,7 +21,7 @@ from tests.common import assert_near
 from tests.methods.conftest import Work, look_at_the_middle
 from tests.methods.solids import Solid, ball, wall
 
-RELEASE = np.load(Path(__file__).parents[2] / "data" / "steernerf_release.npz")
+RELEASE = np.load(Path(__file__).parents[2] / "data/steernerf_release.npz")
 """Two frames of 10 x 12 pixels, brought into a third of 40 x 48 by the released code."""
 
 

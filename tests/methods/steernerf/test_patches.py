@@ -88,7 +88,7 @@ def test_distilled_views_are_found_again_without_rendering(
     assert same(views_of(trained, ball_scene, tmp_path), first)
     with pytest.raises(NameError, match="render_frame"):
         views_of(trained, ball_scene, tmp_path / "elsewhere")
-    left = (tmp_path / "elsewhere" / "stages").glob("*/*")
+    left = (tmp_path / "elsewhere/stages").glob("*/*")
     assert [path.name for path in left] == ["lock"]
     # The seed alone decides which they are.
     monkeypatch.undo()

@@ -66,16 +66,13 @@ def test_what_is_remembered_without_drawing_is_the_same(monkeypatch):
         assert torch.equal(getattr(rendered[0], name), getattr(remembered[0], name))
 
 
-def test_after_a_reset_a_sequence_repeats_bit_for_bit():
-    """And until then the newest frames are remembered, newest first."""
+def test_the_newest_frames_are_remembered_newest_first():
     pipeline, buffer = new_pipeline(), Buffer(maxlen=2)
     cameras = [look_at_the_middle(0.1 + 0.003 * i, 0.3) for i in range(4)]
-    first = [pipeline.render(camera, buffer, USUAL, NullProbe()).rgb for camera in cameras]
+    for camera in cameras:
+        pipeline.render(camera, buffer, USUAL, NullProbe())
     kept = [pipeline.view(camera).low.c2w for camera in (cameras[3], cameras[2])]
-    assert all(torch.equal(old.camera.c2w, c2w) for old, c2w in zip(buffer, kept, strict=True))
-    buffer.clear()
-    second = [pipeline.render(camera, buffer, USUAL, NullProbe()).rgb for camera in cameras]
-    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+    assert all(map(torch.equal, kept, [cloud.camera.c2w for cloud in buffer]))
 
 
 def test_range_reduction_reprojects_the_depth_that_it_is_told_to():

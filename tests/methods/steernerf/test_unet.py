@@ -18,7 +18,7 @@ from tests.common import assert_near, seeded
 from tests.methods.conftest import look_at_the_middle
 from tests.methods.models import shaken
 
-RELEASE = np.load(Path(__file__).parents[2] / "data" / "steernerf_release.npz")
+RELEASE = np.load(Path(__file__).parents[2] / "data/steernerf_release.npz")
 """What the released code computes on the formulas below."""
 
 POINTS = 20

@@ -60,6 +60,11 @@ def test_depth_is_finite_exactly_where_there_is_opacity():
     assert ((frame.rgb >= 0) & (frame.rgb <= 1 + 1e-6)).all()
 
 
+def hits(part: Part, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+    local = (origins - torch.tensor(part.centre)) @ part.frame, directions @ part.frame
+    return part.shape.hit(*(x.unbind(-1) for x in local))
+
+
 @pytest.mark.parametrize("model", [totem, wires])
 @pytest.mark.parametrize("eye", [(1.0, -3.5, 1.5), (0.3, 0.2, 0.3), (0.0, 0.1, 4.0)])
 def test_the_nearest_of_all_parts_is_seen(monkeypatch, model, eye):
@@ -67,11 +72,8 @@ def test_the_nearest_of_all_parts_is_seen(monkeypatch, model, eye):
     monkeypatch.setattr(raytrace, "BAND_RAYS", 40 * 6)  # bands of six rows, the last of four
     depth = render(solids, camera, samples=1).depth.flatten()
     rays = cast(camera)
-    nearest = torch.full_like(depth, math.inf)
-    for part in solids.parts:
-        origins = (rays.origins - torch.tensor(part.centre)) @ part.frame
-        directions = rays.directions @ part.frame
-        nearest = nearest.minimum(part.shape.hit(origins.unbind(1), directions.unbind(1)))
+    met = [hits(part, rays.origins, rays.directions) for part in solids.parts]
+    nearest = torch.stack(met).amin(dim=0)
     # Only rounding may differ, and it can turn a ray that grazes an edge.
     differing = (nearest - depth).abs() > 1e-4  # not where both are infinite
     assert differing.sum() <= 2
@@ -87,9 +89,7 @@ def test_shadows_are_those_of_all_parts_but_of_a_convex_one_on_itself(model):
     assert math.hypot(*LIGHT) == pytest.approx(1, abs=1e-6)
     dark = torch.zeros(6000, dtype=torch.bool)
     for number, part in enumerate(solids.parts):
-        origins = (points - torch.tensor(part.centre)) @ part.frame
-        light = torch.tensor(LIGHT) @ part.frame
-        found = part.shape.hit(origins.unbind(1), light.unbind(0)).isfinite()
+        found = hits(part, points, torch.tensor(LIGHT)).isfinite()
         dark |= found & ((owners != number) | isinstance(part.shape, Carved))
     # Rounding can turn a ray that grazes an edge.
     assert (solids.shadowed(owners, points) != dark).sum() <= 1
