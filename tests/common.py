@@ -1,6 +1,9 @@
 """What tests of all packages say in the same words."""
 
+import json
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -16,6 +19,14 @@ def seeded(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def refusal(message: str) -> pytest.RaisesExc[SteerbenchError]:
-    """In here something is refused with a SteerbenchError that says `message`, a pattern."""
-    return pytest.raises(SteerbenchError, match=message)
+def refusal(message: str, kind: type[Exception] = SteerbenchError) -> pytest.RaisesExc[Exception]:
+    """In here something is refused with an error that says `message`, a pattern."""
+    return pytest.raises(kind, match=message)
+
+
+def read_json(path: Path) -> Any:
+    return json.loads(path.read_text())
+
+
+def write_json(path: Path, record: Any) -> None:
+    path.write_text(json.dumps(record))

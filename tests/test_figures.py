@@ -95,7 +95,7 @@ def test_documents_get_tables_pictures_and_where_they_are_from(checkout, capsys)
 
 
 def test_what_is_of_the_same_code_is_used_again_and_named_otherwise(checkout, capsys):
-    def said(*words: str) -> str:
+    def said(*words):
         figures.main(["--only", "run", *words])
         return capsys.readouterr().err
 

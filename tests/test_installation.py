@@ -66,7 +66,7 @@ def steerbench(installed, tmp_path):
     """Call it in an empty folder; what it printed."""
     elsewhere = {name: x for name, x in os.environ.items() if name != "PYTHONPATH"}
 
-    def call(*words: str, **more: str) -> str:
+    def call(*words, **more):
         given = {"cwd": tmp_path, "env": elsewhere | more, "text": True, "timeout": 900}
         ran = subprocess.run([installed, *words], capture_output=True, **given)
         assert ran.returncode == 0, ran.stderr

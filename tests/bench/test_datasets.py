@@ -59,7 +59,7 @@ def test_a_failed_download_says_why_and_leaves_nothing(web, tmp_path, quiet_log,
     web.files |= files
     web.breaks_after = end
     digest = hashlib.sha256(CONTENT).hexdigest()
-    with pytest.raises(Unavailable, match=said):
+    with refusal(said, Unavailable):
         fetch(web.address + "file", tmp_path / "file", digest, quiet_log)
     assert found(tmp_path) == {}
 
@@ -68,7 +68,7 @@ def test_without_a_connection_the_message_says_so_in_two_words(tmp_path, quiet_l
     nobody = socket.create_server(("127.0.0.1", 0))
     address = f"http://127.0.0.1:{nobody.getsockname()[1]}/file"
     nobody.close()
-    with pytest.raises(Unavailable, match=r"/file failed \(no connection\)$"):
+    with refusal(r"/file failed \(no connection\)$", Unavailable):
         fetch(address, tmp_path / "file", None, quiet_log)
 
 
@@ -114,7 +114,7 @@ WRONG = {
 def test_a_wrong_archive_leaves_nothing_behind(monkeypatch, web, tmp_path, quiet_log, archive):
     data = publish(monkeypatch, FILES, archive=web.address + "{scene}.zip")
     web.files["/mic.zip"] = archive
-    with pytest.raises(Unavailable, match=r"mic.zip: expected"):
+    with refusal(r"mic.zip: expected", Unavailable):
         get(data, "mic", tmp_path, quiet_log)
     assert found(tmp_path) == {}
 

@@ -1,6 +1,5 @@
 """What is exported for other programs, our own loaders read back as it was."""
 
-import json
 import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,7 +16,7 @@ from bench.scenes import blender, colmap, embedded
 from bench.scenes.export import data_camera
 from bench.trajectories import Trajectory, follow, orbit, smooth
 from bench.types import Camera, Scene, composite
-from tests.common import assert_near, refusal
+from tests.common import assert_near, read_json, refusal
 
 
 @pytest.fixture
@@ -56,7 +55,7 @@ def test_the_layout_of_nerfbaselines_comes_back_with_its_path(scene, path, tmp_p
     assert (found.unit_length, found.origin.tolist()) == (scene.unit_length, scene.origin.tolist())
     cameras = (given.splits["train"].cameras for given in (found, scene))
     assert all(torch.equal(a.c2w, b.c2w) for a, b in zip(*cameras, strict=True))
-    about = json.loads((tmp_path / "out/nb-info.json").read_text())
+    about = read_json(tmp_path / "out/nb-info.json")
     assert (about["id"], about["scene"]) == ("steerbench", scene.name)
     steps = follow(scene, str(tmp_path / "out/path.json")).steps
     for step, other in zip(steps, path.steps, strict=True):

@@ -25,8 +25,7 @@ def write(folder: Path, images: dict[str, Tensor]) -> Path:
 
 
 def noise(channels: int = 3, size: tuple[int, int] = (16, 20), seed: int = 0) -> Tensor:
-    generator = seeded(seed)
-    return torch.randint(256, (*size, channels), dtype=torch.uint8, generator=generator)
+    return torch.randint(256, (*size, channels), dtype=torch.uint8, generator=seeded(seed))
 
 
 GREY = torch.full((16, 20, 3), 100, dtype=torch.uint8)

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
 
 from bench.cameras import scale_camera
 from bench.metrics import psnr, quantise
@@ -70,7 +69,7 @@ def test_masked_pixels_are_not_scored_unless_the_protocol_says_so(device):
     wrong = composite(truth, torch.ones(3)) + 0.2 * (~mask[..., None]).to(device)
     near = quantise(wrong + 8 / 255 * (torch.arange(16, device=device)[:, None, None] < 6))
 
-    def scored(rgb: Tensor, mask: Tensor | None, use: str = "scene") -> dict[str, float]:
+    def scored(rgb, mask, use="scene"):
         protocol = replace(QUICK, name="mine", mask=use, colour_correction="affine")
         return Scoring(protocol, {}, torch.ones(3), ()).score(0, rgb, truth, cut=True, mask=mask)
 

@@ -91,16 +91,14 @@ def test_a_smooth_path_is_even_also_where_cameras_only_move():
     when they turn by as much."""
     scene = orbit_of([0, 0, 0])
     test = scene.splits["test"]
-    first, *others = test.cameras
-    moves = (0.2 * first.c2w[:, 0], 0.2 * first.c2w[:, 0] + 0.1 * first.c2w[:, 2])
-    cameras = [first]
-    for other, move in zip(others, moves, strict=True):
-        pose = other.c2w + torch.cat((torch.zeros(3, 3), move[:, None]), dim=1)
-        cameras.append(replace(other, c2w=pose))
-    splits = {"test": replace(test, cameras=cameras)}
-    path = smooth(replace(scene, splits=splits))
+    right, _, ahead, _ = test.cameras[0].c2w.T
+    for camera, move in zip(
+        test.cameras[1:], (0.2 * right, 0.2 * right + 0.1 * ahead), strict=True
+    ):
+        camera.c2w[:, 3] += move
     # atan(0.1) is 5.7 degrees, atan(0.05) 2.9.
-    assert [step.truth for step in path.steps] == [0, *[None] * 5, 1, *[None] * 2, 2]
+    truths = [step.truth for step in smooth(scene).steps]
+    assert truths == [0, *[None] * 5, 1, *[None] * 2, 2]
 
 
 def test_a_static_path_stays_where_it_is_and_an_orbit_takes_the_first_cameras():

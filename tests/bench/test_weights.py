@@ -49,10 +49,10 @@ def test_weights_with_their_published_name_are_read_unless_damaged(tmp_path, wei
     assert path == tmp_path / name
     assert torch.equal(features["features.0.weight"], STATE["features.0.weight"])
     (tmp_path / name).write_bytes(content[:-1] + b"?")
-    with pytest.raises(Unavailable, match=f"{name}: expected a SHA-256 that begins with"):
+    with refusal(f"{name}: expected a SHA-256 that begins with", Unavailable):
         locate("alex", tmp_path, quiet_log)
     (tmp_path / "alexnet_features.pth").write_bytes(content[:100])
-    with pytest.raises(Unavailable, match=r"alexnet_features.pth: expected a torch state dict"):
+    with refusal(r"alexnet_features.pth: expected a torch state dict", Unavailable):
         load_features("alex", tmp_path, quiet_log)
 
 
@@ -83,7 +83,7 @@ def test_a_failed_download_says_what_to_do_and_hinders_neither_others_nor_a_seco
 def test_downloaded_weights_are_kept_if_right(tmp_path, publisher, weights, quiet_log):
     name, content = weights
     publisher.files[f"/{name}"] = content[:-1]
-    with pytest.raises(Unavailable, match="SHA-256"):
+    with refusal("SHA-256", Unavailable):
         locate("alex", None, quiet_log)
     assert not (cache(tmp_path) / name).exists()
     publisher.files[f"/{name}"] = content

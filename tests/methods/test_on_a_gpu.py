@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
-import pandas as pd
 import pytest
 import torch
 
@@ -172,7 +171,7 @@ def products_of_bfloat16(monkeypatch) -> Iterator[None]:
 
 @pytest.mark.usefixtures("products_of_bfloat16")
 def test_with_products_of_bfloat16_it_trains_and_renders_as_on_the_cpu(scene, tmp_path):
-    def drawn(device: str) -> list[torch.Tensor]:
+    def drawn(device):
         assert multiplies_bf16(device)
         return frames(fitted("steernerf", device, scene, tmp_path), scene)
 
@@ -180,7 +179,7 @@ def test_with_products_of_bfloat16_it_trains_and_renders_as_on_the_cpu(scene, tm
 
 
 def test_its_rows_are_those_of_the_cpu(scene, tmp_path):
-    def rows(device: str) -> pd.DataFrame:
+    def rows(device):
         """All but times and peak memory."""
         method = METHODS["ngp"](device=device, backend="reference")
         protocol = replace(QUICK, warmup=0)
@@ -207,7 +206,7 @@ def test_killed_in_stage_2_it_goes_on_as_if_it_had_not_been(gpu, scene, tmp_path
 
 @pytest.mark.parametrize("places", [("cuda", "cpu"), ("cpu", "cuda")])
 def test_what_was_trained_at_one_place_goes_on_at_the_other(gpu, places, scene, tmp_path):
-    def training(device: str) -> FieldTraining:
+    def training(device):
         field = HashField(GRID, backend="reference", generator=seeded(0)).to(device)
         return FieldTraining(field, scene, BUDGET, STAGE1, seed=0)
 
@@ -252,14 +251,14 @@ def test_a_step_of_stage_2_waits_a_few_times(gpu, scene, tmp_path, monkeypatch):
     """For the rays, their samples, the visible ones and the errors."""
     advance, counts = JointTraining.advance, []
 
-    def counted(training: JointTraining) -> dict[str, float]:
+    def counted(training):
         with device_waits() as waits:
             errors = advance(training)
         counts.append(waits.total())
         assert bool(errors) == (training.step > 1)  # those of the step before
         return errors
 
-    def apart(remember: Callable[..., None], *args: Any) -> None:
+    def apart(remember, *args):
         with device_waits():
             remember(*args)
 
@@ -301,7 +300,7 @@ def test_by_triton_it_trains_and_renders_as_on_the_cpu(name, ball_scene, tmp_pat
     tiny = replace(ball_scene, splits=splits)
     budget = replace(BUDGET, steps=1, samples=64, renderer_steps=1)
 
-    def drawn(device: str) -> list[torch.Tensor]:
+    def drawn(device):
         method = smallest(name, device=device, backend="gpu")
         method.fit(tiny, budget, ConsoleLog(tmp_path / device, quiet=True))
         return frames(method, tiny)
@@ -316,10 +315,10 @@ def test_by_triton_it_trains_and_renders_as_on_the_cpu(name, ball_scene, tmp_pat
 @pytest.mark.usefixtures("products_of_bfloat16")
 def test_steps_and_frames_are_few_launches(gpu, ball_scene, tmp_path, monkeypatch):
     """Each takes some microseconds, whatever it computes."""
-    steps: list[int] = []
+    steps = []
     advance, march = FieldTraining.advance, Mock(wraps=frame.march)
 
-    def advanced(training: FieldTraining) -> dict[str, float]:
+    def advanced(training):
         before = gpu.launched
         errors = advance(training)
         steps.append(gpu.launched - before)

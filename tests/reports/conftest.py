@@ -1,6 +1,5 @@
 """Rows whose figures are known, several runs, and runs with other figures."""
 
-import json
 import math
 import shutil
 from collections.abc import Mapping
@@ -17,6 +16,7 @@ from bench.sharing import write_sums
 from reports.paper_tables import PaperTable, Place
 from reports.runs import Repeated, Run, load_runs
 from sweeps.tables import chosen
+from tests.common import read_json, write_json
 
 TABLES = {table.name: table for table in chosen()}
 """Those of the paper."""
@@ -112,7 +112,7 @@ def run(store, stored_run) -> Run:
 
 @pytest.fixture
 def drawn(monkeypatch) -> list[Figure]:
-    figures: list[Figure] = []
+    figures = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
     return figures
 
@@ -120,10 +120,10 @@ def drawn(monkeypatch) -> list[Figure]:
 def rewrite(store: Store, key: str, **others: object) -> None:
     """Change the record of a stored run; `machine` and `scene` are changed in part."""
     path = store.folder / key / "record.json"
-    record = json.loads(path.read_text())
+    record = read_json(path)
     for name, value in others.items():
         record[name] = {**record.get(name, {}), **value} if isinstance(value, dict) else value
-    path.write_text(json.dumps(record))
+    write_json(path, record)
     write_sums(path.parent)
 
 

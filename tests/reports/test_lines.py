@@ -17,7 +17,7 @@ PLACE = {"machine": {"cpu": "EPYC", "threads": 2, "gpus": []}, "scene": {"digest
 def make(rows):
     """Makes a run of a method with settings and a seed; `facts` are those of its rows."""
 
-    def make_run(settings: dict, seed: int = 0, psnr: float = 30.0, typed="", **facts: str):
+    def make_run(settings, seed=0, psnr=30.0, typed="", **facts):
         own = rows.assign(**{**FACTS, "seed": seed, **facts})
         own.loc[own["metric"] == "psnr", "value"] = psnr
         name = own["method"].iloc[0]

@@ -1,13 +1,11 @@
 """The page about the paper's tables, and the plots of all pages."""
 
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
 
 from reports import figures
-from reports.images import Picture
 from reports.lines import Lines
 from reports.paper_page import PAGE, write_paper_page
 from reports.paper_tables import Line, PaperTable, Place
@@ -29,7 +27,7 @@ def test_every_line_that_is_shown_in_a_figure_is_one_of_the_tables():
 
 
 def test_the_page_has_every_table_and_every_figure(run, tmp_path):
-    measured: dict[Place, Repeated] = {}
+    measured = {}
     for table in TABLES.values():
         measured |= measured_of(table, dict.fromkeys(table.lines, run))
     page = write_paper_page([*TABLES.values()], measured, tmp_path)
@@ -49,10 +47,10 @@ def test_a_method_has_one_mark_at_its_first_measured_line_and_an_added_one_is_in
 ):
     (table,) = chosen("table1", methods=["x"])
     measured = measured_of(table, dict.fromkeys(table.lines.keys() - {"bf16"}, run))
-    drawn: list[list[str]] = []
+    drawn = []
     real = figures.quality_plot
 
-    def watched(shown: Sequence[Repeated], metric: str) -> Picture:
+    def watched(shown, metric):
         drawn.append([line.label for line in shown])
         return real(shown, metric)
 

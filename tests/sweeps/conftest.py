@@ -61,7 +61,7 @@ def steerbench(elsewhere, monkeypatch, capfd) -> Callable[..., Outcome]:
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # which `run` sets: restored after the test
     monkeypatch.setattr(sys, "argv", ["steerbench"])
 
-    def call(*argv: str) -> Outcome:
+    def call(*argv):
         try:
             status = cli.guard(cli.dispatch, list(argv))
         except SystemExit as ended:  # argparse and Hydra leave this way after --help
@@ -80,10 +80,10 @@ def run(steerbench) -> Callable[..., Outcome]:
 @pytest.fixture
 def launched(monkeypatch) -> list[int]:
     """How many jobs Hydra's usual launcher was handed, each time."""
-    counts: list[int] = []
+    counts = []
     launch = BasicLauncher.launch
 
-    def noted(self, jobs, initial_job_idx: int):
+    def noted(self, jobs, initial_job_idx):
         counts.append(len(jobs))
         return launch(self, jobs, initial_job_idx)
 
@@ -96,7 +96,7 @@ def spawn(tmp_path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
     """Start `steerbench run` with the stand-ins as a process of its own in `tmp_path`; what still
     runs after the test is killed."""
 
-    def start(*argv: str) -> subprocess.Popen[str]:
+    def start(*argv):
         process = subprocess.Popen(
             [Path(sys.executable).with_name("steerbench"), "run", *STAND_INS, *argv],
             cwd=tmp_path,

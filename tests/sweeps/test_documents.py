@@ -134,7 +134,7 @@ def test_the_workflow_and_the_test_of_the_document_pass(steerbench, tmp_path, mo
     assert Path("check.xml").is_file()
 
     (test,) = re.findall(r"```python\n(import pytest.*?)```", text, re.DOTALL)
-    names: dict[str, Any] = {}
+    names = {}
     exec(test, names)
     ((_, cases),) = [mark.args for mark in names["test_nothing_became_worse"].pytestmark]
     assert "psnr" in [one.metric for one in cases]

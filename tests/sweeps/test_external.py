@@ -1,6 +1,5 @@
 """Programs in other processes, from the command line: their rows, and their ends."""
 
-import json
 import math
 import os
 import re
@@ -12,6 +11,7 @@ import pandas as pd
 import psutil
 import pytest
 
+from tests.common import read_json
 from tests.sweeps.conftest import CONFIGS, HERE, QUICK
 from tests.sweeps.test_documents import DOCS, ROOT, write_files
 from tests.sweeps.test_render import pictures
@@ -40,7 +40,7 @@ def write(tmp_path):
     """Write `worker.py`: `GREY`, then further lines."""
     shutil.copy(ROOT / "steerbench_worker.py", tmp_path)
 
-    def write(lines: str = "") -> None:
+    def write(lines=""):
         (tmp_path / "worker.py").write_text(f"{dedent(GREY)}\n{dedent(lines)}\nserve(Grey)\n")
 
     return write
@@ -77,7 +77,7 @@ def test_the_worker_of_the_document_is_a_row_of_ten_lines(steerbench, documented
     assert set(table["backend"]) == {"external"}
     assert set(table["method"]) == {"Mean"}
     (record,) = tmp_path.glob("outputs/runs/*/record.json")
-    assert json.loads(record.read_text())["times"].startswith("read by the process that rendered")
+    assert read_json(record)["times"].startswith("read by the process that rendered")
 
 
 def test_another_worker_or_another_option_is_another_run(run, write, tmp_path):

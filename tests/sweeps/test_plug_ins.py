@@ -4,7 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import MappingProxyType
 
@@ -114,7 +114,7 @@ def plugged(tmp_path, monkeypatch) -> Iterator[Callable[..., Path | str]]:
     """Install a package `other` with an entry point of a value, and files of its folder."""
     monkeypatch.syspath_prepend(tmp_path / "site")
 
-    def install(value: str, files: Mapping[str, str] = MappingProxyType({})) -> Path | str:
+    def install(value, files=MappingProxyType({})):
         info = {
             "METADATA": "Metadata-Version: 2.1\nName: other\nVersion: 2.0\n",
             "entry_points.txt": f"[{PLUG_INS}]\nother = {value}\n",

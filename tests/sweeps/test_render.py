@@ -1,6 +1,5 @@
 """`steerbench render`: the pictures of a path, again from its own file, next to another method."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ from PIL import Image
 from bench.paths import write_path
 from bench.results import Store
 from methods.gaussians import ply
+from tests.common import read_json, write_json
 from tests.methods.gaussians.test_ply import some
 
 SCENE = ("scene=totem", "scene.width=24", "scene.train=3", "scene.test=3")
@@ -34,7 +34,7 @@ def test_every_frame_of_a_run_is_written_and_its_path_can_be_followed_and_timed(
     kept = Path("outputs/runs") / run / "pictures/0000-rendered.png"
     assert np.array_equal(np.asarray(Image.open(kept)), there[0])
 
-    path = json.loads(Path("there/path.json").read_text())
+    path = read_json(Path("there/path.json"))
     assert len(path["camera_path"]) == 2
     words = ["--run", run, "--path", "there/path.json", "--beside", "ngp", "--to", "again"]
     steerbench("render", *words).ok()
@@ -60,6 +60,6 @@ def test_a_ply_file_and_a_path_need_no_scene(steerbench, tiny_scene):
     assert [picture.shape for picture in pictures("there")] == [(32, 40, 3)] * 2
     assert not Path("outputs").exists()  # where an embedded scene would be
     frame = {"transform_matrix": torch.eye(4).tolist(), "camera_angle_x": 0.7}
-    Path("bare.json").write_text(json.dumps({"frames": [frame]}))
+    write_json(Path("bare.json"), {"frames": [frame]})
     said = steerbench("render", *words, "--path", "bare.json").refused()
     assert "frames[0]: expected w and h, or scene=" in said

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import steerbench as python
-from tests.common import refusal
+from tests.common import read_json, refusal
 from tests.sweeps.conftest import CONFIGS, STAND_INS
 
 
@@ -22,7 +22,7 @@ def stored(tmp_path: Path) -> list[Path]:
 
 
 def records(tmp_path: Path) -> list[dict[str, Any]]:
-    return [json.loads((folder / "record.json").read_text()) for folder in stored(tmp_path)]
+    return [read_json(folder / "record.json") for folder in stored(tmp_path)]
 
 
 def test_a_run_prints_its_table_and_is_stored_and_not_measured_again(run, tmp_path):

@@ -28,7 +28,7 @@ def folders(tmp_path) -> tuple[str, str]:
 def scored(steerbench, folders) -> Callable[..., str]:
     """Score a folder of pictures against the true ones; the key of the run."""
 
-    def score(folder: str, *words: str) -> str:
+    def score(folder, *words):
         outcome = steerbench("score", folder, "--truth", "true", *QUICK, *words).ok()
         return re.search(r"run (\w+)", outcome.out)[1]
 

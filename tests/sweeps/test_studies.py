@@ -16,7 +16,7 @@ from sweeps.commands.study import decibels
 from sweeps.overrides import engine_kinds
 from sweeps.studies import subjects
 from tests.common import refusal
-from tests.sweeps.conftest import QUICK, STAND_INS, Outcome
+from tests.sweeps.conftest import QUICK, STAND_INS
 
 ROUNDS = ["trajectory=test", "engine=torch", "protocol=study-1", "protocol.rounds=2"]
 TORCH = [f"torch, {precision}" for precision in engine_kinds(())["torch"].precisions]
@@ -24,7 +24,7 @@ TORCH = [f"torch, {precision}" for precision in engine_kinds(())["torch"].precis
 
 @pytest.fixture
 def study(steerbench):
-    def call(command: str, method: str, *argv: str) -> Outcome:
+    def call(command, method, *argv):
         return steerbench(command, *STAND_INS, *ROUNDS, f"method={method}", *argv)
 
     return call
@@ -96,7 +96,7 @@ def test_a_study_that_was_killed_measures_the_other_half(study, monkeypatch):
 
     measure, measured = measurement.measure, []
 
-    def killed_at(limit: int):
+    def killed_at(limit):
         def call(methods, task, log, guard):
             if len(measured) == limit:
                 raise KeyboardInterrupt
@@ -126,7 +126,7 @@ def test_what_cannot_be_used_is_left_out_unless_all_are_compared_with_it(study, 
     make = stand_ins.Shades.__init__
 
     @functools.wraps(make)
-    def made(self, **settings) -> None:
+    def made(self, **settings):
         if settings["level"] == absent:
             raise Unavailable("it is not installed")
         make(self, **settings)

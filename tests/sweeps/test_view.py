@@ -1,7 +1,6 @@
 """`steerbench view`, by a stand-in for a browser that speaks viser's protocol."""
 
 import io
-import json
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -15,6 +14,7 @@ from PIL import Image
 from sweeps import cli
 from sweeps.commands import view
 from sweeps.commands.view import AS_GIVEN, Viewer
+from tests.common import read_json
 
 from .conftest import STAND_INS
 from .test_external import documented  # noqa: F401 (a fixture)
@@ -89,7 +89,7 @@ def browser(viewer: Viewer) -> Iterator[Page]:
 def opened(steerbench, tmp_path) -> Iterator[Callable[..., Viewer]]:
     viewers = []
 
-    def open_(*words: str) -> Viewer:
+    def open_(*words):
         options = cli.parsed(["view", "--port", "18080", *STAND_INS, *words])
         viewers.append(view.opened(options))
         return viewers[-1]
@@ -139,7 +139,7 @@ def test_a_recorded_path_can_be_measured(opened, steerbench):
         page.choose("record a path", False)
         page.until(lambda: not path)
     (file,) = Path("outputs/view").glob("*.json")
-    assert len(json.loads(file.read_text())["camera_path"]) == 3
+    assert len(read_json(file)["camera_path"]) == 3
     steerbench("run", *STAND_INS, "trajectory=path", f"trajectory.path={file}").ok()
 
 
@@ -150,7 +150,7 @@ def test_a_browser_that_leaves_in_the_middle_of_a_frame_takes_nothing_with_it(op
     with browser(viewer) as page:
         whole = type(method).render
 
-        def interrupted(self: Any, *args: Any) -> Any:
+        def interrupted(self, *args):
             page.close()
             assert left.wait(TICK_S * ROUNDS)
             return whole(self, *args)

@@ -62,7 +62,7 @@ def test_a_validation_split_has_all_its_pictures_or_none(blender_folder, log):
 
 
 def test_the_digest_depends_on_content_and_options_not_on_the_place(blender_folder, tmp_path, log):
-    def digest(**options) -> str:
+    def digest(**options):
         return blender.load(copy, **options, log=log).digest
 
     copy = tmp_path / "elsewhere/chair"

@@ -21,6 +21,7 @@ from bench.scenes import blender, nsvf, transforms
 from bench.scenes.images import decode_bytes
 from bench.types import Scene, SteerbenchError
 from tests.bench.scenes.conftest import encoded, png
+from tests.common import write_json
 
 QUIET = ConsoleLog(Path(), quiet=True)
 IN_ONE_FOLDER = settings(
@@ -138,7 +139,7 @@ def folder(tmp_path_factory) -> Path:
     for name in ("0_a", "0_b", "2_c"):
         (root / f"rgb/{name}.png").write_bytes(encoded("RGBA", "PNG"))
         (root / f"pose/{name}.txt").write_text(TEXTS["pose/0_a.txt"])
-    (root / "transforms_test.json").write_text(json.dumps(RECORD))
+    write_json(root / "transforms_test.json", RECORD)
     return root
 
 

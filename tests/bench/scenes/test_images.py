@@ -14,7 +14,6 @@ from bench.scenes.assemble import describe_splits
 from bench.scenes.images import (
     MOST_PIXELS,
     Pictures,
-    ScaledView,
     View,
     decode_bytes,
     describe,
@@ -167,7 +166,7 @@ def pictures(files: list[Path], log) -> Pictures:
 def test_only_pictures_that_are_asked_for_are_decoded_and_once(files, log, monkeypatch):
     opened = []
 
-    def decode(picture: ScaledView) -> torch.Tensor:
+    def decode(picture):
         opened.append(picture.view.name)
         return images.decode_bytes(picture.view.path.read_bytes(), picture.view.path)
 

@@ -1,6 +1,5 @@
 """Captures: intrinsics by frame, missing pictures, lens distortion, and what is refused."""
 
-import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,7 +19,7 @@ from bench.scenes.files import Fields
 from bench.scenes.images import Fisheye, RadialTangential, undistort, undistorted_camera
 from bench.types import Camera
 from tests.bench.scenes.conftest import edit_json, picture, pose
-from tests.common import refusal
+from tests.common import refusal, write_json
 
 
 @pytest.fixture
@@ -33,7 +32,7 @@ def folder(tmp_path) -> Path:
         Image.fromarray(picture(k, channels=3)).save(root / f"images/{k:03}.png")
         frames.append({"file_path": f"images/{k:03}.png", "transform_matrix": pose(k)})
     record = {"fl_x": 9.0, "fl_y": 8.0, "cx": 4.5, "cy": 2.5, "w": 8, "h": 6, "aabb_scale": 2}
-    (root / "transforms.json").write_text(json.dumps({**record, "frames": frames}))
+    write_json(root / "transforms.json", {**record, "frames": frames})
     return root
 
 
@@ -193,7 +192,7 @@ def test_the_cube_is_that_of_instant_ngp(folder, log, given, override, side, y):
 
 
 def test_an_object_in_a_file_without_a_cube_is_where_the_cameras_are(folder, log):
-    def change(record: dict) -> None:
+    def change(record):
         del record["aabb_scale"]
         for frame in record["frames"]:
             frame["transform_matrix"][0][3] += 40

@@ -1,13 +1,12 @@
 """What the tests of engines share."""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import pytest
 import torch
-from torch import Tensor, nn
 
-from methods.engines import Built, Engine
+from methods.engines import Built
 from tests.methods.engines import tensorrt_double
 
 
@@ -15,13 +14,11 @@ from tests.methods.engines import tensorrt_double
 def build(tmp_path, quiet_log) -> Callable[..., Built]:
     """Builds a network with an engine from the inputs of some frames, in a folder."""
 
-    def built(
-        engine: Engine, network: nn.Module, samples: Sequence[Tensor] | None, folder: str = ""
-    ) -> Built:
+    def built(engine, network, samples, folder=""):
         place = tmp_path / folder
         place.mkdir(exist_ok=True)
 
-        def frames() -> Sequence[Tensor]:
+        def frames():
             assert samples is not None, "the frames are not needed again"
             return samples
 

@@ -91,17 +91,17 @@ def test_a_build_belongs_to_its_gpu_and_version(double, monkeypatch):
 
 @pytest.mark.parametrize("device", ["cpu", "cuda:1"])
 def test_what_is_not_the_first_gpu_is_refused(device, double):
-    with pytest.raises(Unavailable, match=f"this is device={device}: use device=cuda"):
+    with refusal(f"this is device={device}: use device=cuda", Unavailable):
         TensorRt("fp16").check(torch.device(device))
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="for a machine without a GPU")
 def test_without_a_gpu_that_is_the_reason_and_not_a_library():
-    with pytest.raises(Unavailable, match="torch sees none here: use engine=openvino"):
+    with refusal("torch sees none here: use engine=openvino", Unavailable):
         TensorRt("fp16")
 
 
 def test_without_tensorrt_the_command_that_installs_it_is_named(double, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorrt", None)
-    with pytest.raises(Unavailable, match=r'pip install .*"\.\[tensorrt\]"'):
+    with refusal(r'pip install .*"\.\[tensorrt\]"', Unavailable):
         TensorRt("fp16")

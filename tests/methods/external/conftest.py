@@ -31,7 +31,7 @@ def worker(tmp_path) -> Callable[..., Path]:
     """Write a worker: `GREY`, then further lines, the last of which serves `Grey`."""
     folder = tmp_path / "worker"
 
-    def write(lines: str = "", before: str = GREY, after: str = "serve(Grey)\n") -> Path:
+    def write(lines="", before=GREY, after="serve(Grey)\n"):
         folder.mkdir(exist_ok=True)
         shutil.copy(ROOT / "steerbench_worker.py", folder)
         (folder / "grey.py").write_text(dedent(before) + dedent(lines) + after)
@@ -44,7 +44,7 @@ def worker(tmp_path) -> Callable[..., Path]:
 def external() -> Iterator[Callable[..., External]]:
     """Make methods whose processes have ended after the test."""
 
-    def make(command: object, **settings) -> External:
+    def make(command, **settings):
         usual = {"python": None, "options": {}, "files": [], "lock": None, "seed": 3}
         usual |= {"environment": {}, "folders": []}
         limits = {"start_s": 60.0, "fit_s": 60.0, "frame_s": 60.0}

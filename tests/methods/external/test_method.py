@@ -1,6 +1,5 @@
 """A renderer in another process as a method: what it learns from, and what comes back."""
 
-import json
 from dataclasses import replace
 from textwrap import dedent
 
@@ -15,7 +14,7 @@ from bench.scenes.assemble import hold_out
 from bench.study import Variant
 from bench.types import Budget, NullProbe, SteerbenchError
 from methods.gaussians import ply
-from tests.common import assert_near, refusal
+from tests.common import assert_near, read_json, refusal
 from tests.methods.gaussians.test_ply import some
 
 BUDGET = Budget("test", steps=7, samples=9)
@@ -121,7 +120,7 @@ def test_it_sees_only_training_pictures(worker, external, moved_scene, quiet_log
             assert torch.equal(one, other)
     (kept,) = tmp_path.glob("outputs/stages/*/output.txt")
     bounds = [[-1.5] * 3, [1.5] * 3]
-    assert json.loads(kept.read_text()) == [7, 9, 3, bounds, 7]
+    assert read_json(kept) == [7, 9, 3, bounds, 7]
 
 
 def test_what_it_stores_is_loaded_and_a_knob_needs_no_training(
@@ -152,7 +151,7 @@ def test_what_it_was_trained_with_makes_another_training(
     more = tmp_path / "more"
     more.mkdir()
 
-    def stages(**settings) -> int:
+    def stages(**settings):
         external(path, **settings).fit(tiny_scene, BUDGET, quiet_log)
         return len(list(tmp_path.glob("outputs/stages/external-*")))
 

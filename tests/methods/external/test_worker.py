@@ -109,10 +109,10 @@ def render(method: External, scene: Scene, log: Log) -> None:
 @pytest.fixture
 def started(monkeypatch) -> list[psutil.Process]:
     """The processes of all workers, and those that these have started."""
-    processes: list[psutil.Process] = []
+    processes = []
     end = Worker._end
 
-    def noted(worker: Worker) -> None:
+    def noted(worker):
         if not worker._output.closed and worker._process.poll() is None:
             this = psutil.Process(worker._process.pid)
             processes.extend((this, *this.children(recursive=True)))
@@ -200,7 +200,7 @@ def test_what_is_no_command_is_refused(external, command):
 
 
 def test_what_is_no_program_is_an_error_about_the_command(external):
-    with pytest.raises(Unavailable, match=r"method\.command: cannot start 'no-such-program'"):
+    with refusal(r"method\.command: cannot start 'no-such-program'", Unavailable):
         _ = external("no-such-program --fast").name
 
 

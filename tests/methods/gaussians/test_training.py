@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from bench.types import Rays, Scene
+from bench.types import Scene
 from methods.gaussians import training
 from methods.gaussians.model import Gaussians
 from methods.gaussians.training import (
@@ -29,8 +29,7 @@ from tests.methods.usual import usual
 
 
 def test_they_begin_on_surfaces_with_their_colours(ball_scene, teacher):
-    generator = seeded(0)
-    points, colours = on_surfaces(teacher, ball_scene, 500, generator)
+    points, colours = on_surfaces(teacher, ball_scene, 500, seeded(0))
     radius = (points - 0.5).norm(dim=1)
     assert len(points) == 500
     assert abs(radius.median().item() - 0.3) < 2 * 1.6 / 40
@@ -41,16 +40,15 @@ def test_they_begin_on_surfaces_with_their_colours(ball_scene, teacher):
 def test_points_come_from_all_pictures_alike(ball_scene, monkeypatch):
     """Three of five pixels show matter, at their camera."""
 
-    def render(field: Any, rays: Rays, *_: Any) -> Pixels:
+    def render(field, rays, *_):
         alpha = torch.arange(len(rays.origins)) % 5 < 3
         return replace(Pixels.blank(len(alpha), 3), alpha=alpha.float())
 
     monkeypatch.setattr(training, "render_rays", render)
     field = SimpleNamespace(device=torch.device("cpu"))
-    trained: Any = SimpleNamespace(field=field, occupancy=None, sampling=None)
+    trained = SimpleNamespace(field=field, occupancy=None, sampling=None)
     cameras, each = ball_scene.splits["train"].cameras, 30
-    generator = seeded(0)
-    points, _ = on_surfaces(trained, ball_scene, each * len(cameras), generator)
+    points, _ = on_surfaces(trained, ball_scene, each * len(cameras), seeded(0))
     found = [int((points == camera.c2w[:, 3]).all(dim=1).sum()) for camera in cameras]
     # Two draws of 18 points a picture, of which five in six are taken; each can be off by 2.
     assert found == pytest.approx([each] * len(cameras), abs=4)

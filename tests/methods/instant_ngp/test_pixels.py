@@ -26,16 +26,14 @@ def test_rays_of_pictures_of_several_sizes_are_those_of_their_cameras(ball_scene
     images = [image[: camera.height, : camera.width] for camera, image in pairs]
     batches = PixelBatches(Split(cameras, images, split.names[:3]), CPU)
     rays, colours = batches.at(torch.arange(len(batches)))
-    expected = [cast(camera) for camera in cameras]
-    for found, of_pixels in (
-        (rays.origins, [of.origins for of in expected]),
-        (rays.directions, [of.directions for of in expected]),
-        (colours, [image.flatten(0, 1) / 255 for image in images]),
-    ):
-        rows = zip(of_pixels, images, strict=True)
-        pictures = [pixels.reshape(*image.shape[:2], -1) for pixels, image in rows]
-        strips = [strip.flatten(0, 1) for of in pictures for strip in of.split(STRIP, dim=1)]
-        torch.testing.assert_close(found, torch.cat(strips))
+    expected = []
+    for camera, image in zip(cameras, images, strict=True):
+        of = cast(camera)
+        pixels = torch.cat((of.origins, of.directions, image.flatten(0, 1) / 255), dim=1)
+        strips = pixels.view(*image.shape[:2], -1).split(STRIP, dim=1)
+        expected += [strip.flatten(0, 1) for strip in strips]
+    found = torch.cat((rays.origins, rays.directions, colours), dim=1)
+    torch.testing.assert_close(found, torch.cat(expected))
 
 
 def test_every_pixel_is_drawn_once_if_as_many_are_drawn_as_there_are(ball_scene):

@@ -7,10 +7,9 @@ from unittest.mock import Mock
 
 import pytest
 import torch
-from torch import Tensor
 
 from bench.console import ConsoleLog
-from bench.types import Budget, Rays, Scene, Split, Unavailable, composite
+from bench.types import Budget, Scene, Split, Unavailable, composite
 from methods.instant_ngp.cases import cases
 from methods.instant_ngp.field import HashField
 from methods.instant_ngp.pixels import RUN, UNSEEN
@@ -51,7 +50,7 @@ def stage(scene: Scene, root: Path) -> Path:
 def unlit(ball_scene, monkeypatch) -> FieldTraining:
     """A training that renders every pixel black and learns nothing."""
 
-    def render(rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
+    def render(rays, jitter, background):
         black = Pixels.blank(len(jitter), 3)
         return replace(black, values=black.values.requires_grad_()), BUDGET.samples
 
@@ -79,7 +78,7 @@ def test_the_error_shown_is_that_of_pixels_drawn_alike(unlit):
 def test_an_error_that_is_not_finite_stops_it(unlit):
     dark = unlit._render
 
-    def render(rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
+    def render(rays, jitter, background):
         pixels, samples = dark(rays, jitter, background)
         last = torch.zeros(len(jitter), 1)
         last[-1] = torch.nan
@@ -109,7 +108,7 @@ def test_the_learning_rate_falls_from_the_first_to_the_last_step(ball_scene):
 
 
 def test_the_step_of_the_rays_suits_the_length_of_the_training_or_is_given():
-    def step(steps: int, march_step: float | None = None) -> float:
+    def step(steps, march_step=None):
         return field_options(march_step=march_step).sampling(replace(BUDGET, steps=steps)).step
 
     assert step(20_000) == STEP  # as long as the release trains
@@ -143,7 +142,7 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_last_good_checkpoint(
     monkeypatch.setattr(loop, "CHECKPOINT_S", -1.0)
     advance = FieldTraining.advance
 
-    def spoiled_at_10(training: FieldTraining) -> dict[str, float]:
+    def spoiled_at_10(training):
         if training.step == 10:
             with torch.no_grad():
                 training.field.layers["feature_mid"][0, 0] = torch.nan
@@ -163,7 +162,7 @@ def test_a_training_that_went_bad_in_its_last_step_is_not_finished(
 ):
     update = FieldTraining._update
 
-    def spoiled(training: FieldTraining) -> None:
+    def spoiled(training):
         update(training)
         if training.step == BUDGET.steps - 1:
             with torch.no_grad():

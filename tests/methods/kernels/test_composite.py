@@ -14,7 +14,7 @@ from bench.case import U32
 from methods.kernels.composite import composite, visibility
 from methods.kernels.composite.experiments import exact, slope
 from methods.kernels.types import Intervals, Pixels, offsets_of
-from tests.common import assert_near, seeded
+from tests.common import assert_near, refusal, seeded
 
 Inputs = tuple[Tensor, Tensor, Intervals]
 
@@ -117,11 +117,11 @@ def test_visible_samples_are_those_with_a_weight_which_is_the_gradient_of_their_
 
 def test_wrong_arguments_are_named():
     sigma, values, where = samples([5])
-    with pytest.raises(ValueError, match="values: expected shape"):
+    with refusal("values: expected shape", ValueError):
         composite(sigma, values[1:], where)
-    with pytest.raises(ValueError, match="offsets: expected to end at the 5 samples"):
+    with refusal("offsets: expected to end at the 5 samples", ValueError):
         composite(sigma, values, replace(where, offsets=torch.tensor([0, 6])))
-    with pytest.raises(ValueError, match="float32"):
+    with refusal("float32", ValueError):
         composite(*samples([5], dtype=torch.float64), backend="cpu")
 
 

@@ -71,8 +71,7 @@ def test_a_ray_goes_to_infinity_in_few_steps_whose_lengths_add_up(backend):
 
 def test_a_wall_beyond_the_box_is_seen_at_its_depth_whatever_it_hides():
     wall = 3.0  # x from which on everything is solid: 10 half sides from the middle
-    generator = seeded(0)
-    targets = torch.rand(100, 3, generator=generator) - 0.5
+    targets = torch.rand(100, 3, generator=seeded(0)) - 0.5
     directions = torch.cat((torch.ones(100, 1), targets[:, 1:]), dim=1)
     rays = Rays(torch.full((100, 3), 0.5), directions)  # t is the way along x
     samples = march(rays, FULL, STEP, backend="reference")

@@ -71,7 +71,7 @@ def test_machine_code_is_used_until_a_file_changes_that_it_comes_from(tmp_path):
     (caller / "__init__.py").touch()
     (caller / "cpu.py").write_text(CALLER)
 
-    def called() -> str:
+    def called():
         command = [sys.executable, "-c", "import methods.caller.cpu"]
         given = {**os.environ, "PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": ""}
         done = subprocess.run(command, cwd=tmp_path, env=given, capture_output=True, text=True)

@@ -9,7 +9,7 @@ from torch import Tensor
 from bench.types import Rays
 from methods.kernels.march import march
 from methods.kernels.types import Occupancy
-from tests.common import seeded
+from tests.common import refusal, seeded
 
 STEP = math.sqrt(3) / 1024
 
@@ -19,8 +19,7 @@ def full() -> Occupancy:
 
 
 def dust(seed: int) -> Occupancy:
-    generator = seeded(seed)
-    return Occupancy(torch.rand(32, 32, 32, generator=generator) < 0.05)
+    return Occupancy(torch.rand(32, 32, 32, generator=seeded(seed)) < 0.05)
 
 
 def rays_through_the_cube(count: int) -> Rays:
@@ -109,12 +108,12 @@ def test_clearance_is_the_distance_to_the_nearest_brick_along_the_farthest_axis(
 
 def test_wrong_arguments_are_named():
     origins = torch.zeros(2, 3)
-    with pytest.raises(ValueError, match="directions: expected shape"):
+    with refusal("directions: expected shape", ValueError):
         march(Rays(origins, torch.zeros(3, 3)), full(), STEP)
-    with pytest.raises(ValueError, match="step: expected a positive length, got 0"):
+    with refusal("step: expected a positive length, got 0", ValueError):
         march(Rays(origins, origins), full(), 0.0)
-    with pytest.raises(ValueError, match="limit: expected 1 or more, got 0"):
+    with refusal("limit: expected 1 or more, got 0", ValueError):
         march(Rays(origins, origins), full(), STEP, limit=0)
     for side in (24, 1024):  # a clearance of 256 bricks would not fit into a byte
-        with pytest.raises(ValueError, match=f"multiple of 16, at most 1008, got {side}"):
+        with refusal(f"multiple of 16, at most 1008, got {side}", ValueError):
             Occupancy(torch.zeros(1, 1, 1).bool().expand(side, side, side))

@@ -1,6 +1,7 @@
 """NSVF as a method: its voxels, its network, and where its embeddings begin."""
 
 import math
+from itertools import chain, pairwise
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from methods.instant_ngp.stage1 import train_field
 from methods.kernels.encode import encode
 from methods.kernels.types import Occupancy
 from methods.nsvf.field import NsvfField
-from tests.common import assert_near, seeded
+from tests.common import assert_near, refusal, seeded
 from tests.methods.small_students import SMALL, budget, fitted
 from tests.methods.trainings import EXACT_GRID, TEACHER
 
@@ -58,17 +59,15 @@ def test_the_network_is_that_of_the_publication():
     assert network == 545_284
     assert field.sizes() == {"embeddings": 128 * len(field.vertices), "network": 4 * 545_284}
 
-    def hidden(inputs: int, outputs: int) -> list[nn.Module]:
-        return [nn.Linear(inputs, outputs), nn.LayerNorm(outputs), nn.ReLU()]
+    def hidden(*widths):
+        pairs = [(nn.Linear(*pair), nn.LayerNorm(pair[1]), nn.ReLU()) for pair in pairwise(widths)]
+        return chain(*pairs)
 
-    trunk = nn.Sequential(*hidden(416, 256), *hidden(256, 256), *hidden(256, 256))
+    trunk = nn.Sequential(*hidden(416, 256, 256, 256))
     opacity = nn.Sequential(*hidden(256, 128), nn.Linear(128, 1), nn.ReLU())
-    colour = nn.Sequential(
-        *hidden(280, 256), *(m for _ in range(3) for m in hidden(256, 256)), nn.Linear(256, 3)
-    )
+    colour = nn.Sequential(*hidden(280, *[256] * 4), nn.Linear(256, 3))
     for mine, other in ((field.trunk, trunk), (field.opacity, opacity), (field.colour, colour)):
-        for value, own in zip(other.parameters(), mine.parameters(), strict=True):
-            value.data = own.data
+        other.load_state_dict(dict(zip(other.state_dict(), mine.parameters(), strict=True)))
     places = torch.rand(300, 3, generator=seeded(4))
     d = functional.normalize(torch.randn(300, 3, generator=seeded(5)), dim=1)
     e, inside = field.embedding(places)
@@ -103,5 +102,5 @@ def test_embeddings_begin_as_the_teachers_features(ball_scene, shared_log):
 
 
 def test_a_teacher_of_other_channels_is_refused():
-    with pytest.raises(ValueError, match=r"^teacher.grid: expected 32 channels .* got 16"):
+    with refusal(r"^teacher.grid: expected 32 channels .* got 16", ValueError):
         SMALL["nsvf"](teacher=TEACHER)

@@ -25,8 +25,7 @@ def mean_quality(method: PlenOctree, scene: Scene, split: str) -> float:
 def extracted(teacher: TrainedField, scene: Scene, **others: float) -> tuple[Octree, torch.Tensor]:
     """An octree, and the centres of its leaves."""
     batches = PixelBatches(scene.splits["train"], torch.device("cpu"))
-    generator = seeded(0)
-    octree = extract(teacher, batches, extraction(**others), generator)
+    octree = extract(teacher, batches, extraction(**others), seeded(0))
     return octree, (octree.voxels.coordinates + 0.5) / 128
 
 

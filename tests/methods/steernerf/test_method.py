@@ -101,7 +101,7 @@ def test_reset_forgets_and_sizes_are_those_of_all_that_a_frame_needs(ball_scene,
 
 @pytest.mark.slow
 def test_a_network_is_built_once_for_each_training_and_for_no_other(ball_scene, log, tmp_path):
-    def built(rate: float = 1e-3, **rendering: Any) -> int:
+    def built(rate=1e-3, **rendering):
         method = new_method(rate=rate, engine=OpenVino("int8"), **rendering)
         method.fit(ball_scene, BUDGET, log)
         for camera in ball_scene.splits["test"].cameras:
@@ -138,7 +138,7 @@ def test_a_training_depends_on_its_model_and_on_nothing_that_is_chosen_afterward
 def test_settings_that_do_not_fit_are_refused():
     """Range reduction needs preceding frames."""
     new_method(frames=1, range=RANGED)
-    with pytest.raises(ValueError, match=r"range.mode: expected off without .* got paper"):
+    with refusal(r"range.mode: expected off without .* got paper", ValueError):
         new_method(frames=0, range=RANGED)
 
 

@@ -1,7 +1,6 @@
 """A frame of the pipeline: views, cold start, what follows what, what is chosen afterwards."""
 
 from dataclasses import replace
-from typing import Literal
 
 import pytest
 import torch
@@ -9,7 +8,7 @@ from torch.nn import functional
 
 from bench.cameras import cast, project
 from bench.types import NullProbe
-from methods.steernerf.buffer import Buffer, PointCloud
+from methods.steernerf.buffer import Buffer
 from methods.steernerf.options import RangeReduction
 from methods.steernerf.pipeline import near_matter
 from methods.steernerf.unet import RIM
@@ -81,7 +80,7 @@ def test_range_reduction_reprojects_the_depth_that_it_is_told_to():
     pipeline.render(CAMERA, buffer, USUAL, probe)
     view = pipeline.view(look_at_the_middle(0.15, 0.3))
 
-    def values(cloud: PointCloud, depth: Literal["sum", "expected"]) -> torch.Tensor:
+    def values(cloud, depth):
         rendering = replace(USUAL, range=RangeReduction("paper", 0.02, depth))
         return pipeline.features(view, (cloud,), rendering, probe).values
 

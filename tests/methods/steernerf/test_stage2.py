@@ -5,7 +5,6 @@ from functools import partial
 
 import pytest
 import torch
-from torch import Tensor
 
 from bench.types import Scene, Split
 from methods.instant_ngp.field import HashField
@@ -34,8 +33,7 @@ def new_training(
     trained = trained_field(field or misty_field(channels=model.channels))
     renderer = UNet(model.channels, frames, model.scale, width=8, aligned=True)
     pipeline = Pipeline(trained, scene.background, renderer, model)
-    generator = seeded(1)
-    patches = Patches(pipeline, scene, Split([], [], []), options, generator)
+    patches = Patches(pipeline, scene, Split([], [], []), options, seeded(1))
     return JointTraining(renderer, patches, steps, trained if patches.learning else None)
 
 
@@ -63,7 +61,7 @@ def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(ball_scene, monkeyp
     patches = [replace(p, points=of) for p, of in zip(patches, doubled, strict=False)]
     truth = torch.stack([patch.truth for patch in patches])
 
-    def loss() -> Tensor:
+    def loss():
         batch = training.patches.render(patches)
         error = (renderer(batch.observations) - truth).square().mean()
         return error + 1e-2 * batch.opacity.square().mean()

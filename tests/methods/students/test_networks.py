@@ -29,8 +29,7 @@ def test_positional_encoding_is_its_formula(frequencies, identity, scale):
 
 
 def test_a_layer_multiplies_in_bfloat16_only_where_it_is_fast():
-    generator = seeded(0)
-    inputs = torch.randn(50, 20, generator=generator)
+    inputs = torch.randn(50, 20, generator=seeded(0))
     exact, rounded = (Dense(20, 30, precision, seeded(1)) for precision in ("fp32", "bf16"))
     assert torch.equal(exact.weight, rounded.weight)
     wanted = inputs @ exact.weight.T + exact.bias

@@ -10,7 +10,6 @@ import torch
 
 from bench.types import NullProbe
 from methods.instant_ngp.stage1 import train_field
-from methods.training import loop
 from tests.methods.small_students import SMALL, budget, fitted
 from tests.methods.trainings import EXACT_TEACHER, PIXEL, goes_on_after_a_kill, shows_the_ball
 
@@ -34,7 +33,7 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(
     given = budget(name, steps)
     trained = train_field(SMALL[name]().teacher, ball_scene, given, shared_log)
 
-    def training() -> loop.Training:
+    def training():
         return SMALL[name]().begin(trained, ball_scene, given)
 
     goes_on_after_a_kill(training, killed_at, tmp_path)

@@ -21,7 +21,7 @@ def test_noise_is_that_of_its_lattice_continuous_and_has_a_period():
 
 
 def test_patterns_alternate():
-    def light(texture, *points: tuple[float, float, float]) -> list[bool]:
+    def light(texture, *points):
         colours = texture(torch.tensor(points))
         return [torch.equal(colour, torch.tensor(LIGHT)) for colour in colours]
 

@@ -5,7 +5,7 @@ import torch
 
 from bench.types import Rays
 from methods.diver.kernels.segments import Layers, cases, reference, render_segments
-from tests.common import assert_near
+from tests.common import assert_near, refusal
 
 RAYS = 40
 
@@ -44,8 +44,8 @@ def test_rays_that_are_rendered_in_chunks_have_the_same_pixels(size, monkeypatch
 def test_a_cpu_refuses_what_it_has_no_code_for():
     rays, corners, layers, towards = given()
     wide = Rays(rays.origins.double(), rays.directions.double())
-    with pytest.raises(ValueError, match="computes with float32"):
+    with refusal("computes with float32", ValueError):
         render_segments(wide, corners, layers, towards, stop=0.0, backend="cpu")
     narrow = Layers(*map(torch.zeros, ((8, 32), 8, (1, 8), 1, (8, 8), (3, 8), 3)))
-    with pytest.raises(ValueError, match=r"multiples of 16, got \[8, 32\]"):
+    with refusal(r"multiples of 16, got \[8, 32\]", ValueError):
         render_segments(rays, corners, narrow, towards[:, :8], stop=0.0, backend="cpu")

@@ -10,8 +10,7 @@ from tests.common import seeded
 
 def pictures() -> tuple[torch.Tensor, torch.Tensor]:
     """Two pictures of noise in a black frame wider than the window: no border is in sight."""
-    generator = seeded(0)
-    inner = torch.rand(2, 3, 20, 24, generator=generator, dtype=torch.float64)
+    inner = torch.rand(2, 3, 20, 24, generator=seeded(0), dtype=torch.float64)
     one, other = functional.pad(inner, (11, 11, 11, 11)).movedim(1, -1)
     return one.contiguous(), other.contiguous()
 
