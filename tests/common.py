@@ -10,6 +10,9 @@ import torch
 
 from bench.errors import SteerbenchError
 
+ROOT = Path(__file__).parents[1]
+"""Of the checkout."""
+
 assert_near = partial(torch.testing.assert_close, rtol=0)
 """Within `atol`, however large the numbers are."""
 

@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 
 from docs import figures
+from tests.common import ROOT
 
-ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 END = "<!-- end of figures -->"
 

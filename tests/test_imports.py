@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+from tests.common import ROOT
+
 PACKAGES = ("bench", "methods", "reports", "sweeps")
 MAY_IMPORT = {
     "bench": {"bench"},

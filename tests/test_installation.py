@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.common import ROOT
 from tests.sweeps.test_documents import write_files
 from tests.test_project import PACKAGES
 
-ROOT = Path(__file__).parents[1]
 METADATA = ("pyproject.toml", "README.md", "LICENSE")
 TINY = (
     *("budget=tiny", "budget.steps=2", "budget.renderer_steps=2", "budget.frames=2"),

@@ -4,7 +4,6 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import pytest
 import torch
@@ -16,7 +15,7 @@ from bench.scenes import blender, colmap, embedded
 from bench.scenes.export import data_camera
 from bench.trajectories import Trajectory, follow, orbit, smooth
 from bench.types import Camera, Scene, composite
-from tests.common import assert_near, read_json, refusal
+from tests.common import ROOT, assert_near, read_json, refusal
 
 
 @pytest.fixture
@@ -105,6 +104,5 @@ def test_what_a_layout_cannot_hold_is_refused(scene, path, tmp_path, quiet_log):
 
 
 def test_the_choices_of_the_command_are_the_layouts():
-    file = Path(__file__).parents[2] / "sweeps/commands.toml"
-    command = tomllib.loads(file.read_text())["scenes"]
+    command = tomllib.loads((ROOT / "sweeps/commands.toml").read_text())["scenes"]
     assert command["arguments"]["--layout"]["choices"] == list(LAYOUTS)

@@ -3,6 +3,7 @@
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 
 from methods.instant_ngp.field import HashField
@@ -15,8 +16,12 @@ from methods.rendering.sampling import Sampling
 from methods.steernerf.options import EVERYWHERE, MotionOptions
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.unet import UNet
-from tests.common import seeded
+from tests.common import ROOT, seeded
 from tests.methods.usual import usual
+
+RELEASE = np.load(ROOT / "tests/data/steernerf_release.npz")
+"""What the released code computes: a U-Net on formulas, and two frames of 10 x 12 pixels, brought
+into a third of 40 x 48."""
 
 SMALL_GRID = HashGrid(levels=4, features=2, log2_table=8, n_min=4, n_max=16)
 STEPS = {"step": 8.0, "stop": STOP}

@@ -1,7 +1,5 @@
 """Every method on a pretended GPU: it trains and renders there, with the numbers of the CPU."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial

@@ -21,8 +21,8 @@ from omegaconf import OmegaConf
 from reports.regression import LIMITS
 from sweeps import cli, overrides
 from sweeps.overrides import choices, composed, swept
+from tests.common import ROOT
 
-ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 
 SHOWN = re.compile(

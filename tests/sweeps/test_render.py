@@ -10,7 +10,7 @@ from PIL import Image
 from bench.paths import write_path
 from bench.results import Store
 from methods.gaussians import ply
-from tests.common import read_json, write_json
+from tests.common import write_json
 from tests.methods.gaussians.test_ply import some
 
 SCENE = ("scene=totem", "scene.width=24", "scene.train=3", "scene.test=3")
@@ -23,7 +23,7 @@ def pictures(folder: str) -> list[np.ndarray]:
 
 
 @pytest.mark.slow
-def test_every_frame_of_a_run_is_written_and_its_path_can_be_followed_and_timed(steerbench):
+def test_every_frame_of_a_run_is_written_and_its_path_can_be_followed(steerbench):
     steerbench("run", "method=ngp", *SCENE, *QUICK, *PROTOCOL).ok()
     (run,) = Store(Path("outputs")).rows()["run"].unique()
 
@@ -34,8 +34,6 @@ def test_every_frame_of_a_run_is_written_and_its_path_can_be_followed_and_timed(
     kept = Path("outputs/runs") / run / "pictures/0000-rendered.png"
     assert np.array_equal(np.asarray(Image.open(kept)), there[0])
 
-    path = read_json(Path("there/path.json"))
-    assert len(path["camera_path"]) == 2
     words = ["--run", run, "--path", "there/path.json", "--beside", "ngp", "--to", "again"]
     steerbench("render", *words).ok()
     for before, after in zip(there, pictures("again"), strict=True):
@@ -43,13 +41,6 @@ def test_every_frame_of_a_run_is_written_and_its_path_can_be_followed_and_timed(
         assert np.array_equal(left, right)  # the same method twice
         # Poses in float32, there and back: a ray that touches a cell's edge may miss a sample.
         assert np.abs(left - before).mean() < 0.5
-
-    words = ("trajectory=path", "trajectory.path=there/path.json")
-    steerbench("run", "method=ngp", *words, *SCENE, *QUICK, *PROTOCOL).ok()
-    rows = Store(Path("outputs")).rows()
-    timed = rows[rows["run"] != run].set_index("metric")
-    assert timed["n"]["frame_ms"] == 2
-    assert timed["n"]["psnr"] == 0  # without ground truth
 
 
 def test_a_ply_file_and_a_path_need_no_scene(steerbench, tiny_scene):

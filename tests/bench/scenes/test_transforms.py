@@ -41,13 +41,6 @@ def of_picture(number: int, **settings: object) -> Callable[[dict], object]:
     return lambda record: record["frames"][9 - number].update(settings)
 
 
-def test_every_nth_picture_by_name_is_a_test(folder, log):
-    scene = transforms.load(folder, split_every=4, log=log)
-    assert list(scene.splits["test"].names) == [f"images/{k:03}.png" for k in (0, 4, 8)]
-    assert len(scene.splits["train"]) == 7
-    assert np.array_equal(scene.splits["test"].images[1].numpy(), picture(4, channels=3))
-
-
 @pytest.mark.parametrize(
     ("focal", "fx"), [({"fl_x": 7.0}, 7), ({"camera_angle_x": 2 * np.arctan(0.25)}, 8 / 2 / 0.25)]
 )

@@ -9,8 +9,7 @@ from textwrap import dedent
 import pytest
 
 from methods.external.method import External
-
-ROOT = Path(__file__).parents[3]
+from tests.common import ROOT
 
 GREY = """
     import numpy as np

@@ -1,7 +1,5 @@
 """Instant-NGP as a method."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """How long a hash table a scene needs."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """The sparse Adam step against torch's dense one, and what it leaves alone."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -33,28 +33,23 @@ def samples(
     return sigma, values, Intervals(t, delta, offsets_of(torch.tensor(counts)))
 
 
-def plain_composite(rows: list[list[float]], stop: float) -> list[float]:
-    """The sums of a ray by definition (Eq. 2, 3), in Python numbers. A sample is a row: density,
-    length, and the five numbers that are summed."""
-    sums, transmittance = [0.0] * 5, 1.0
-    for sigma, delta, *shown in rows:
-        if transmittance <= stop:
-            break
-        opacity = 1 - math.exp(-sigma * delta)
-        sums = [total + transmittance * opacity * x for total, x in zip(sums, shown, strict=True)]
-        transmittance *= 1 - opacity
-    return sums
+def by_definition(sigma: Tensor, delta: Tensor, shown: Tensor, stop: float) -> Tensor:
+    """The sums of a ray of the numbers that its samples show (Eq. 2, 3)."""
+    opacity = 1 - torch.exp(-sigma * delta)
+    behind = (1 - opacity).cumprod(dim=0)
+    before = torch.cat((torch.ones(1), behind))[:-1]
+    return (torch.where(before > stop, before * opacity, 0)[:, None] * shown).sum(dim=0)
 
 
 @pytest.mark.parametrize("stop", [0.0, 0.3])
 def test_reference_is_the_definition(stop):
     sigma, values, where = inputs = samples([4, 0, 1, 9], dtype=torch.float64)
     pixels = composite(*inputs, stop=stop, backend="reference")
-    summed = torch.column_stack((values, where.t, torch.ones_like(sigma)))
-    rows = torch.column_stack((sigma, where.delta, summed)).split([4, 0, 1, 9])
-    got = torch.column_stack((pixels.values, pixels.depth_sum, pixels.alpha)).tolist()
-    for ray, pixel in zip(rows, got, strict=True):
-        assert pixel == pytest.approx(plain_composite(ray.tolist(), stop), abs=1e-12)
+    shown = torch.column_stack((values, where.t, torch.ones_like(sigma)))
+    rays = zip(*(x.split([4, 0, 1, 9]) for x in (sigma, where.delta, shown)), strict=True)
+    wanted = torch.stack([by_definition(*ray, stop) for ray in rays])
+    got = torch.column_stack((pixels.values, pixels.depth_sum, pixels.alpha))
+    assert_near(got, wanted, atol=1e-12)
 
 
 def part(inputs: Inputs, index: Tensor, counts: list[int]) -> Inputs:

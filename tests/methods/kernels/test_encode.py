@@ -1,7 +1,5 @@
 """The hash-grid encoding: published levels, gradients, what is collected and refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,7 +1,5 @@
 """The kernels of the GPU where their cases say nothing: on a GPU, else in Triton's interpreter."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import os

@@ -1,7 +1,5 @@
 """NeRF as a method: its network is that of the paper, and skipping changes no picture."""
 
-from __future__ import annotations
-
 import torch
 from torch import nn
 

@@ -3,7 +3,6 @@ reduction, on solids whose surface is known."""
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,10 +18,8 @@ from methods.rendering.sampling import Sampling
 from methods.steernerf.buffer import RELIABLE_ALPHA, PointCloud
 from tests.common import assert_near
 from tests.methods.conftest import Work, look_at_the_middle
+from tests.methods.models import RELEASE
 from tests.methods.solids import Solid, ball, wall
-
-RELEASE = np.load(Path(__file__).parents[2] / "data/steernerf_release.npz")
-"""Two frames of 10 x 12 pixels, brought into a third of 40 x 48 by the released code."""
 
 
 def frame_of(camera: Camera, depth: Tensor | None = None, alpha: float = 1.0) -> FeatureFrame:

@@ -2,9 +2,7 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
@@ -16,10 +14,7 @@ from methods.steernerf.buffer import Points
 from methods.steernerf.unet import RIM, Observation, UNet
 from tests.common import assert_near, seeded
 from tests.methods.conftest import look_at_the_middle
-from tests.methods.models import shaken
-
-RELEASE = np.load(Path(__file__).parents[2] / "data/steernerf_release.npz")
-"""What the released code computes on the formulas below."""
+from tests.methods.models import RELEASE, shaken
 
 POINTS = 20
 

@@ -1,8 +1,6 @@
 """What the methods that start from a trained field have in common: a training survives a kill and
 is found again; they learn a ball; wrong settings are refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -98,15 +98,12 @@ def test_shadows_are_those_of_all_parts_but_of_a_convex_one_on_itself(model):
 
 def test_highlights_move_with_the_viewer():
     glossy = Solids([Part(Ellipsoid((0.7, 0.7, 0.7)), RED, gloss=0.9)])
-    top = Solids([sphere(0.7)])
     places = []
     for eye in ((0.0, -4.0, 0.0), (1.5, -3.7, 0.0)):
         camera = camera_at(eye)
-        shiny, matt = (render(model, camera, 4) for model in (glossy, top))
-        row, column = divmod((shiny.rgb - matt.rgb)[..., 1].argmax().item(), camera.width)
-        depth = matt.depth[row, column]
-        ray = cast(camera, torch.tensor([[column + 0.5, row + 0.5]]))
-        places.append(ray.origins[0] + depth * ray.directions[0])
+        shiny, matt = (render(model, camera, 4) for model in (glossy, Solids([sphere(0.7)])))
+        place, rays = (shiny.rgb - matt.rgb)[..., 1].argmax(), cast(camera)
+        places.append(rays.origins[place] + matt.depth.flatten()[place] * rays.directions[place])
     assert (places[0] - places[1]).norm() > 0.05
 
 
