@@ -6,6 +6,7 @@ import torch
 from bench.cameras import cast
 from methods.kernels.types import Occupancy
 from methods.rendering.batch import render_batch
+from methods.rendering.field import BATCH_QUANTUM, pad
 from methods.rendering.frame import render_rays
 from methods.rendering.occupancy import RESOLUTION, DensityGrid
 from methods.rendering.sampling import Sampling
@@ -46,3 +47,12 @@ def test_the_density_grid_finds_a_solid():
     # All but the one in e^4 that were left out were found to be empty.
     assert cells[outside].float().mean() < 0.05
     assert not cells[~slice_].any()
+
+
+def test_padding_hides_behind_the_samples():
+    rows = torch.rand(BATCH_QUANTUM + 1, 3)
+    padded = pad(rows)
+    assert len(padded) == 2 * BATCH_QUANTUM
+    assert torch.equal(padded[: len(rows)], rows)
+    assert not padded[len(rows) :].any()
+    assert pad(rows[:BATCH_QUANTUM]).shape == (BATCH_QUANTUM, 3)
