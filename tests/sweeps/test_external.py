@@ -102,20 +102,6 @@ def test_the_worker_of_the_document_is_drawn_along_a_path(steerbench, documented
         assert (picture[:, 40:] == 128).all()
 
 
-def test_accuracy_turns_the_knobs_that_it_declares_and_trains_once(steerbench, write):
-    write("""
-    def fit(self, job):
-        with open("trainings", "a") as file:
-            file.write("one ")
-
-    Grey.fit, Grey.load = fit, lambda self, job: None
-    """)
-    done = steerbench("accuracy", *WHITE, *EXTERNAL, "protocol.rounds=2").ok()
-    assert "level 0.25" in done.out
-    assert "level 1.0" in done.out
-    assert Path("trainings").read_text() == "one "
-
-
 def test_when_steerbench_is_killed_the_worker_ends(spawn, write, tmp_path):
     write(f"""
     import os, threading

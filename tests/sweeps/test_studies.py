@@ -1,6 +1,7 @@
 """Studies: their lines are runs of the store, of what methods declare; each shows them its way."""
 
 import functools
+import io
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -31,11 +32,11 @@ def study(steerbench):
 
 
 def page(study: str) -> pd.DataFrame:
-    """The first table of the page of a study, by the first cell of a line."""
-    lines = Path(f"outputs/{study}/report.md").read_text().splitlines()
-    cells = [[x.strip(" *") for x in line.split("|")[1:-1]] for line in lines if line[:1] == "|"]
-    table = [row for row in cells if len(row) == len(cells[0])]
-    return pd.DataFrame(table[2:], columns=table[0]).set_index(table[0][0])
+    """The first table of the page of a study, as text, by the first cell of a line."""
+    text = Path(f"outputs/{study}/report.md").read_text()
+    table = io.StringIO(text[text.index("|") :].partition("\n\n")[0].replace("**", ""))
+    cells = pd.read_csv(table, sep=r"\s*\|\s*", engine="python", dtype=str, keep_default_na=False)
+    return cells.iloc[1:, 1:-1].set_index(cells.columns[1])
 
 
 def stored(metric: str) -> Mapping[str, float]:

@@ -19,7 +19,7 @@ from bench.scenes.files import Fields
 from bench.scenes.images import Fisheye, RadialTangential, undistort, undistorted_camera
 from bench.types import Camera
 from tests.bench.scenes.conftest import edit_json, picture, pose
-from tests.common import refusal, write_json
+from tests.common import assert_near, refusal, write_json
 
 
 @pytest.fixture
@@ -297,25 +297,25 @@ def wave(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize("name", LENSES)
 def test_undistortion_recovers_the_pinhole_picture(name):
     camera, lens = pinhole(), LENSES[name]
-    matrix = torch.tensor(
-        [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float64
-    )
-    grid = pixel_grid(camera.width, camera.height).double()
-    seen = undistort_points(grid, matrix, torch.tensor(lens, dtype=torch.float64), num_iters=60)
-    x, y = (seen[:, 0] - camera.cx) / camera.fx, (seen[:, 1] - camera.cy) / camera.fy
-    distorted = wave(x, y).reshape(camera.height, camera.width, 3).round().to(torch.uint8)
+
+    def places(camera):
+        pixels = pixel_grid(camera.width, camera.height).double()
+        middle, focal = torch.tensor([[camera.cx, camera.cy], [camera.fx, camera.fy]]).double()
+        return (pixels - middle) / focal
+
+    numbers = torch.tensor(lens, dtype=torch.float64)
+    seen = undistort_points(places(camera), torch.eye(3).double(), numbers, num_iters=60)
+    distorted = wave(*seen.T).view(camera.height, camera.width, 3).round().to(torch.uint8)
+
     straight = undistort(distorted, camera, RadialTangential(lens))
     cropped = undistorted_camera(camera, RadialTangential(lens), Path("picture.png"))
     assert straight.shape == (cropped.height, cropped.width, 3)
     # The crop loses a border only: most of the picture stays.
     assert cropped.width * cropped.height > 0.85 * camera.width * camera.height
-    grid = pixel_grid(cropped.width, cropped.height).double()
-    expected = wave((grid[:, 0] - cropped.cx) / cropped.fx, (grid[:, 1] - cropped.cy) / cropped.fy)
     # Bilinear: h^2 / 8 of the second derivatives along u and v, at most 100 * 36 / 84^2 a pixel
     # squared each, 1.5 for the lens' own stretch; and half a level for each rounding.
     bilinear = 2 * 1.5 * 100 * 36 / 84**2 / 8
-    error = (straight.reshape(-1, 3).double() - expected).abs().max().item()
-    assert error <= bilinear + 1
+    assert_near(straight.flatten(0, 1).double(), wave(*places(cropped).T), atol=bilinear + 1)
 
 
 def test_colours_between_pixels_weigh_by_their_alpha():

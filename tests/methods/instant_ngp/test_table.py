@@ -37,10 +37,6 @@ def test_detail_is_a_mean_over_pictures_from_all_over_the_path():
     assert detail(split_of(*[plain] * 16, *[dotted] * 16)) == pytest.approx(1.5)
 
 
-def test_a_length_that_is_given_is_kept():
-    assert hash_grid(log2_table=12, **SHAPE) == HashGrid(log2_table=12, **SHAPE)
-
-
 @pytest.mark.parametrize(("fine", "expected"), [(10**6, SHORT), (0, LONG)])
 def test_a_field_gets_the_table_that_its_scene_needs(
     ball_scene, quiet_log, monkeypatch, fine, expected
