@@ -34,7 +34,7 @@ from sweeps.overrides import CONFIGS
 from tests.pretended_gpu import PretendedGpu, pretended_gpu
 from tests.web import Web
 
-STEERBENCH_1 = instantiate(OmegaConf.load(CONFIGS / "protocol" / "steerbench-1.yaml"))
+STEERBENCH_1 = instantiate(OmegaConf.load(CONFIGS / "protocol/steerbench-1.yaml"))
 QUICK = replace(STEERBENCH_1, name="quick", lpips=())  # without weights, which a test may lack
 
 hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True)
@@ -55,7 +55,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(params=["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"])
-def device(request: pytest.FixtureRequest) -> str:
+def device(request) -> str:
     """Every device of this machine in turn."""
     return request.param
 
@@ -93,7 +93,7 @@ def poisoned_empty() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def own_turns(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def own_turns(tmp_path_factory) -> Iterator[None]:
     """Tests wait for no measurement on this machine, no measurement waits for them, and nothing is
     said about what runs beside them."""
     with pytest.MonkeyPatch.context() as patch:
@@ -113,7 +113,7 @@ def _poisoning(allocate):
 
 
 @pytest.fixture
-def quiet_log(tmp_path: Path) -> Log:
+def quiet_log(tmp_path) -> Log:
     """A log that says nothing and keeps its stages under `tmp_path`."""
     return ConsoleLog(tmp_path / "outputs", quiet=True)
 
@@ -134,7 +134,7 @@ def tiny_scene() -> Scene:
 
 
 @pytest.fixture
-def moved_scene(tiny_scene: Scene) -> Scene:
+def moved_scene(tiny_scene) -> Scene:
     """The unit cube is [-1.5, 1.5]^3 of the data set."""
     return replace(tiny_scene, origin=torch.full((3,), -1.5))
 
@@ -207,22 +207,20 @@ def _apart(one: Camera, other: Camera) -> float:
 
 
 @pytest.fixture
-def offset_method(device: str) -> OffsetMethod:
+def offset_method(device) -> OffsetMethod:
     """A method with known figures: its pictures are 8 levels brighter than the ground truth."""
     return OffsetMethod(device, 8 / 255)
 
 
 @pytest.fixture(scope="session")
-def real_lpips_weights(shared_data: Path | None) -> Path | None:
+def real_lpips_weights(shared_data) -> Path | None:
     """A folder with the backbones of LPIPS, if there is one on this machine."""
     real = os.environ.get("STEERBENCH_WEIGHTS") or (shared_data and shared_data / "lpips")
     return Path(real) if real and Path(real).is_dir() else None
 
 
 @pytest.fixture(scope="session")
-def lpips_weights(
-    real_lpips_weights: Path | None, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
+def lpips_weights(real_lpips_weights, tmp_path_factory) -> Path:
     """A folder with the backbones of LPIPS: the real ones where they are, else random ones."""
     if real_lpips_weights:
         return real_lpips_weights
@@ -240,7 +238,7 @@ def lpips_weights(
 
 
 @pytest.fixture
-def store(tmp_path: Path, offset_method, tiny_scene, quiet_log) -> Store:
+def store(tmp_path, offset_method, tiny_scene, quiet_log) -> Store:
     """A store with one run, key `stored_run`, six frames, three of them pictured."""
     budget = Budget("none", steps=1, samples=1)
     task = Task(tiny_scene, from_split(tiny_scene), QUICK, budget, seed=5)
@@ -257,6 +255,6 @@ def store(tmp_path: Path, offset_method, tiny_scene, quiet_log) -> Store:
 
 
 @pytest.fixture
-def stored_run(store: Store) -> str:
+def stored_run(store) -> str:
     """The key of the run in `store`."""
     return store.rows()["run"].iloc[0]

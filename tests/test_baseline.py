@@ -1,10 +1,10 @@
 """The methods against recorded figures, on a scene that each of them learns in seconds."""
 
-import json
 from pathlib import Path
 
 import pytest
 
+from tests.common import read_json, write_json
 from tests.test_end_to_end import called
 
 BASELINE = Path(__file__).with_name("baseline.json")
@@ -19,7 +19,7 @@ METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "work.samples", "work.prod
 
 
 def test_the_baseline_is_of_methods_that_have_learnt():
-    baseline = json.loads(BASELINE.read_text())
+    baseline = read_json(BASELINE)
     assert baseline["limits"].keys() >= set(METRICS)
     for of in baseline["runs"]:
         assert len(of["seeds"]) == 3
@@ -39,11 +39,11 @@ def test_methods_are_as_good_as_the_recorded_baseline(tmp_path, lpips_weights, r
     for method in METHODS:
         done = called(tmp_path, "run", *RUN, *method, f"weights_dir={lpips_weights}")
         assert done.returncode == 0, done.stderr
-    held = json.loads(BASELINE.read_text())
+    held = read_json(BASELINE)
     if not real_lpips_weights:
         limits = held["limits"].items()
         held["limits"] = {name: one for name, one in limits if not name.startswith("lpips")}
     baseline = tmp_path / "baseline.json"
-    baseline.write_text(json.dumps(held))
+    write_json(baseline, held)
     checked = called(tmp_path, "check", baseline)
     assert checked.returncode == 0, checked.stdout

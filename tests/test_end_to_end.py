@@ -45,7 +45,7 @@ def repeatable(folder: Path) -> pd.DataFrame:
 
 
 @pytest.fixture(scope="module")
-def first(tmp_path_factory: pytest.TempPathFactory, lpips_weights: Path) -> tuple[Path, str]:
+def first(tmp_path_factory, lpips_weights) -> tuple[Path, str]:
     """A folder in which the demo has run, and what it printed."""
     folder = tmp_path_factory.mktemp("first")
     done = demo(folder, lpips_weights)
@@ -57,8 +57,8 @@ def test_the_table_and_the_report_compare_all_methods(first):
     outputs, printed = first[0] / "outputs", first[1]
     for word in ("PSNR", "SSIM", "LPIPS alex", "FPS", "model, MB", *METHODS):
         assert word in printed
-    text = (outputs / "demo" / "report.md").read_text()
-    pictures = list((outputs / "demo" / "pictures").glob("frames-*.png"))
+    text = (outputs / "demo/report.md").read_text()
+    pictures = list((outputs / "demo/pictures").glob("frames-*.png"))
     assert len(pictures) == 3
     assert f"![Ground truth, {', '.join(METHODS)}; a detail of each; error maps](" in text
     stages = ("march", "field", "feature_reprojection", "renderer2d")
@@ -91,7 +91,7 @@ def test_training_is_shared_by_methods_and_runs_that_render_differently(first, l
     done = demo(first[0], lpips_weights, "method=ngp", "method.stop=1e-3")
     assert "trained field found" in done.stderr
     assert len(rows(first[0])["run"].unique()) == len(METHODS) + 1
-    stages = [path.name.split("-")[0] for path in (first[0] / "outputs" / "stages").iterdir()]
+    stages = [path.name.split("-")[0] for path in (first[0] / "outputs/stages").iterdir()]
     assert stages.count("field") == 1
     assert stages.count("steernerf") == 1
 

@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 
 from docs import figures
+from tests.common import ROOT
 
-ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 END = "<!-- end of figures -->"
 
@@ -63,7 +63,7 @@ def checkout(tmp_path, monkeypatch):
     monkeypatch.setattr(figures, "STEERBENCH", program)
     (tmp_path / "page.md").write_text(PAGE)
     Image.fromarray(np.full((8, 8, 3), 128, np.uint8)).save(tmp_path / "grey-12.png")
-    (tmp_path / "bench" / "code.py").write_text("one = 1\n")
+    (tmp_path / "bench/code.py").write_text("one = 1\n")
     listed = {
         "run": "run report={folder}", "list": "results", "real": "run scene.path={data}/mic"
     }  # fmt: skip
@@ -72,7 +72,7 @@ def checkout(tmp_path, monkeypatch):
     text = f"before\n\n{region('run', '', 'table')}\n\n{region('run', 'Pictures', 'picture')}\n"
     (tmp_path / "README.md").write_text(f"{text}\nafter\n")
     more = [region("run", "Pictures", "picture"), region("list", "", "table")]
-    (tmp_path / "docs" / "more.md").write_text("\n".join(more))
+    (tmp_path / "docs/more.md").write_text("\n".join(more))
     who = ["-c", "user.name=x", "-c", "user.email=x@x"]
     for words in (["init", "-q"], ["add", "."], [*who, "commit", "-qm", "all"]):
         subprocess.run(["git", *words], check=True)
@@ -95,7 +95,7 @@ def test_documents_get_tables_pictures_and_where_they_are_from(checkout, capsys)
 
 
 def test_what_is_of_the_same_code_is_used_again_and_named_otherwise(checkout, capsys):
-    def said(*words: str) -> str:
+    def said(*words):
         figures.main(["--only", "run", *words])
         return capsys.readouterr().err
 
@@ -104,7 +104,7 @@ def test_what_is_of_the_same_code_is_used_again_and_named_otherwise(checkout, ca
     first = (checkout / "README.md").read_text()
     assert said().startswith("run: made at")
     assert (checkout / "README.md").read_text() == first
-    (checkout / "bench" / "code.py").write_text("one = 2\n")
+    (checkout / "bench/code.py").write_text("one = 2\n")
     assert "of other code" in said("--check")
     assert figures.main(["--only", "run", "--check"]) == 1
 
@@ -113,9 +113,9 @@ def test_what_a_failing_command_left_is_not_shown_and_the_others_are_measured(ch
     text = (checkout / figures.LIST).read_text()
     wrong = "[wrong]\ncommand = 'run fail report={folder}'\n"
     (checkout / figures.LIST).write_text(f"{wrong}{text}")
-    (checkout / "docs" / "wrong.md").write_text(region("wrong", "", "all"))
+    (checkout / "docs/wrong.md").write_text(region("wrong", "", "all"))
     assert figures.main([]) == 1
-    assert (checkout / "docs" / "wrong.md").read_text() == region("wrong", "", "all")
+    assert (checkout / "docs/wrong.md").read_text() == region("wrong", "", "all")
     assert "|run|PSNR, dB ↑|" in (checkout / "README.md").read_text()
 
 

@@ -1,16 +1,13 @@
 """`make gpu`, rehearsed to its end on a pretended GPU."""
 
-import json
 import subprocess
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
 
-import pytest
-
 from docs import gpu as report
 from sweeps.cli import dispatch, guard
-from tests.pretended_gpu import PretendedGpu
+from tests.common import read_json
 
 TINY = [
     *("scene.width=16", "scene.train=4", "scene.test=2", "protocol.lpips=[]", "protocol.warmup=0"),
@@ -28,16 +25,11 @@ def in_this_process(step: report.Step) -> subprocess.CompletedProcess[str]:
     return subprocess.CompletedProcess(step.words, status, printed.getvalue(), said.getvalue())
 
 
-def test_it_goes_to_its_end_and_says_what_failed(
-    gpu: PretendedGpu, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_goes_to_its_end_and_says_what_failed(gpu, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(report, "ran", in_this_process)
     assert report.main(["--filter", "mlp", *TINY]) == 1
-    ended = {
-        file.stem: json.loads(file.read_text())["done"][0]
-        for file in Path("outputs/gpu").glob("*.json")
-    }
+    ended = {file.stem: read_json(file)["done"][0] for file in Path("outputs/gpu").glob("*.json")}
     assert len(ended) == 8
     assert {name for name, status in ended.items() if status} == {"tensorrt-fp16", "tensorrt-int8"}
     text = Path("outputs/gpu/report.md").read_text()
@@ -45,12 +37,10 @@ def test_it_goes_to_its_end_and_says_what_failed(
         assert said in text
 
 
-def test_what_is_done_is_not_repeated(
-    gpu: PretendedGpu, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    taken: list[str] = []
+def test_what_is_done_is_not_repeated(gpu, tmp_path, monkeypatch):
+    taken = []
 
-    def noted(step: report.Step) -> subprocess.CompletedProcess[str]:
+    def noted(step):
         taken.append(step.name)
         if step.name == "kernels" and taken.count("kernels") == 1:
             raise subprocess.TimeoutExpired("steerbench", step.limit_s, output=b"half")

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+from tests.common import ROOT
+
 PACKAGES = ("bench", "methods", "reports", "sweeps")
 MAY_IMPORT = {
     "bench": {"bench"},
@@ -111,12 +112,12 @@ def test_all_machine_code_of_a_cpu_is_kept_as_methods_kernels_cpu_keeps_it():
 @pytest.mark.parametrize(("package", "floors"), [("bench", 11), ("sweeps", 6)])
 def test_a_package_has_few_floors_and_no_circle(package, floors):
     """A file's floor is one above the highest it imports; a folder is as one file."""
-    below: dict[str, set[str]] = {}
+    below = {}
     for path in (path for path in SOURCES if path.parts[0] == package):
         names = {name.split(".")[1] for name in imports(path) if name.startswith(f"{package}.")}
         below.setdefault(path.with_suffix("").parts[1], set()).update(names)
 
-    def floor(file: str, above: tuple[str, ...] = ()) -> int:
+    def floor(file, above=()):
         assert file not in above, f"a circle: {' -> '.join((*above, file))}"
         others = below[file] - {file} & below.keys()
         return 1 + max((floor(other, (*above, file)) for other in others), default=0)

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.common import ROOT
 from tests.sweeps.test_documents import write_files
 from tests.test_project import PACKAGES
 
-ROOT = Path(__file__).parents[1]
 METADATA = ("pyproject.toml", "README.md", "LICENSE")
 TINY = (
     *("budget=tiny", "budget.steps=2", "budget.renderer_steps=2", "budget.frames=2"),
@@ -40,7 +40,7 @@ def test_a_foreign_package_of_the_same_name_is_named_in_one_line(tmp_path, found
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def installed(tmp_path_factory) -> Path:
     """The `steerbench` of an environment that has the wheel, and the libraries of this one."""
     source, folder = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
     environment = folder / "environment"
@@ -54,11 +54,11 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     subprocess.run(built, check=True)
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
     (wheel,) = folder.glob("*.whl")
-    there = ["--python", str(environment / "bin" / "python")]
+    there = ["--python", str(environment / "bin/python")]
     subprocess.run([*pip, *there, "install", *alone, str(wheel)], check=True)
     (libraries,) = environment.glob("lib/python*/site-packages")
     (libraries / "libraries.pth").write_text(sysconfig.get_path("purelib"))
-    return environment / "bin" / "steerbench"
+    return environment / "bin/steerbench"
 
 
 @pytest.fixture
@@ -66,7 +66,7 @@ def steerbench(installed, tmp_path):
     """Call it in an empty folder; what it printed."""
     elsewhere = {name: x for name, x in os.environ.items() if name != "PYTHONPATH"}
 
-    def call(*words: str, **more: str) -> str:
+    def call(*words, **more):
         given = {"cwd": tmp_path, "env": elsewhere | more, "text": True, "timeout": 900}
         ran = subprocess.run([installed, *words], capture_output=True, **given)
         assert ran.returncode == 0, ran.stderr
@@ -78,7 +78,7 @@ def steerbench(installed, tmp_path):
 @pytest.mark.slow
 def test_the_demo_of_the_wheel_writes_its_page(steerbench, tmp_path):
     steerbench("run", "+experiment=demo", *TINY)
-    assert "| gaussians |" in (tmp_path / "outputs" / "demo" / "report.md").read_text()
+    assert "| gaussians |" in (tmp_path / "outputs/demo/report.md").read_text()
 
 
 @pytest.mark.slow

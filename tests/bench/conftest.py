@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
 
@@ -35,7 +34,7 @@ def log() -> RememberingLog:
 
 
 @pytest.fixture
-def publisher(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, web: Web) -> Web:
+def publisher(monkeypatch, tmp_path, web) -> Web:
     """An empty cache, no environment, and a publisher of weights with no file."""
     monkeypatch.setattr("bench.weights.ADDRESS", web.address)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))

@@ -29,7 +29,7 @@ def case(worst: Callable[[str, str, str], float]) -> Case:
     ],
 )
 def test_an_error_is_held_against_the_tolerance_of_its_cell(seen, status, error):
-    def worst(backend: str, device: str, precision: str) -> float:
+    def worst(backend, device, precision):
         if isinstance(seen, Exception):
             raise seen
         return seen
@@ -42,7 +42,7 @@ def test_an_error_is_held_against_the_tolerance_of_its_cell(seen, status, error)
 def test_every_cell_of_every_case_gets_a_row(quiet_log):
     asked = []
 
-    def worst(backend: str, device: str, precision: str) -> float:
+    def worst(backend, device, precision):
         asked.append((backend, device, precision))
         return 0.0
 

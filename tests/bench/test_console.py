@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from bench.console import ConsoleLog
-from bench.types import SteerbenchError
+from tests.common import refusal
 
 
 @pytest.fixture
@@ -94,5 +94,5 @@ def test_a_stage_has_one_folder_for_one_key_in_any_order(plain, tmp_path):
     assert plain.stage_dir("field", {"seed": 0, "steps": 10}) == folder
     assert plain.stage_dir("field", {"seed": 1, "steps": 10}) != folder
     (tmp_path / "outputs").write_text("in the way")
-    with pytest.raises(SteerbenchError, match=r"cannot write to .*outputs"):
+    with refusal(r"cannot write to .*outputs"):
         ConsoleLog(tmp_path / "outputs").stage_dir("field", {})

@@ -20,5 +20,5 @@ def test_the_first_part_that_is_missing_and_the_nearest_name_are_said(path, said
     for file in ("in/cameras.json", *(f"many/a{number}" for number in range(1, 8))):
         (tmp_path / file).parent.mkdir(exist_ok=True)
         (tmp_path / file).touch()
-    (tmp_path / "in" / "broken").symlink_to("elsewhere")
+    (tmp_path / "in/broken").symlink_to("elsewhere")
     assert said in str(not_there(tmp_path / path))

@@ -1,11 +1,9 @@
 """What is exported for other programs, our own loaders read back as it was."""
 
-import json
 import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import pytest
 import torch
@@ -16,7 +14,8 @@ from bench.metrics import as_bytes
 from bench.scenes import blender, colmap, embedded
 from bench.scenes.export import data_camera
 from bench.trajectories import Trajectory, follow, orbit, smooth
-from bench.types import Camera, Scene, SteerbenchError, composite
+from bench.types import Camera, Scene, composite
+from tests.common import ROOT, assert_near, read_json, refusal
 
 
 @pytest.fixture
@@ -33,7 +32,7 @@ def path(scene) -> Trajectory:
 def same_cameras(scene: Scene, found: Scene, split: str, wanted: Sequence[Camera]) -> None:
     for read, given in zip(found.splits[split].cameras, wanted, strict=True):
         camera, other = data_camera(found, read), data_camera(scene, given)
-        torch.testing.assert_close(camera.c2w, other.c2w, atol=4e-6, rtol=0)  # float32, at 4.3
+        assert_near(camera.c2w, other.c2w, atol=4e-6)  # float32, at 4.3
         lens, expected = ((x.fx, x.fy, x.cx, x.cy, x.width, x.height) for x in (camera, other))
         assert lens == pytest.approx(expected, rel=1e-9)
 
@@ -55,11 +54,11 @@ def test_the_layout_of_nerfbaselines_comes_back_with_its_path(scene, path, tmp_p
     assert (found.unit_length, found.origin.tolist()) == (scene.unit_length, scene.origin.tolist())
     cameras = (given.splits["train"].cameras for given in (found, scene))
     assert all(torch.equal(a.c2w, b.c2w) for a, b in zip(*cameras, strict=True))
-    about = json.loads((tmp_path / "out/nb-info.json").read_text())
+    about = read_json(tmp_path / "out/nb-info.json")
     assert (about["id"], about["scene"]) == ("steerbench", scene.name)
     steps = follow(scene, str(tmp_path / "out/path.json")).steps
     for step, other in zip(steps, path.steps, strict=True):
-        torch.testing.assert_close(step.camera.c2w, other.camera.c2w, atol=2e-6, rtol=0)
+        assert_near(step.camera.c2w, other.camera.c2w, atol=2e-6)
 
 
 @pytest.mark.parametrize("far", [0.0, 5e6])
@@ -89,24 +88,21 @@ def test_the_points_of_a_colmap_model_fill_the_bounds(scene, path, tmp_path, qui
     points = torch.tensor([[float(x) for x in line.split()[1:4]] for line in lines]).double()
     corners = scene.origin + scene.unit_length * scene.bounds
     assert len(points) == POINTS
-    torch.testing.assert_close(
-        torch.stack((points.amin(0), points.amax(0))), corners, atol=5e-3, rtol=0
-    )
+    assert_near(torch.stack((points.amin(0), points.amax(0))), corners, atol=5e-3)
 
 
 def test_what_a_layout_cannot_hold_is_refused(scene, path, tmp_path, quiet_log):
     photographed = replace(scene, exact=None)
-    with pytest.raises(SteerbenchError, match="--path: expected a path whose frames all have true"):
+    with refusal("--path: expected a path whose frames all have true"):
         export(photographed, path, tmp_path / "b", "colmap", quiet_log)
     export(photographed, orbit(scene), tmp_path / "b", "blender", quiet_log)
-    with pytest.raises(SteerbenchError, match="expected a new or an empty folder"):
+    with refusal("expected a new or an empty folder"):
         export(scene, path, tmp_path / "b", "blender", quiet_log)
     black = replace(scene, background=torch.zeros(3))
-    with pytest.raises(SteerbenchError, match="expected square pictures on white"):
+    with refusal("expected square pictures on white"):
         export(black, path, tmp_path / "c", "nerfbaselines", quiet_log)
 
 
 def test_the_choices_of_the_command_are_the_layouts():
-    file = Path(__file__).parents[2] / "sweeps" / "commands.toml"
-    command = tomllib.loads(file.read_text())["scenes"]
+    command = tomllib.loads((ROOT / "sweeps/commands.toml").read_text())["scenes"]
     assert command["arguments"]["--layout"]["choices"] == list(LAYOUTS)

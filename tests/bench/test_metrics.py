@@ -1,8 +1,6 @@
 """Metrics against closed forms, plain re-computations and the identities they must obey."""
 
-import importlib.util
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,13 +12,13 @@ from torch import Tensor
 
 from bench.metrics import SMALLEST_SIDE, Lpips, colour_corrected, flicker, psnr, quantise, ssim
 from bench.scoring import Scoring
-from bench.types import SteerbenchError, Unavailable
+from bench.types import Unavailable
+from tests.common import refusal, seeded
 from tests.conftest import STEERBENCH_1
 
 
 def noise(height: int, width: int, seed: int = 0, device: str = "cpu") -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.rand(height, width, 3, generator=generator).to(device)
+    return torch.rand(height, width, 3, generator=seeded(seed)).to(device)
 
 
 def test_quantise_keeps_the_256_levels_and_clips_the_rest(device):
@@ -97,47 +95,30 @@ def test_colours_are_corrected_as_in_mip_nerf_360(quadratic, grey, device):
 
 def test_pictures_of_different_size_are_refused():
     small, large = noise(4, 5), noise(5, 4)
-    with pytest.raises(ValueError, match=r"previous_image: expected shape \[4, 5, 3\]"):
+    with refusal(r"previous_image: expected shape \[4, 5, 3\]", ValueError):
         flicker(small, small, large, large)
-    with pytest.raises(ValueError, match=r"reference: expected shape \[4, 5, 3\], got \[5, 4, 3\]"):
+    with refusal(r"reference: expected shape \[4, 5, 3\], got \[5, 4, 3\]", ValueError):
         psnr(small, large)
 
 
-READ = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}
-"""The layers of torchvision's `features` whose output LPIPS reads."""
-
-
-def plain_lpips(net: str, weights: dict, heads: dict, a: Tensor, b: Tensor) -> float:
-    """Zhang et al. 2018, Eq. 1, layer by layer from the weights."""
-    import torchvision  # after `lpips`, see `bench.metrics`
-
-    backbone = torchvision.models.alexnet if net == "alex" else torchvision.models.vgg16
-    features = backbone(weights=None).features
-    features.load_state_dict({name.partition(".")[2]: x for name, x in weights.items()})
-    shift = torch.tensor([-0.030, -0.088, -0.188]).view(3, 1, 1)
-    scale = torch.tensor([0.458, 0.448, 0.450]).view(3, 1, 1)
-    x = (2 * torch.stack((a, b)).permute(0, 3, 1, 2) - 1 - shift) / scale
-    distance = 0.0
-    for index, layer in enumerate(features[: READ[net][-1] + 1]):
-        x = layer(x)
-        if index in READ[net]:
-            unit = x / (x.square().sum(dim=1, keepdim=True).sqrt() + 1e-10)
-            head = heads[f"lin{READ[net].index(index)}.model.1.weight"].view(-1, 1, 1)
-            distance += (head * (unit[0] - unit[1]).square()).sum(dim=0).mean().item()
-    return distance
-
-
 @torch.no_grad()
+@pytest.mark.filterwarnings("ignore::UserWarning")  # lpips calls torchvision as it should not
 @pytest.mark.parametrize(("net", "file"), [("alex", "alexnet"), ("vgg", "vgg16")])
-def test_lpips_is_the_published_formula(net, file, lpips_weights, quiet_log, device):
-    weights = torch.load(lpips_weights / f"{file}_features.pth", weights_only=True)
-    package = Path(importlib.util.find_spec("lpips").origin).parent
-    heads = torch.load(package / "weights" / "v0.1" / f"{net}.pth", "cpu", weights_only=True)
+def test_lpips_is_that_of_its_authors_with_the_weights_in_the_order_of_their_layers(
+    net, file, lpips_weights, quiet_log, device
+):
+    """Its formula, in words of our own, is in `recompute.py`."""
     a = noise(50, 44, 7)
     b = (a + 0.2 * (noise(50, 44, 8) - 0.5)).clamp(0, 1)
     measured = Lpips(net, lpips_weights, quiet_log)(a.to(device), b.to(device))
+    import lpips  # after `Lpips`, see `bench.metrics`
+
+    weights = torch.load(lpips_weights / f"{file}_features.pth", weights_only=True)
+    model = lpips.LPIPS(net=net, pnet_rand=True, verbose=False)
+    model.net.load_state_dict(dict(zip(model.net.state_dict(), weights.values(), strict=True)))
+    expected = model(*((2 * x - 1).permute(2, 0, 1)[None] for x in (a, b))).item()
     # float32 convolutions of up to 4,608 products a position: relative error below 1e-4.
-    assert measured == pytest.approx(plain_lpips(net, weights, heads, a, b), rel=1e-3)
+    assert measured == pytest.approx(expected, rel=1e-3)
 
 
 def test_figures_are_those_of_nerfbaselines(device):
@@ -158,14 +139,14 @@ def test_lpips_is_zero_for_equal_pictures_down_to_the_smallest_size(net, lpips_w
     assert lpips(noise(side, side), noise(side, side)) == 0.0
     assert lpips(noise(side, side, 1), noise(side, side, 2)) > 0.0
     for metric, least in ((lpips, side), (ssim, 11)):
-        with pytest.raises(SteerbenchError, match=f"at least {least} x {least} pixels, got 40 x"):
+        with refusal(f"at least {least} x {least} pixels, got 40 x"):
             metric(noise(least - 1, 40), noise(least - 1, 40))
 
 
 def test_lpips_refuses_the_weights_of_another_network(lpips_weights, quiet_log, tmp_path):
     path = tmp_path / "vgg16_features.pth"
     path.write_bytes((lpips_weights / "alexnet_features.pth").read_bytes())
-    with pytest.raises(Unavailable, match=r"vgg16_features.pth: expected the `features"):
+    with refusal(r"vgg16_features.pth: expected the `features", Unavailable):
         Lpips("vgg", tmp_path, quiet_log)
 
 

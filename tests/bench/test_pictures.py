@@ -10,7 +10,8 @@ from PIL import Image
 from torch import Tensor
 
 from bench import pictures
-from bench.types import Split, SteerbenchError
+from bench.types import Split
+from tests.common import refusal, seeded
 from tests.conftest import QUICK
 
 FACTS = {"method": "theirs", "scene": "a"}
@@ -24,8 +25,7 @@ def write(folder: Path, images: dict[str, Tensor]) -> Path:
 
 
 def noise(channels: int = 3, size: tuple[int, int] = (16, 20), seed: int = 0) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randint(256, (*size, channels), dtype=torch.uint8, generator=generator)
+    return torch.randint(256, (*size, channels), dtype=torch.uint8, generator=seeded(seed))
 
 
 GREY = torch.full((16, 20, 3), 100, dtype=torch.uint8)
@@ -86,7 +86,7 @@ def test_pictures_in_subfolders_match_by_their_path(tmp_path, quiet_log, folder)
         found = pictures.score(pairs, QUICK, {}, FACTS, quiet_log)
         assert found.frames["psnr"].tolist() == [math.inf] * 3
     flat = write(tmp_path / "flat", {"1.png": noise(), "2.png": noise()})
-    with pytest.raises(SteerbenchError, match=r"true pictures of different names.* several of 1"):
+    with refusal(r"true pictures of different names.* several of 1"):
         pictures.pairs_with_split(flat, split)
 
 
@@ -116,29 +116,29 @@ def test_depth_and_normals_beside_a_picture_are_ignored(tmp_path):
 def test_pictures_that_do_not_match_are_named(tmp_path, match, names, said):
     ours = write(tmp_path / "ours", dict.fromkeys(names, noise()))
     true = write(tmp_path / "true", dict.fromkeys(["a.png", "b.png"], noise()))
-    with pytest.raises(SteerbenchError, match=said):
+    with refusal(said):
         pictures.pairs_with_folder(ours, true, match)
-    with pytest.raises(SteerbenchError, match="expected a folder, got no"):
+    with refusal("expected a folder, got no"):
         pictures.listed(tmp_path / "nowhere")
     (tmp_path / "linear").mkdir()
     (tmp_path / "linear/0.exr").touch()
-    with pytest.raises(SteerbenchError, match=r"expected pictures .* got 0\.exr"):
+    with refusal(r"expected pictures .* got 0\.exr"):
         pictures.listed(tmp_path / "linear")
 
 
 def test_pictures_that_a_run_kept_are_refused_by_their_names(tmp_path):
     for kind in ("rendered", "truth", "error"):
         Image.new("RGB", (4, 4)).save(tmp_path / f"0003-{kind}.png")
-    with pytest.raises(SteerbenchError, match=r"scored already.*steerbench compare"):
+    with refusal(r"scored already.*steerbench compare"):
         pictures.listed(tmp_path)
 
 
 def test_two_truths_of_one_name_have_no_picture_of_their_own(tmp_path):
     ours = write(tmp_path / "ours", {"r_10.png": noise(), "r_9.png": noise()})
     said = "--match order takes both in their order, got several of 0001"
-    with pytest.raises(SteerbenchError, match=said):
+    with refusal(said):
         pictures.matched(ours, ["0001", "0001"], "name")
-    with pytest.raises(SteerbenchError, match=r"in the order of letters, got r_9\.png, r_10\.png"):
+    with refusal(r"in the order of letters, got r_9\.png, r_10\.png"):
         pictures.matched(ours, ["images/10", "images/9"], "order")
     files = pictures.matched(ours, ["0001", "0001"], "order")
     assert [file.name for file in files] == ["r_9.png", "r_10.png"]
@@ -158,7 +158,7 @@ def test_a_picture_that_cannot_be_scored_is_named(tmp_path, quiet_log, ours, tru
         whole = (theirs / "a.png").read_bytes()
         (theirs / "a.png").write_bytes(whole[: len(whole) // 2])
     pairs = pictures.pairs_with_folder(theirs, write(tmp_path / "true", {"a.png": true}))
-    with pytest.raises(SteerbenchError, match=message):
+    with refusal(message):
         pictures.score(pairs, QUICK, {}, FACTS, quiet_log)
 
 

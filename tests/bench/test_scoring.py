@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from bench.errors import SteerbenchError
 from bench.metrics import flicker, quantise
 from bench.scoring import Scoring, taken
 from bench.types import Camera, Frame, composite
+from tests.common import refusal
 from tests.conftest import QUICK
 
 WHITE = torch.ones(3)
@@ -99,7 +99,7 @@ def test_a_frame_is_taken_as_a_copy():
     ],
 )
 def test_what_is_no_frame_is_refused_with_the_method_and_the_part(part, value, why):
-    with pytest.raises(SteerbenchError, match=f"mine: frame 7: {part}: expected .*{why}"):
+    with refusal(f"mine: frame 7: {part}: expected .*{why}"):
         taken(replace(PLAIN, **{part: value}), CAMERA, "mine", 7)
 
 

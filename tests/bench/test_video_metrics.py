@@ -26,7 +26,7 @@ def test_tpsnr_and_tlpips_are_those_of_the_change_from_frame_to_frame():
     pictures = [torch.from_numpy(as_bytes(noise(16, 12, seed))) for seed in range(4)]
     now, true, before, true_before = (picture / 255 for picture in pictures)
 
-    def lpips(one: Tensor, other: Tensor) -> float:
+    def lpips(one, other):
         return (one - other).square().mean().item()
 
     protocol = replace(QUICK, name="path", lpips=("alex",), columns=("tlpips", "tpsnr"))

@@ -57,7 +57,7 @@ def test_who_waits_for_an_ask_wakes_up(monkeypatch):
     turns, woken = Turns(), []
     wait = turns._changed.wait
 
-    def wait_and_ask(timeout: float | None = None) -> None:
+    def wait_and_ask(timeout=None):
         threading.Thread(target=turns.want, args=("a", Ask(CAMERA))).start()
         woken.append(wait(timeout))
 

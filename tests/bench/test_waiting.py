@@ -49,7 +49,7 @@ def test_trainings_wait_only_for_those_on_their_cores_and_a_timing_for_all():
 
 
 def test_who_waits_is_told_for_whom_how_far_that_is_and_the_next_when_it_was_killed(tmp_path):
-    def start(how: str) -> subprocess.Popen[str]:
+    def start(how):
         words = [sys.executable, "-c", WAITER, str(tmp_path / "device.lock"), how]
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
         return subprocess.Popen(words, **pipes)

@@ -2,7 +2,6 @@
 
 import linecache
 import warnings
-from typing import Any
 
 import pytest
 import torch
@@ -18,7 +17,7 @@ def test_the_line_that_waits_or_calls_what_waits_in_torch_is_named(gpu):
     ((line, count),) = waits.items()
     assert (line.path, count) == (__file__, 2)
     assert linecache.getline(*line).strip() == "torch.unique(x)"
-    scope: dict[str, Any] = {}
+    scope = {}
     text = "def wait():\n import warnings\n warnings.warn('called a synchronizing CUDA operation')"
     exec(compile(text, torch.functional.__file__, "exec"), scope)
     with device_waits() as waits:

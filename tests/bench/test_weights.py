@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from bench.types import SteerbenchError, Unavailable
+from bench.types import Unavailable
 from bench.weights import BACKBONES, load_features, locate
+from tests.common import refusal
 
 STATE = {"features.0.weight": torch.ones(2), "classifier.1.weight": torch.zeros(3)}
 
@@ -27,7 +28,7 @@ def weights(publisher, monkeypatch) -> tuple[str, bytes]:
 
 
 def cache(tmp_path: Path) -> Path:
-    return tmp_path / "torch" / "hub" / "checkpoints"
+    return tmp_path / "torch/hub/checkpoints"
 
 
 def test_weights_dir_precedes_environment_and_cache(publisher, monkeypatch, tmp_path, quiet_log):
@@ -48,10 +49,10 @@ def test_weights_with_their_published_name_are_read_unless_damaged(tmp_path, wei
     assert path == tmp_path / name
     assert torch.equal(features["features.0.weight"], STATE["features.0.weight"])
     (tmp_path / name).write_bytes(content[:-1] + b"?")
-    with pytest.raises(Unavailable, match=f"{name}: expected a SHA-256 that begins with"):
+    with refusal(f"{name}: expected a SHA-256 that begins with", Unavailable):
         locate("alex", tmp_path, quiet_log)
     (tmp_path / "alexnet_features.pth").write_bytes(content[:100])
-    with pytest.raises(Unavailable, match=r"alexnet_features.pth: expected a torch state dict"):
+    with refusal(r"alexnet_features.pth: expected a torch state dict", Unavailable):
         load_features("alex", tmp_path, quiet_log)
 
 
@@ -82,7 +83,7 @@ def test_a_failed_download_says_what_to_do_and_hinders_neither_others_nor_a_seco
 def test_downloaded_weights_are_kept_if_right(tmp_path, publisher, weights, quiet_log):
     name, content = weights
     publisher.files[f"/{name}"] = content[:-1]
-    with pytest.raises(Unavailable, match="SHA-256"):
+    with refusal("SHA-256", Unavailable):
         locate("alex", None, quiet_log)
     assert not (cache(tmp_path) / name).exists()
     publisher.files[f"/{name}"] = content
@@ -92,7 +93,7 @@ def test_downloaded_weights_are_kept_if_right(tmp_path, publisher, weights, quie
 
 
 def test_an_unknown_network_and_a_missing_folder_are_errors_not_gaps(tmp_path, quiet_log):
-    with pytest.raises(SteerbenchError, match="expected one of alex, vgg, got 'resnet'"):
+    with refusal("expected one of alex, vgg, got 'resnet'"):
         locate("resnet", None, quiet_log)
-    with pytest.raises(SteerbenchError, match=r"weights_dir: expected a folder, got .*nowhere"):
+    with refusal(r"weights_dir: expected a folder, got .*nowhere"):
         locate("alex", tmp_path / "nowhere", quiet_log)

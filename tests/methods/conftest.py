@@ -15,6 +15,7 @@ from methods.instant_ngp.field import HashField
 from methods.instant_ngp.stage1 import TrainedField, train_field
 from methods.kernels.encode import HashGrid
 from methods.kernels.types import Occupancy
+from tests.common import seeded
 from tests.methods.trainings import TAUGHT, TEACHER
 
 SIZE = 32
@@ -57,7 +58,7 @@ class Work(NullProbe):
 
 
 @pytest.fixture(scope="session", params=["reference", "cpu"])
-def backend(request: pytest.FixtureRequest) -> str:
+def backend(request) -> str:
     return request.param
 
 
@@ -76,7 +77,7 @@ def ball_scene() -> Scene:
 
 
 @pytest.fixture(scope="session")
-def shared_log(tmp_path_factory: pytest.TempPathFactory) -> Log:
+def shared_log(tmp_path_factory) -> Log:
     """One folder for all tests, of all processes: what one of them trained, the others find."""
     root = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
@@ -85,15 +86,15 @@ def shared_log(tmp_path_factory: pytest.TempPathFactory) -> Log:
 
 
 @pytest.fixture(scope="module")
-def teacher(ball_scene: Scene, shared_log: Log) -> TrainedField:
+def teacher(ball_scene, shared_log) -> TrainedField:
     """A field that has learned the ball."""
     return train_field(TEACHER, ball_scene, TAUGHT, shared_log)
 
 
 @pytest.fixture
-def cloud(device: str) -> Cloud:
+def cloud(device) -> Cloud:
     """A random field, dense enough to stop rays, in a box of the cube."""
-    field = HashField(GRID, precision="fp32", generator=torch.Generator().manual_seed(0))
+    field = HashField(GRID, precision="fp32", generator=seeded(0))
     with torch.no_grad():
         field.table.mul_(3e4)
     cells = torch.zeros(32, 32, 32, dtype=torch.bool, device=device)

@@ -3,6 +3,7 @@
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 
 from methods.instant_ngp.field import HashField
@@ -15,7 +16,12 @@ from methods.rendering.sampling import Sampling
 from methods.steernerf.options import EVERYWHERE, MotionOptions
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.unet import UNet
+from tests.common import ROOT, seeded
 from tests.methods.usual import usual
+
+RELEASE = np.load(ROOT / "tests/data/steernerf_release.npz")
+"""What the released code computes: a U-Net on formulas, and two frames of 10 x 12 pixels, brought
+into a third of 40 x 48."""
 
 SMALL_GRID = HashGrid(levels=4, features=2, log2_table=8, n_min=4, n_max=16)
 STEPS = {"step": 8.0, "stop": STOP}
@@ -56,7 +62,7 @@ def trained_field(field: HashField) -> TrainedField:
 
 def misty_field(precision: str = "bf16", backend: str = "auto", channels: int = 4) -> HashField:
     """A field in which every sample matters: density of about 10, features all different."""
-    generator = torch.Generator().manual_seed(3)
+    generator = seeded(3)
     field = HashField(
         SMALL_GRID, channels, precision=precision, backend=backend, generator=generator
     )
@@ -78,7 +84,7 @@ def new_pipeline(**options: Any) -> Pipeline:
 
 def shaken(renderer: UNet) -> UNet:
     """The renderer with no weight that is 0, as after some training."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     with torch.no_grad():
         for parameter in renderer.parameters():
             parameter.add_(0.02 * torch.randn(parameter.shape, generator=generator))

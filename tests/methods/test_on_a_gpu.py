@@ -1,7 +1,5 @@
 """Every method on a pretended GPU: it trains and renders there, with the numbers of the CPU."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
@@ -9,7 +7,6 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
-import pandas as pd
 import pytest
 import torch
 
@@ -41,12 +38,13 @@ from methods.steernerf.stage2 import JointTraining
 from methods.steernerf.unet import UNet
 from methods.students.fields import StudentField
 from methods.training import loop
+from tests.common import seeded
 from tests.conftest import EMPTY, QUICK
 from tests.methods.models import small_joint, small_model, small_motion, small_rendering
 from tests.methods.small_students import extraction
 from tests.methods.trainings import killed
 from tests.methods.usual import field_options, lessons, new_gaussians, new_ngp, usual
-from tests.pretended_gpu import PretendedGpu, pretended_gpu
+from tests.pretended_gpu import pretended_gpu
 
 pytestmark = pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
 needs_triton = pytest.mark.skipif(
@@ -135,7 +133,7 @@ def fewer(split: Split, count: int, side: int = 16) -> Split:
 
 
 @pytest.fixture(scope="module")
-def scene(ball_scene: Scene) -> Scene:
+def scene(ball_scene) -> Scene:
     """A few small pictures of the ball, of which the middle is learned: few cells."""
     splits = {"train": fewer(ball_scene.splits["train"], 4)}
     splits["test"] = fewer(ball_scene.splits["test"], 2)
@@ -144,7 +142,7 @@ def scene(ball_scene: Scene) -> Scene:
 
 
 @pytest.fixture(autouse=True)
-def one_round(monkeypatch: pytest.MonkeyPatch) -> None:
+def one_round(monkeypatch) -> None:
     """Of whole rays, as on a GPU, also where they are hidden in training, so that the sums have the
     same groups; and as few runs of a network before it is recorded."""
     for kind in (HashField, StudentField, KiloField, NerfField, NsvfField):
@@ -154,13 +152,13 @@ def one_round(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_it_trains_and_renders_as_on_the_cpu(name: str, scene: Scene, tmp_path: Path) -> None:
+def test_it_trains_and_renders_as_on_the_cpu(name, scene, tmp_path):
     drawn = here_and_there(lambda device: frames(fitted(name, device, scene, tmp_path), scene))
     assert_alike(*drawn)
 
 
 @pytest.fixture
-def products_of_bfloat16(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def products_of_bfloat16(monkeypatch) -> Iterator[None]:
     """As real GPUs have."""
     capabilities = {**torch.cpu.get_capabilities(), "avx512_bf16": True}
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities)
@@ -170,18 +168,16 @@ def products_of_bfloat16(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("products_of_bfloat16")
-def test_with_products_of_bfloat16_it_trains_and_renders_as_on_the_cpu(
-    scene: Scene, tmp_path: Path
-) -> None:
-    def drawn(device: str) -> list[torch.Tensor]:
+def test_with_products_of_bfloat16_it_trains_and_renders_as_on_the_cpu(scene, tmp_path):
+    def drawn(device):
         assert multiplies_bf16(device)
         return frames(fitted("steernerf", device, scene, tmp_path), scene)
 
     assert_alike(*here_and_there(drawn))
 
 
-def test_its_rows_are_those_of_the_cpu(scene: Scene, tmp_path: Path) -> None:
-    def rows(device: str) -> pd.DataFrame:
+def test_its_rows_are_those_of_the_cpu(scene, tmp_path):
+    def rows(device):
         """All but times and peak memory."""
         method = METHODS["ngp"](device=device, backend="reference")
         protocol = replace(QUICK, warmup=0)
@@ -198,9 +194,7 @@ def test_its_rows_are_those_of_the_cpu(scene: Scene, tmp_path: Path) -> None:
     assert set(there["device"]) == {"cuda"}
 
 
-def test_killed_in_stage_2_it_goes_on_as_if_it_had_not_been(
-    gpu: PretendedGpu, scene: Scene, tmp_path: Path
-) -> None:
+def test_killed_in_stage_2_it_goes_on_as_if_it_had_not_been(gpu, scene, tmp_path):
     whole = frames(fitted("steernerf", "cuda", scene, tmp_path / "whole"), scene)
     with killed(JointTraining, 1):
         fitted("steernerf", "cuda", scene, tmp_path / "killed")
@@ -209,12 +203,9 @@ def test_killed_in_stage_2_it_goes_on_as_if_it_had_not_been(
 
 
 @pytest.mark.parametrize("places", [("cuda", "cpu"), ("cpu", "cuda")])
-def test_what_was_trained_at_one_place_goes_on_at_the_other(
-    gpu: PretendedGpu, places: tuple[str, str], scene: Scene, tmp_path: Path
-) -> None:
-    def training(device: str) -> FieldTraining:
-        generator = torch.Generator().manual_seed(0)
-        field = HashField(GRID, backend="reference", generator=generator).to(device)
+def test_what_was_trained_at_one_place_goes_on_at_the_other(gpu, places, scene, tmp_path):
+    def training(device):
+        field = HashField(GRID, backend="reference", generator=seeded(0)).to(device)
         return FieldTraining(field, scene, BUDGET, STAGE1, seed=0)
 
     first, second = map(training, places)
@@ -224,14 +215,14 @@ def test_what_was_trained_at_one_place_goes_on_at_the_other(
     for one in (first, second):
         one.advance()
     assert second.field.device.type == places[1]
-    for name, value in first.result().items():
-        assert torch.equal(value.cpu(), second.result()[name].cpu()), name
+    results = ({name: x.cpu() for name, x in one.result().items()} for one in (first, second))
+    assert_equal(*results)
 
 
 @pytest.mark.parametrize("name", ["ngp", "nsvf", "steernerf"])
 def test_a_frame_waits_for_its_rays_and_once_a_round_of_samples(
-    gpu: PretendedGpu, name: str, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    gpu, name, scene, tmp_path, monkeypatch
+):
     method = fitted(name, "cuda", scene, tmp_path)
     monkeypatch.setattr(frame, "GPU_SAMPLES", 1)
     march = Mock(wraps=frame.march)
@@ -244,7 +235,7 @@ def test_a_frame_waits_for_its_rays_and_once_a_round_of_samples(
         assert waits.total() <= 2 + march.call_count <= 12
 
 
-def test_a_step_of_stage_1_waits_less_than_three_times(gpu: PretendedGpu, scene: Scene) -> None:
+def test_a_step_of_stage_1_waits_less_than_three_times(gpu, scene):
     field = HashField(GRID, backend="reference").to("cuda")
     training = FieldTraining(field, scene, BUDGET, STAGE1, seed=0)
     training.advance()
@@ -254,20 +245,18 @@ def test_a_step_of_stage_1_waits_less_than_three_times(gpu: PretendedGpu, scene:
     assert waits.total() < 3 * 2 * EVERY
 
 
-def test_a_step_of_stage_2_waits_a_few_times(
-    gpu: PretendedGpu, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_step_of_stage_2_waits_a_few_times(gpu, scene, tmp_path, monkeypatch):
     """For the rays, their samples, the visible ones and the errors."""
     advance, counts = JointTraining.advance, []
 
-    def counted(training: JointTraining) -> dict[str, float]:
+    def counted(training):
         with device_waits() as waits:
             errors = advance(training)
         counts.append(waits.total())
         assert bool(errors) == (training.step > 1)  # those of the step before
         return errors
 
-    def apart(remember: Callable[..., None], *args: Any) -> None:
+    def apart(remember, *args):
         with device_waits():
             remember(*args)
 
@@ -299,9 +288,7 @@ def smallest(name: str, **where: Any) -> Method:
 @pytest.mark.slow
 @needs_triton
 @pytest.mark.parametrize("name", ["ngp", "steernerf", "gaussians"])
-def test_by_triton_it_trains_and_renders_as_on_the_cpu(
-    name: str, ball_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_by_triton_it_trains_and_renders_as_on_the_cpu(name, ball_scene, tmp_path, monkeypatch):
     from triton.runtime.interpreter import interpreter_builder as builder
 
     # What takes half of the time, and is looked for by the tests of the kernels.
@@ -311,7 +298,7 @@ def test_by_triton_it_trains_and_renders_as_on_the_cpu(
     tiny = replace(ball_scene, splits=splits)
     budget = replace(BUDGET, steps=1, samples=64, renderer_steps=1)
 
-    def drawn(device: str) -> list[torch.Tensor]:
+    def drawn(device):
         method = smallest(name, device=device, backend="gpu")
         method.fit(tiny, budget, ConsoleLog(tmp_path / device, quiet=True))
         return frames(method, tiny)
@@ -324,14 +311,12 @@ def test_by_triton_it_trains_and_renders_as_on_the_cpu(
 @pytest.mark.slow
 @needs_triton
 @pytest.mark.usefixtures("products_of_bfloat16")
-def test_steps_and_frames_are_few_launches(
-    gpu: PretendedGpu, ball_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_steps_and_frames_are_few_launches(gpu, ball_scene, tmp_path, monkeypatch):
     """Each takes some microseconds, whatever it computes."""
-    steps: list[int] = []
+    steps = []
     advance, march = FieldTraining.advance, Mock(wraps=frame.march)
 
-    def advanced(training: FieldTraining) -> dict[str, float]:
+    def advanced(training):
         before = gpu.launched
         errors = advance(training)
         steps.append(gpu.launched - before)
@@ -371,8 +356,8 @@ WAIT = [("march", "limit 1")]
 @needs_triton
 @pytest.mark.parametrize("which", [*GO_ON, *WAIT], ids=" ".join)
 def test_a_case_of_a_kernel_of_triton_is_computed_there_as_on_the_cpu(
-    which: tuple[str, str],
-) -> None:
+    which,
+):
     """And while it is computed, the host goes on."""
     case = next(case for case in found("cases") if (case.subject, case.name) == which)
     assert isinstance(case.error, Difference)

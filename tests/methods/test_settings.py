@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from methods.steernerf.options import RangeReduction
+from tests.common import refusal
 from tests.methods.models import small_joint, small_model, small_motion, small_rendering
 from tests.methods.small_students import SMALL, extraction
 from tests.methods.trainings import GRID, QUICK
@@ -59,6 +60,6 @@ REFUSED: list[tuple[Callable[..., Any], str, Any]] = [
 
 
 @pytest.mark.parametrize(("make", "setting", "value"), REFUSED)
-def test_wrong_settings_are_refused(make: Callable[..., Any], setting: str, value: Any) -> None:
-    with pytest.raises(ValueError, match=f"^{setting}: expected"):
+def test_wrong_settings_are_refused(make, setting, value):
+    with refusal(f"^{setting}: expected", ValueError):
         make(**{setting.rpartition(".")[2]: value})

@@ -1,6 +1,5 @@
 """Rows whose figures are known, several runs, and runs with other figures."""
 
-import json
 import math
 import shutil
 from collections.abc import Mapping
@@ -17,6 +16,7 @@ from bench.sharing import write_sums
 from reports.paper_tables import PaperTable, Place
 from reports.runs import Repeated, Run, load_runs
 from sweeps.tables import chosen
+from tests.common import read_json, write_json
 
 TABLES = {table.name: table for table in chosen()}
 """Those of the paper."""
@@ -53,7 +53,7 @@ def rows() -> pd.DataFrame:
 
 
 @pytest.fixture
-def rows_with_cold(rows: pd.DataFrame) -> pd.DataFrame:
+def rows_with_cold(rows) -> pd.DataFrame:
     """The same of a method that looks back: two cold frames, 3 dB worse and half as fast."""
     cold = rows[rows["phase"] == "steady"].assign(phase="cold", n=2)
     figures = ["value", "lo", "hi"]
@@ -104,15 +104,15 @@ def of_scene(run: Run, scene: str, by: float = 0.0, **facts: object) -> Run:
 
 
 @pytest.fixture
-def run(store: Store, stored_run: str) -> Run:
+def run(store, stored_run) -> Run:
     """A run of six scored frames, three of them pictured."""
     (found,) = load_runs(store, [stored_run])
     return found
 
 
 @pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    figures: list[Figure] = []
+def drawn(monkeypatch) -> list[Figure]:
+    figures = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
     return figures
 
@@ -120,10 +120,10 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
 def rewrite(store: Store, key: str, **others: object) -> None:
     """Change the record of a stored run; `machine` and `scene` are changed in part."""
     path = store.folder / key / "record.json"
-    record = json.loads(path.read_text())
+    record = read_json(path)
     for name, value in others.items():
         record[name] = {**record.get(name, {}), **value} if isinstance(value, dict) else value
-    path.write_text(json.dumps(record))
+    write_json(path, record)
     write_sums(path.parent)
 
 
@@ -143,7 +143,7 @@ def rename(store: Store, key: str, method: str) -> None:
 
 
 @pytest.fixture
-def several(store: Store, stored_run: str) -> tuple[Store, dict[str, str]]:
+def several(store, stored_run) -> tuple[Store, dict[str, str]]:
     """A store with six runs of the same frames, and the method of each.
 
     The last was made on another machine; all else is the same.

@@ -4,10 +4,10 @@ import math
 
 import pytest
 
-from bench.errors import SteerbenchError
 from reports.comparison import comparison, ranks, shown_as
 from reports.lines import as_lines
-from reports.runs import Repeated, Run
+from reports.runs import Repeated
+from tests.common import refusal
 from tests.reports.conftest import changed, elsewhere, run_of
 
 FACTS = dict.fromkeys(("split", "trajectory", "budget", "protocol", "device"), "same")
@@ -15,7 +15,7 @@ FACTS = dict.fromkeys(("split", "trajectory", "budget", "protocol", "device"), "
 
 @pytest.fixture
 def make(rows):
-    def make_run(label: str, rows=rows, digest: str = "d", **figures: float) -> Run:
+    def make_run(label, rows=rows, digest="d", **figures):
         machine, scene = {"cpu": "EPYC", "threads": 2, "gpus": []}, {"digest": digest}
         run = run_of(rows.assign(**FACTS), label, machine=machine, scene=scene)
         return changed(run, figures)
@@ -70,7 +70,7 @@ def test_cold_frames_have_a_table_of_their_own_and_compete_among_themselves(make
 
 
 def test_a_mean_shares_the_rank_of_a_better_one_within_their_intervals(make):
-    def line(*psnr: float) -> Repeated:
+    def line(*psnr):
         return Repeated("", [changed(make("m", psnr=x), {}, seed=n) for n, x in enumerate(psnr)])
 
     best, close, far = line(31.0, 31.2), line(30.9, 31.25), line(20.0, 20.2)
@@ -103,5 +103,5 @@ def test_a_metric_without_a_better_side_has_no_best(make, rows):
 
 
 def test_a_metric_that_does_not_exist_is_refused():
-    with pytest.raises(SteerbenchError, match="pnsr: no such metric; expected one as"):
+    with refusal("pnsr: no such metric; expected one as"):
         shown_as("pnsr")

@@ -9,7 +9,7 @@ import pytest
 
 from reports import export
 from reports.paper_tables import Line, PaperTable, Place
-from reports.runs import Repeated, Run
+from reports.runs import Repeated
 from tests.reports.conftest import changed, measured_of
 
 LINES = {
@@ -29,7 +29,7 @@ TABLE = PaperTable(
 
 
 @pytest.fixture
-def measured(run: Run) -> dict[Place, Repeated]:
+def measured(run) -> dict[Place, Repeated]:
     """Three measured lines; two of them differ by less than the decimals show."""
     figures = {
         "t19": {"psnr": 30.456, "ssim": 0.9512, "size_bytes.total": 25.24e6},

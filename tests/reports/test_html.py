@@ -14,7 +14,6 @@ import pytest
 from markdown_it import MarkdownIt
 from PIL import Image
 
-from bench.results import Store
 from reports import publish
 from reports.images import ComparedFrame, RunView
 from reports.page import write_page
@@ -49,13 +48,13 @@ def cells(page: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def pages(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def pages(tmp_path_factory) -> Path:
     """Where the page of each device is kept: no test changes one."""
     return tmp_path_factory.mktemp("pages")
 
 
 @pytest.fixture
-def page(several: tuple[Store, dict[str, str]], pages: Path, device: str) -> Path:
+def page(several, pages, device) -> Path:
     """The folder of the page of six runs, and of one that failed."""
     if not (pages / device).exists():
         write_page(*several, pages / device, {"gone | lost": "no memory"})
@@ -63,7 +62,7 @@ def page(several: tuple[Store, dict[str, str]], pages: Path, device: str) -> Pat
 
 
 @pytest.fixture
-def parsed(page: Path) -> Parsed:
+def parsed(page) -> Parsed:
     return Parsed((page / "report.html").read_text())
 
 
@@ -94,7 +93,7 @@ def test_every_picture_says_what_it_shows(parsed):
 
 def test_pictures_lose_nothing(several, stored_run, parsed):
     (shown,) = (image for image in parsed.of("img") if FIRST.fullmatch(image["alt"]))
-    stored = several[0].folder / stored_run / "pictures" / "0000-rendered.png"
+    stored = several[0].folder / stored_run / "pictures/0000-rendered.png"
     content = base64.b64decode(shown["src"].partition(",")[2])
     with Image.open(io.BytesIO(content)) as picture, Image.open(stored) as rendered:
         assert np.array_equal(picture.convert("RGB"), rendered.convert("RGB"))
@@ -136,7 +135,7 @@ def test_names_are_text_and_nothing_else(store, stored_run, tmp_path):
     rewrite(store, stored_run, command=HOSTILE, error_map=HOSTILE)
     rename(store, stored_run, HOSTILE)
     write_page(store, [stored_run], tmp_path / "page", {HOSTILE: HOSTILE})
-    text = (tmp_path / "page" / "report.html").read_text()
+    text = (tmp_path / "page/report.html").read_text()
     assert "<script>x" not in text
     assert text.count("&lt;script&gt;x") > 10
     assert len(Parsed(text).of("script")) == 1

@@ -1,13 +1,11 @@
 """The page about the paper's tables, and the plots of all pages."""
 
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
 
 from reports import figures
-from reports.images import Picture
 from reports.lines import Lines
 from reports.paper_page import PAGE, write_paper_page
 from reports.paper_tables import Line, PaperTable, Place
@@ -29,7 +27,7 @@ def test_every_line_that_is_shown_in_a_figure_is_one_of_the_tables():
 
 
 def test_the_page_has_every_table_and_every_figure(run, tmp_path):
-    measured: dict[Place, Repeated] = {}
+    measured = {}
     for table in TABLES.values():
         measured |= measured_of(table, dict.fromkeys(table.lines, run))
     page = write_paper_page([*TABLES.values()], measured, tmp_path)
@@ -49,10 +47,10 @@ def test_a_method_has_one_mark_at_its_first_measured_line_and_an_added_one_is_in
 ):
     (table,) = chosen("table1", methods=["x"])
     measured = measured_of(table, dict.fromkeys(table.lines.keys() - {"bf16"}, run))
-    drawn: list[list[str]] = []
+    drawn = []
     real = figures.quality_plot
 
-    def watched(shown: Sequence[Repeated], metric: str) -> Picture:
+    def watched(shown, metric):
         drawn.append([line.label for line in shown])
         return real(shown, metric)
 
@@ -94,12 +92,15 @@ def test_a_page_of_nothing_still_says_what_is_missing(tmp_path):
     assert "![" not in text
 
 
-def test_a_page_of_ones_own_table_has_its_title_and_pictures(run, tmp_path):
-    table = PaperTable("mine", "My table", ["psnr"], {"a": Line("here", {})})
+def test_a_page_of_ones_own_table_has_its_title_figures_and_pictures(run, tmp_path):
+    table = PaperTable(
+        "mine", "My table", ["psnr"], {"a": Line("here", {}), "b": Line("there", {})}
+    )
     text = write_paper_page([table], measured_of(table, {"a": run}), tmp_path).read_text()
     assert text.startswith("# My table\n")
+    assert f"| here | {run.values['psnr']:.2f} |" in text
     assert "![Ground truth, here; a detail of each; error maps]" in text
-    assert "paper" not in text
+    assert "aper" not in text
 
 
 def test_a_curve_has_a_point_for_every_scored_frame_and_hollow_ones_for_cold(run, tmp_path, drawn):

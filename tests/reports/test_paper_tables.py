@@ -40,7 +40,7 @@ TABLE = PaperTable(
 
 
 @pytest.fixture
-def run(run: Run) -> Run:
+def run(run) -> Run:
     """A run of known figures."""
     figures = {"psnr": 30.456, "frame_ms": 12.0, "stage_ms.other": 8.0}
     return changed(replace(run, rows=run.rows[run.rows["metric"].isin(figures)]), figures)
@@ -111,16 +111,6 @@ def test_a_section_shows_its_blocks_with_distances_and_says_what_to_mind(run, tm
     assert "Mind this." not in second
     alone = {place: line for place, line in measured.items() if place.block == FIRST}
     assert SECOND not in markdown(section(table, alone), tmp_path)
-
-
-def test_a_table_without_published_figures_shows_what_was_measured(run, tmp_path):
-    lines = {key: Line(line.label, {}) for key, line in LINES.items()}
-    table = PaperTable("mine", "My table", METRICS, lines)
-    measured = {Place("mine", "", "a"): Repeated("here", [run])}
-    text = markdown(section(table, measured), tmp_path)
-    assert text.startswith("## My table")
-    assert "| here | 30.46 |" in text
-    assert "aper" not in text
 
 
 def test_a_cell_has_the_distance_to_the_reference_here_and_in_the_paper(run):

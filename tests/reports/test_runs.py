@@ -99,12 +99,9 @@ def test_other_scenes_and_other_machines_are_other_conditions(run):
     assert over_scenes([a, elsewhere(b)]).computer != run.computer
 
 
-@pytest.mark.parametrize("scenes", ["ab", "a"])
-def test_each_scene_has_its_line_where_there_are_several(run, scenes, tmp_path):
+def test_a_single_scene_has_no_line_beside_its_mean(run, tmp_path):
     table = PaperTable("table9", "t", ["psnr"], {"x": Line("x", {})}, scenes=["psnr"])
-    by_scene = {name: [of_scene(run, name, place)] for place, name in enumerate(scenes)}
-    mean = over_scenes([of_one for (of_one,) in by_scene.values()])
-    measured = {Place("table9", "", "x"): Repeated("x", [mean], by_scene=by_scene)}
+    measured = {Place("table9", "", "x"): Repeated("x", [run], by_scene={"a": [run]})}
     shown = markdown(section(table, measured), tmp_path)
-    lines = [f"| {name}: x | {run.values['psnr'] + place:.2f} |" for place, name in enumerate("ab")]
-    assert all((line in shown) == (len(scenes) > 1) for line in lines)
+    assert "| x | " in shown
+    assert "a: x" not in shown

@@ -49,21 +49,19 @@ class Outcome(NamedTuple):
 
 
 @pytest.fixture
-def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def elsewhere(tmp_path, monkeypatch) -> None:
     """The working directory is `tmp_path`, and the stand-ins can be imported."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(HERE)
 
 
 @pytest.fixture
-def steerbench(
-    elsewhere: None, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> Callable[..., Outcome]:
+def steerbench(elsewhere, monkeypatch, capfd) -> Callable[..., Outcome]:
     """Call the command line within this process, `elsewhere`."""
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # which `run` sets: restored after the test
     monkeypatch.setattr(sys, "argv", ["steerbench"])
 
-    def call(*argv: str) -> Outcome:
+    def call(*argv):
         try:
             status = cli.guard(cli.dispatch, list(argv))
         except SystemExit as ended:  # argparse and Hydra leave this way after --help
@@ -74,18 +72,18 @@ def steerbench(
 
 
 @pytest.fixture
-def run(steerbench: Callable[..., Outcome]) -> Callable[..., Outcome]:
+def run(steerbench) -> Callable[..., Outcome]:
     """Call `steerbench run` with the stand-ins and further arguments."""
     return lambda *argv: steerbench("run", *STAND_INS, *argv)
 
 
 @pytest.fixture
-def launched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def launched(monkeypatch) -> list[int]:
     """How many jobs Hydra's usual launcher was handed, each time."""
-    counts: list[int] = []
+    counts = []
     launch = BasicLauncher.launch
 
-    def noted(self, jobs, initial_job_idx: int):
+    def noted(self, jobs, initial_job_idx):
         counts.append(len(jobs))
         return launch(self, jobs, initial_job_idx)
 
@@ -94,11 +92,11 @@ def launched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.fixture
-def spawn(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+def spawn(tmp_path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
     """Start `steerbench run` with the stand-ins as a process of its own in `tmp_path`; what still
     runs after the test is killed."""
 
-    def start(*argv: str) -> subprocess.Popen[str]:
+    def start(*argv):
         process = subprocess.Popen(
             [Path(sys.executable).with_name("steerbench"), "run", *STAND_INS, *argv],
             cwd=tmp_path,

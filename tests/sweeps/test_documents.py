@@ -21,10 +21,8 @@ from omegaconf import OmegaConf
 from reports.regression import LIMITS
 from sweeps import cli, overrides
 from sweeps.overrides import choices, composed, swept
-from sweeps.plan import plan
-from sweeps.tables import chosen
+from tests.common import ROOT
 
-ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 
 SHOWN = re.compile(
@@ -63,7 +61,7 @@ def write_files(document: str, folder: Path) -> set[str]:
 
 
 @pytest.fixture
-def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def mine(tmp_path, monkeypatch) -> Path:
     """The folder that extending.md makes, with views of two greys."""
     written = write_files("extending.md", tmp_path)
     assert {"mean_colour/method.py", "mean_colour/average.py", "npz.py"} <= written
@@ -101,13 +99,6 @@ def test_what_the_document_makes_is_listed_measured_and_studied(steerbench, mine
     assert "shade 0.9" in studied.out
 
 
-def test_the_method_of_the_document_has_a_line_in_a_table(mine, monkeypatch):
-    seen = captured(monkeypatch, typed("table table1"))
-    (table,) = chosen(seen.table, seen.overrides, seen.beside)
-    assert "mean_colour" in [job.label for job in plan(table, seen.overrides)]
-    assert captured(monkeypatch, typed("report .* --table table1")).beside == seen.beside
-
-
 def test_the_table_of_the_document_is_measured_reported_and_the_same_sweep(steerbench, mine):
     words = typed("table shades --config-dir configs")
     steerbench(*words, *WITHOUT_LPIPS).ok()
@@ -132,9 +123,9 @@ def test_the_workflow_and_the_test_of_the_document_pass(steerbench, tmp_path, mo
     (workflow,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
     steps = [step.get("run", "") for step in yaml.safe_load(workflow)["jobs"]["check"]["steps"]]
     measure, check = (shlex.split(step)[1:] for step in steps if step.startswith("steerbench"))
-    (tmp_path / "configs" / "method").mkdir(parents=True)
+    (tmp_path / "configs/method").mkdir(parents=True)
     grey = ROOT / "tests/sweeps/configs/method/grey.yaml"
-    (tmp_path / "configs" / "method" / "mine.yaml").write_text(grey.read_text())
+    (tmp_path / "configs/method/mine.yaml").write_text(grey.read_text())
     steerbench(*measure, "scene.train=2", "scene.test=2").ok()
     steerbench("check", "--record", "baseline.json").ok()
     monkeypatch.setenv("GITHUB_STEP_SUMMARY", "summary.md")
@@ -143,7 +134,7 @@ def test_the_workflow_and_the_test_of_the_document_pass(steerbench, tmp_path, mo
     assert Path("check.xml").is_file()
 
     (test,) = re.findall(r"```python\n(import pytest.*?)```", text, re.DOTALL)
-    names: dict[str, Any] = {}
+    names = {}
     exec(test, names)
     ((_, cases),) = [mark.args for mark in names["test_nothing_became_worse"].pytestmark]
     assert "psnr" in [one.metric for one in cases]

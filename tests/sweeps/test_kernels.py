@@ -10,10 +10,9 @@ import pytest
 
 from bench.case import Case
 from bench.errors import Unavailable
-from bench.types import Log
-from reports.tables import Table
 from sweeps.commands.compile import wrong_of
 from sweeps.processes import lock_file
+from tests.common import refusal
 
 RIGHT = {
     "kernel": "encode", "case": "view", "backend": "cpu", "dtype": "float32", "error": 1e-7,
@@ -28,11 +27,11 @@ WRONG = {
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], int]]:
+def asked(monkeypatch) -> list[tuple[list[str], int]]:
     """The subjects that were timed, and how often; the rows are those above, by subject."""
     calls = []
 
-    def timed_rows(cases, device, backends, repeats: int, log: Log) -> list[dict]:
+    def timed_rows(cases, device, backends, repeats, log):
         calls.append(([case.subject for case in cases], repeats))
         assert {"reference", "cpu"} & set(backends)
         place = max(lock_file("auto").parent.glob("*.json"))
@@ -40,7 +39,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], int]]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return [row for row in (SMALL, REFERENCE, RIGHT, WRONG) if row["kernel"] in calls[-1][0]]
 
-    def case(subject: str) -> Case:
+    def case(subject):
         return Case(subject, "view", "", "", {}, lambda *cell: 0.0)
 
     monkeypatch.setattr("methods.checks.found", lambda name: [case("encode"), case("march")])
@@ -59,7 +58,7 @@ def test_the_last_line_is_json_and_a_wrong_kernel_fails(steerbench, asked):
 
 
 def test_a_fast_version_has_a_line_with_the_time_of_its_reference(steerbench, asked, monkeypatch):
-    shown: list[Table] = []
+    shown = []
     monkeypatch.setattr("sweeps.commands.checks.show", shown.append)
     steerbench("kernels")
     (table,) = shown
@@ -87,8 +86,8 @@ def test_compiled_kernels_compute_their_quick_cases(monkeypatch):
     tolerances = {("cpu", "fp32"): 0.1, ("reference", "fp32"): 0.1}
     computed = []
 
-    def case(name: str, error: float | Unavailable, slow: bool = False) -> Case:
-        def measure(backend: str, device: str, precision: str) -> float:
+    def case(name, error, slow=False):
+        def measure(backend, device, precision):
             computed.append((name, backend, precision))
             if isinstance(error, Unavailable):
                 raise error
@@ -109,7 +108,7 @@ def test_compile_computes_the_cases_of_all_modules_in_processes(steerbench, monk
     monkeypatch.setattr("methods.checks.modules", lambda name: ["methods.kernels.shade.cases"])
     assert steerbench("compile").status == 0
     monkeypatch.setattr("methods.checks.modules", lambda name: ["methods.kernels.shade"])
-    with pytest.raises(AttributeError, match="has no attribute 'cases'"):
+    with refusal("has no attribute 'cases'", AttributeError):
         steerbench("compile")
 
 
@@ -148,7 +147,7 @@ def test_cases_nearest_to_their_tolerances_are_shown_again(steerbench, monkeypat
     seen = {"cpu": 5e-7, "reference": 4e-7, "gpu": Unavailable("no GPU")}
     cells = {("cpu", "fp32"): 1e-6, ("reference", "fp32"): 5e-7, ("gpu", "fp32"): 1e-6}
 
-    def worst(backend: str, device: str, precision: str, share: float) -> float:
+    def worst(backend, device, precision, share):
         if isinstance(seen[backend], Unavailable):
             raise seen[backend]
         return share * seen[backend]
@@ -158,7 +157,7 @@ def test_cases_nearest_to_their_tolerances_are_shown_again(steerbench, monkeypat
         for number in range(10)
     ]
     monkeypatch.setattr("methods.checks.found", lambda name: cases)
-    shown: list[Table] = []
+    shown = []
     monkeypatch.setattr("sweeps.commands.checks.show", shown.append)
     steerbench("stress")
     nearest = shown[-1].lines

@@ -4,8 +4,8 @@ import shlex
 
 import pytest
 
-from bench.errors import SteerbenchError
 from sweeps.overrides import as_typed, composed, setting
+from tests.common import refusal
 
 UNKNOWN = [
     ("method=gery", "method", "gery", "grey"),
@@ -80,7 +80,7 @@ def test_commas_separate_values_unless_they_are_in_a_name(tmp_path):
 
 @pytest.mark.parametrize("word", ["protocol.name=a=b", "protocol.name=ä", "protocol.name=a,`b`"])
 def test_the_hint_works_when_it_is_copied_into_a_shell(word):
-    with pytest.raises(SteerbenchError, match="in quotes inside quotes") as refused:
+    with refusal("in quotes inside quotes") as refused:
         composed([word])
     (hint, *_) = shlex.split(str(refused.value).partition("inside quotes, ")[2])
     assert composed([hint]).protocol.name == word.partition("=")[2]
@@ -88,8 +88,8 @@ def test_the_hint_works_when_it_is_copied_into_a_shell(word):
 
 @pytest.mark.parametrize("content", [b"a: b: c", b"- 1", b"", b"\xff\xfe", b"_target_: 5", b"7"])
 def test_a_choice_that_is_no_yaml_of_settings_is_named_in_one_line(content, steerbench, tmp_path):
-    (tmp_path / "further" / "method").mkdir(parents=True)
-    (tmp_path / "further" / "method" / "mine.yaml").write_bytes(content)
+    (tmp_path / "further/method").mkdir(parents=True)
+    (tmp_path / "further/method/mine.yaml").write_bytes(content)
     refused = steerbench("run", f"--config-dir={tmp_path / 'further'}", "method=mine").refused()
     assert "mine.yaml: expected" in refused or "method: its YAML file: expected" in refused
     assert refused.count("\n") == 1

@@ -1,6 +1,5 @@
 """The jobs of the paper's tables, and the scenes of a data set that they are means over."""
 
-import json
 from functools import cache
 from pathlib import Path
 
@@ -9,7 +8,6 @@ import pytest
 import torch
 from PIL import Image
 
-from bench.errors import SteerbenchError
 from methods.engines import openvino_engine
 from sweeps.commands.paper import data_set
 from sweeps.data_sets import DATA_SETS, data_sets, find
@@ -17,6 +15,7 @@ from sweeps.measurement import described
 from sweeps.overrides import composed
 from sweeps.plan import Planned, plan, scenes_of
 from sweeps.tables import chosen
+from tests.common import refusal, write_json
 
 TABLES = {table.name: table for table in chosen()}
 """Their lines alone."""
@@ -54,7 +53,7 @@ def test_a_budget_says_how_often_lines_are_repeated_unless_seeds_are_asked_for(w
 
 
 def test_the_field_that_the_papers_method_is_trained_from_is_rendered_with_every_seed():
-    seeds: dict[str, set[int]] = {}
+    seeds = {}
     for job in plan(TABLES["table1"], ["tables.seeds=2"]):
         seeds.setdefault(job.place.line, set()).add(job.config.seed)
     own = {line for line, of in seeds.items() if of == {0, 1}}
@@ -120,7 +119,7 @@ def test_what_only_the_tables_read_changes_no_key():
     ],
 )
 def test_a_setting_that_cannot_be_had_is_named(override, said):
-    with pytest.raises(SteerbenchError, match=said):
+    with refusal(said):
         plan(TABLES["table3"], [override])
 
 
@@ -157,19 +156,15 @@ def test_a_scene_is_compared_with_the_figures_of_its_data_set():
     scenes = scenes_of(words)
     assert data_sets(scenes) == ["NeRF-Synthetic", "Tanks & Temples"]
     tables = {table.name: table for table in chosen(data_sets=data_sets(scenes))}
-    of_block: dict[str, set[tuple[str, str]]] = {}
-    for job in plan(tables["table1"], words):
+    jobs = plan(tables["table1"], words)
+    for job in jobs:
         assert job.config.scene.height == {"totem": None, "totem_hd": 1080}[job.scene]
         assert job.config.scene.downscale == 2
-        of_block.setdefault(job.place.block, set()).add((job.scene, job.place.line))
-        again = composed([text for text in job.command[2:] if text != "hydra.mode=RUN"])
-        assert described(again) == described(job.config)
-    assert list(of_block) == list(DATA_SETS)
-    first, second = of_block.values()
-    assert {scene for scene, _ in first} == {"totem"}
-    assert {scene for scene, _ in second} == {"totem_hd"}
-    assert {line for _, line in second} == set(tables["table1"].beside)
-    assert len(second) == 4
+    of_scene = zip(DATA_SETS, ["totem", "totem_hd"], strict=True)
+    assert {(job.place.block, job.scene) for job in jobs} == {*of_scene}
+    lines = {job.place.line for job in jobs if job.scene == "totem_hd"}
+    assert lines == set(tables["table1"].beside)
+    assert len(lines) == 4
     assert {job.scene for job in plan(tables["table5"], words)} == {"totem"}
 
 
@@ -195,7 +190,7 @@ def blender(folder: Path, value: int = 255, pictures: bool = True) -> Path:
         names = [f"./{split}/r_{number}" for number in range(2)]
         frames = [{"file_path": name, "transform_matrix": POSE} for name in names]
         record = {"camera_angle_x": 0.7, "frames": frames}
-        (folder / f"transforms_{split}.json").write_text(json.dumps(record))
+        write_json(folder / f"transforms_{split}.json", record)
         for name in names if pictures else ():
             picture = np.full((16, 16, 3), value, np.uint8)
             Image.fromarray(picture).save(folder / f"{name}.png")
@@ -208,7 +203,7 @@ def nsvf(folder: Path, pictures: bool = True) -> Path:
         (folder / name).mkdir(parents=True)
     (folder / "bbox.txt").touch()
     if pictures:
-        (folder / "rgb" / "0_00000.png").touch()
+        (folder / "rgb/0_00000.png").touch()
     return folder
 
 
@@ -216,7 +211,7 @@ def test_of_nerf_synthetic_what_is_there_is_found_and_the_rest_is_named(tmp_path
     for name in ("mic", "lego"):
         blender(tmp_path / name)
     blender(tmp_path / "chair", pictures=False)
-    (tmp_path / "lego" / "test" / "r_1.png").unlink()
+    (tmp_path / "lego/test/r_1.png").unlink()
     (tmp_path / "drums").mkdir()
     found = find(str(tmp_path))
     assert (found.layout, list(found.scenes)) == ("blender", ["mic"])
@@ -235,7 +230,7 @@ def test_of_tanks_and_temples_too_and_scenes_of_ones_own_miss_nothing(tmp_path):
     found = find(str(tmp_path))
     assert (found.layout, list(found.scenes)) == ("nsvf", ["Barn", "Truck"])
     assert set(found.missing) == {"Caterpillar", "Family", "Ignatius"}
-    blender(tmp_path / "mine" / "teapot")
+    blender(tmp_path / "mine/teapot")
     assert find(str(tmp_path / "mine")).missing == {}
 
 
@@ -249,16 +244,16 @@ def test_of_tanks_and_temples_too_and_scenes_of_ones_own_miss_nothing(tmp_path):
 )
 def test_no_scenes_or_those_of_two_layouts_have_no_mean(tmp_path, folder, said):
     (tmp_path / "empty").mkdir()
-    blender(tmp_path / "both" / "mic")
-    nsvf(tmp_path / "both" / "Barn")
-    with pytest.raises(SteerbenchError, match=said):
+    blender(tmp_path / "both/mic")
+    nsvf(tmp_path / "both/Barn")
+    with refusal(said):
         find(str(tmp_path / folder))
 
 
 @pytest.mark.parametrize("word", ["scene=totem", "scene.path=elsewhere", "++scene.path=elsewhere"])
 def test_a_scene_beside_a_data_set_is_refused(tmp_path, word):
     blender(tmp_path / "mic")
-    with pytest.raises(SteerbenchError, match="expected one of them"):
+    with refusal("expected one of them"):
         data_set([word, f"data={tmp_path}"])
     assert data_set([word]) == ([word], None)
 

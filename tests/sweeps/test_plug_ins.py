@@ -4,7 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import MappingProxyType
 
@@ -33,14 +33,14 @@ SMALL = (
 
 
 @pytest.fixture
-def folder(steerbench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(steerbench, tmp_path, monkeypatch) -> Path:
     """Of the package `mine` and the configuration of its method; all further calls find it."""
-    package = tmp_path / "plug-in's" / "mine"
+    package = tmp_path / "plug-in's/mine"
     package.mkdir(parents=True)
     (package / "__init__.py").touch()
     (package / "helper.py").write_text("LEVEL = 0.5\n")
     (package / "renderer.py").write_text(RENDERER)
-    config = package.parent / "configs" / "method" / "mine.yaml"
+    config = package.parent / "configs/method/mine.yaml"
     config.parent.mkdir(parents=True)
     config.write_text("# Mine.\n_target_: mine.renderer.Mine\n")
     monkeypatch.syspath_prepend(package.parent)
@@ -51,7 +51,7 @@ def folder(steerbench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def call(steerbench, folder: Path):
+def call(steerbench, folder):
     return lambda command, *argv: steerbench(
         command, "--config-dir", str(folder / "configs"), *argv
     )
@@ -123,11 +123,11 @@ def test_the_package_of_the_document_is_installed_listed_and_measured(mine):  # 
 
 
 @pytest.fixture
-def plugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Path | str]]:
+def plugged(tmp_path, monkeypatch) -> Iterator[Callable[..., Path | str]]:
     """Install a package `other` with an entry point of a value, and files of its folder."""
     monkeypatch.syspath_prepend(tmp_path / "site")
 
-    def install(value: str, files: Mapping[str, str] = MappingProxyType({})) -> Path | str:
+    def install(value, files=MappingProxyType({})):
         info = {
             "METADATA": "Metadata-Version: 2.1\nName: other\nVersion: 2.0\n",
             "entry_points.txt": f"[{PLUG_INS}]\nother = {value}\n",

@@ -16,7 +16,7 @@ from tests.sweeps.conftest import PATH
 
 
 @pytest.fixture(autouse=True)
-def locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def locks(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv(LOCKS, str(tmp_path))
 
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import steerbench as python
-from bench.errors import SteerbenchError
+from tests.common import read_json, refusal
 from tests.sweeps.conftest import CONFIGS, STAND_INS
 
 
@@ -22,7 +22,7 @@ def stored(tmp_path: Path) -> list[Path]:
 
 
 def records(tmp_path: Path) -> list[dict[str, Any]]:
-    return [json.loads((folder / "record.json").read_text()) for folder in stored(tmp_path)]
+    return [read_json(folder / "record.json") for folder in stored(tmp_path)]
 
 
 def test_a_run_prints_its_table_and_is_stored_and_not_measured_again(run, tmp_path):
@@ -104,7 +104,7 @@ def test_an_ablation_is_a_table_over_seeds_in_every_form_and_grows_by_what_is_ne
     table = run(*ABLATION, "report=page", "--format", "markdown").ok().out
     assert "| method | level | seeds | PSNR, dB ↑ |" in table
     assert "| grey | 0.5 | 2 | **6.05** |" in table
-    page = (tmp_path / "page" / "report.md").read_text()
+    page = (tmp_path / "page/report.md").read_text()
     assert table.partition("\n\n")[2].strip() in page
     assert "means over seeds" in page
     keys = stored(tmp_path)
@@ -137,7 +137,7 @@ def test_a_sweep_and_a_run_of_the_store_are_frames_in_python(elsewhere):
     assert first.psnr_to(first) == math.inf
     # Between 128/255 and 64/255: PSNR = -20 log10(64 / 255) = 12.01 dB.
     assert round(first.psnr_to(last), 2) == 12.01
-    with pytest.raises(SteerbenchError, match="expected 0 to 1, got 7"):
+    with refusal("expected 0 to 1, got 7"):
         python.sweep(*STAND_INS, "method.level=0.5,7")
 
 

@@ -10,14 +10,13 @@ import torch
 
 from bench.results import STEADY, Store
 from tests.bench.test_pictures import write
-from tests.sweeps.conftest import Outcome
 
 QUICK = ("protocol.name=quick", "protocol.lpips=[]")
 SCENE = ("scene=totem", "scene.width=24", "scene.train=2", "scene.test=3")
 
 
 @pytest.fixture
-def folders(tmp_path: Path) -> tuple[str, str]:
+def folders(tmp_path) -> tuple[str, str]:
     """Two grey pictures that are 51 levels (0.2) too bright, and their truth."""
     for name, level in (("theirs", 151), ("true", 100)):
         grey = torch.full((16, 20, 3), level, dtype=torch.uint8)
@@ -26,10 +25,10 @@ def folders(tmp_path: Path) -> tuple[str, str]:
 
 
 @pytest.fixture
-def scored(steerbench: Callable[..., Outcome], folders: tuple[str, str]) -> Callable[..., str]:
+def scored(steerbench, folders) -> Callable[..., str]:
     """Score a folder of pictures against the true ones; the key of the run."""
 
-    def score(folder: str, *words: str) -> str:
+    def score(folder, *words):
         outcome = steerbench("score", folder, "--truth", "true", *QUICK, *words).ok()
         return re.search(r"run (\w+)", outcome.out)[1]
 

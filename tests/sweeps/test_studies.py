@@ -1,6 +1,7 @@
 """Studies: their lines are runs of the store, of what methods declare; each shows them its way."""
 
 import functools
+import io
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -8,14 +9,15 @@ import pandas as pd
 import pytest
 import torch
 
-from bench.errors import SteerbenchError, Unavailable
+from bench.errors import Unavailable
 from bench.results import Store
 from bench.study import Axis, Study, turned
 from sweeps import experiments
 from sweeps.commands.study import decibels
 from sweeps.overrides import engine_kinds
 from sweeps.studies import subjects
-from tests.sweeps.conftest import QUICK, STAND_INS, Outcome
+from tests.common import refusal
+from tests.sweeps.conftest import QUICK, STAND_INS
 
 ROUNDS = ["trajectory=test", "engine=torch", "protocol=study-1", "protocol.rounds=2"]
 TORCH = [f"torch, {precision}" for precision in engine_kinds(())["torch"].precisions]
@@ -23,18 +25,18 @@ TORCH = [f"torch, {precision}" for precision in engine_kinds(())["torch"].precis
 
 @pytest.fixture
 def study(steerbench):
-    def call(command: str, method: str, *argv: str) -> Outcome:
+    def call(command, method, *argv):
         return steerbench(command, *STAND_INS, *ROUNDS, f"method={method}", *argv)
 
     return call
 
 
 def page(study: str) -> pd.DataFrame:
-    """The first table of the page of a study, by the first cell of a line."""
-    lines = Path(f"outputs/{study}/report.md").read_text().splitlines()
-    cells = [[x.strip(" *") for x in line.split("|")[1:-1]] for line in lines if line[:1] == "|"]
-    table = [row for row in cells if len(row) == len(cells[0])]
-    return pd.DataFrame(table[2:], columns=table[0]).set_index(table[0][0])
+    """The first table of the page of a study, as text, by the first cell of a line."""
+    text = Path(f"outputs/{study}/report.md").read_text()
+    table = io.StringIO(text[text.index("|") :].partition("\n\n")[0].replace("**", ""))
+    cells = pd.read_csv(table, sep=r"\s*\|\s*", engine="python", dtype=str, keep_default_na=False)
+    return cells.iloc[1:, 1:-1].set_index(cells.columns[1])
 
 
 def stored(metric: str) -> Mapping[str, float]:
@@ -86,7 +88,7 @@ def test_a_loss_is_read_with_its_unit_or_without(text):
 
 @pytest.mark.parametrize("text", ["", "dB", "-1dB", "1e", "nan", "1 ms"])
 def test_what_is_no_loss_is_refused(text):
-    with pytest.raises(SteerbenchError, match="expected decibels"):
+    with refusal("expected decibels"):
         decibels(text)
 
 
@@ -95,7 +97,7 @@ def test_a_study_that_was_killed_measures_the_other_half(study, monkeypatch):
 
     measure, measured = measurement.measure, []
 
-    def killed_at(limit: int):
+    def killed_at(limit):
         def call(methods, task, log, guard):
             if len(measured) == limit:
                 raise KeyboardInterrupt
@@ -125,7 +127,7 @@ def test_what_cannot_be_used_is_left_out_unless_all_are_compared_with_it(study, 
     make = stand_ins.Shades.__init__
 
     @functools.wraps(make)
-    def made(self, **settings) -> None:
+    def made(self, **settings):
         if settings["level"] == absent:
             raise Unavailable("it is not installed")
         make(self, **settings)

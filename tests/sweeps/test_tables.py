@@ -8,6 +8,7 @@ from bench.errors import SteerbenchError
 from sweeps.data_sets import DATA_SETS, FIRST
 from sweeps.experiments import experiment, grid
 from sweeps.tables import chosen
+from tests.common import refusal
 
 _, SECOND = DATA_SETS
 TABLES = {table.name: table for table in chosen()}
@@ -58,7 +59,7 @@ table:
 
 def declared(folder: Path, more: str = "", text: str = MINE) -> list[str]:
     (folder / "experiment").mkdir()
-    (folder / "experiment" / "mine.yaml").write_text(f"{text}{more}")
+    (folder / "experiment/mine.yaml").write_text(f"{text}{more}")
     return [f"--config-dir={folder}"]
 
 
@@ -135,7 +136,7 @@ def test_what_is_wrong_in_a_declaration_is_named(tmp_path, more, said):
 
 
 def test_an_experiment_without_a_table_or_a_grid_is_refused(tmp_path):
-    with pytest.raises(SteerbenchError, match="demo: table: expected a section"):
+    with refusal("demo: table: expected a section"):
         chosen("demo")
-    with pytest.raises(SteerbenchError, match="expected settings in hydra"):
+    with refusal("expected settings in hydra"):
         chosen("mine", declared(tmp_path, text=MINE.replace("hydra", "hydro")))

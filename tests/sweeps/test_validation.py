@@ -18,7 +18,7 @@ HELD_OUT = ["view_4", "view_12"]
 @pytest.fixture
 def learned_from(steerbench, monkeypatch) -> list[Scene]:
     """The scenes that a grey was fitted to."""
-    scenes: list[Scene] = []
+    scenes = []
     monkeypatch.setattr("stand_ins.Grey.fit", lambda self, scene, *others: scenes.append(scene))
     return scenes
 

@@ -6,8 +6,8 @@ import sys
 import numpy as np
 import pytest
 
-from bench.errors import SteerbenchError
 from sweeps.commands.render import recorded
+from tests.common import refusal
 
 
 def test_a_video_shows_its_pictures_in_turn_and_what_is_no_video_is_one_line(tmp_path):
@@ -23,7 +23,7 @@ def test_a_video_shows_its_pictures_in_turn_and_what_is_no_video_is_one_line(tmp
     for frame, level in zip(frames, levels, strict=True):
         assert np.abs(frame.astype(int) - level).max() <= 3  # limited range of YUV, and its loss
 
-    refused = pytest.raises(SteerbenchError, match=r"a\.nothing: cannot write the video")
+    refused = refusal(r"a\.nothing: cannot write the video")
     with refused, recorded(tmp_path / "a.nothing", fps=10) as take:
         take(np.zeros((8, 8, 3), np.uint8))
 

@@ -1,7 +1,6 @@
 """Pictures, poses, and a small NeRF-Synthetic folder to break."""
 
 import io
-import json
 import struct
 import zlib
 from collections.abc import Callable
@@ -14,6 +13,7 @@ from PIL import Image
 
 from bench.cameras import look_at
 from bench.types import Camera
+from tests.common import read_json, write_json
 
 
 def camera_at(eye: tuple[float, float, float], size: int = 96) -> Camera:
@@ -53,13 +53,13 @@ def pose(k: int) -> list[list[float]]:
 
 
 def edit_json(path: Path, change: Callable[[dict], object]) -> None:
-    record = json.loads(path.read_text())
+    record = read_json(path)
     change(record)
-    path.write_text(json.dumps(record))
+    write_json(path, record)
 
 
 @pytest.fixture
-def blender_folder(tmp_path: Path) -> Path:
+def blender_folder(tmp_path) -> Path:
     """Three training and two test pictures of 8 x 6."""
     root = tmp_path / "chair"
     for split, count, seed in (("train", 3, 0), ("test", 2, 50)):
@@ -69,5 +69,5 @@ def blender_folder(tmp_path: Path) -> Path:
             Image.fromarray(picture(seed + k)).save(root / split / f"r_{k}.png")
             frames.append({"file_path": f"./{split}/r_{k}", "transform_matrix": pose(k)})
         record = {"camera_angle_x": 0.7, "frames": frames}
-        (root / f"transforms_{split}.json").write_text(json.dumps(record))
+        write_json(root / f"transforms_{split}.json", record)
     return root

@@ -1,6 +1,5 @@
 """Scenes as files: what is written is what our own loaders, and others' by their names, read."""
 
-import json
 from dataclasses import replace
 
 import pytest
@@ -8,6 +7,7 @@ import torch
 
 from bench.scenes import blender, transforms
 from bench.scenes.export import write_blender
+from tests.common import read_json, write_json
 
 
 def test_pictures_without_alpha_are_opaque_and_a_split_not_named_has_none(
@@ -38,14 +38,15 @@ def test_lenses_that_one_angle_does_not_describe_are_in_other_fields(
     cameras = [replace(c, **lens) if n < count else c for n, c in enumerate(train.cameras)]
     scene = replace(moved_scene, splits={"train": replace(train, cameras=cameras)})
     write_blender(scene, tmp_path, {"train": "train", "test": "train"}, quiet_log)
+
+    def lenses(cameras):
+        return [(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in cameras]
+
     read = blender.load(tmp_path, bounds="full", log=quiet_log).splits["train"].cameras
-    assert [(c.fx, c.fy, c.cx) for c in read] == [(c.fx, c.fy, c.cx) for c in cameras]
-    record = json.loads((tmp_path / "transforms_train.json").read_text())
+    assert lenses(read) == lenses(cameras)
+    record = read_json(tmp_path / "transforms_train.json")
     for frame in record["frames"]:
         frame["file_path"] += ".png"
-    (tmp_path / "transforms.json").write_text(json.dumps(record))
-    found = transforms.load(tmp_path, split_every=4, log=quiet_log)
-    (camera, *_) = found.splits["test"].cameras
-    wanted = cameras[0]
-    shown = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-    assert shown == (wanted.fx, wanted.fy, wanted.cx, wanted.cy, wanted.width, wanted.height)
+    write_json(tmp_path / "transforms.json", record)
+    found = transforms.load(tmp_path, split_every=4, log=quiet_log).splits["test"].cameras
+    assert lenses(found)[0] == lenses(cameras)[0]

@@ -21,6 +21,7 @@ from bench.scenes import blender, nsvf, transforms
 from bench.scenes.images import decode_bytes
 from bench.types import Scene, SteerbenchError
 from tests.bench.scenes.conftest import encoded, png
+from tests.common import write_json
 
 QUIET = ConsoleLog(Path(), quiet=True)
 IN_ONE_FOLDER = settings(
@@ -128,7 +129,7 @@ def within_a_gigabyte() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory) -> Path:
     """Pictures and camera files of all formats, which a test may overwrite."""
     root = tmp_path_factory.mktemp("scene")
     for i in range(3):
@@ -136,9 +137,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (root / "pose").mkdir()
     (root / "rgb").mkdir()
     for name in ("0_a", "0_b", "2_c"):
-        (root / "rgb" / f"{name}.png").write_bytes(encoded("RGBA", "PNG"))
-        (root / "pose" / f"{name}.txt").write_text(TEXTS["pose/0_a.txt"])
-    (root / "transforms_test.json").write_text(json.dumps(RECORD))
+        (root / f"rgb/{name}.png").write_bytes(encoded("RGBA", "PNG"))
+        (root / f"pose/{name}.txt").write_text(TEXTS["pose/0_a.txt"])
+    write_json(root / "transforms_test.json", RECORD)
     return root
 
 

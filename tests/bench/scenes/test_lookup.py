@@ -9,7 +9,7 @@ from bench.scenes.lookup import find_all, report
 
 
 @pytest.fixture
-def root(tmp_path: Path) -> Path:
+def root(tmp_path) -> Path:
     """A folder `scan` with pictures, beside another one."""
     pictures = ("a.png", "b.JPG", "e\u0301.png", "other.png")
     for name in (*(f"scan/rgb/{picture}" for picture in pictures), "other/c.png"):

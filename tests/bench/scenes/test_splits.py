@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from bench.errors import SteerbenchError
 from bench.scenes.images import View
 from bench.scenes.splits import divide, read_lists
 from bench.types import Camera
+from tests.common import refusal
 
 NAMES = [f"images/{k}.png" for k in range(6)]
 VIEWS = [View(n, Path(n), Camera(torch.eye(4)[:3], 1, 1, 1, 1, 2, 2)) for n in NAMES]
@@ -70,5 +70,5 @@ def test_a_file_of_names_goes_before_the_lists_of_the_capture(tmp_path, log, tex
 def test_a_file_that_names_no_picture_is_refused(tmp_path, log, split, text, message):
     (tmp_path / "a.txt").write_text(text)
     record, here = {"train_filenames": 3}, Path("here")
-    with pytest.raises(SteerbenchError, match=message):
+    with refusal(message):
         divide(LISTED, 2, read_lists(tmp_path, split, record, here), here, log)

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from methods.students.voxels import corners_of
+from tests.common import refusal
 from tests.methods.small_students import SMALL, fitted
 from tests.methods.trainings import GRID, TAUGHT, TEACHER, quality
 
@@ -62,5 +63,5 @@ def test_sizes_are_those_of_what_is_stored(ball_scene, shared_log):
 
 def test_a_teacher_with_more_features_than_a_corner_is_refused(ball_scene, shared_log):
     setup = replace(TEACHER, grid=replace(GRID, levels=17))
-    with pytest.raises(ValueError, match="expected at most the 32 channels of a corner"):
+    with refusal("expected at most the 32 channels of a corner", ValueError):
         new(teacher=setup).fit(ball_scene, replace(TAUGHT, steps=1), shared_log)

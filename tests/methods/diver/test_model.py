@@ -10,6 +10,7 @@ from methods.kernels.composite import composite
 from methods.kernels.march.cases import some_rays
 from methods.kernels.voxel_walk import walk
 from methods.students.networks import encode_directions
+from tests.common import assert_near, seeded
 
 SIZE = 16
 
@@ -21,7 +22,7 @@ def test_it_has_the_parameters_of_the_published_one():
 def test_rendered_rays_are_those_of_the_trained_model():
     """The baked model, in rounds, with merged layers, against the layers as they were trained; all
     voxels of a small grid, with random features."""
-    generator, rays = torch.Generator().manual_seed(0), some_rays(200)
+    generator, rays = seeded(0), some_rays(200)
     voxels = torch.cartesian_prod(*[torch.arange(SIZE)] * 3).int()
     model = CornerModel(voxels, SIZE, Decoder(generator), "auto")
     with torch.no_grad():
@@ -36,6 +37,6 @@ def test_rendered_rays_are_those_of_the_trained_model():
         want = composite(raw.relu(), colours, as_intervals(crossings), stop=0.0)
     got = Baked(model, "fp32").render_rays(rays, NullProbe(), stop=0.0, faint=0.0)
     # Five layers of 32 numbers below 8 with sums of 32 roundings: 5 x 32 x 8 u = 8e-5.
-    torch.testing.assert_close(got.values, want.values, rtol=0, atol=1e-4)
-    torch.testing.assert_close(got.alpha, want.alpha, rtol=0, atol=1e-4)
+    assert_near(got.values, want.values, atol=1e-4)
+    assert_near(got.alpha, want.alpha, atol=1e-4)
     assert got.alpha.max() > 0.5

@@ -1,29 +1,24 @@
 """What the tests of engines share."""
 
 import sys
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
 import torch
-from torch import Tensor, nn
 
-from bench.types import Log
-from methods.engines import Built, Engine
+from methods.engines import Built
 from tests.methods.engines import tensorrt_double
 
 
 @pytest.fixture
-def build(tmp_path: Path, quiet_log: Log) -> Callable[..., Built]:
+def build(tmp_path, quiet_log) -> Callable[..., Built]:
     """Builds a network with an engine from the inputs of some frames, in a folder."""
 
-    def built(
-        engine: Engine, network: nn.Module, samples: Sequence[Tensor] | None, folder: str = ""
-    ) -> Built:
+    def built(engine, network, samples, folder=""):
         place = tmp_path / folder
         place.mkdir(exist_ok=True)
 
-        def frames() -> Sequence[Tensor]:
+        def frames():
             assert samples is not None, "the frames are not needed again"
             return samples
 
@@ -33,7 +28,7 @@ def build(tmp_path: Path, quiet_log: Log) -> Callable[..., Built]:
 
 
 @pytest.fixture
-def double(monkeypatch: pytest.MonkeyPatch) -> None:
+def double(monkeypatch) -> None:
     """TensorRT and a GPU, both played."""
     monkeypatch.setitem(sys.modules, "tensorrt", tensorrt_double)
     monkeypatch.setattr(tensorrt_double.Builder, "built", 0)

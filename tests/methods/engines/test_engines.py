@@ -8,6 +8,7 @@ from bench.errors import Unavailable
 from methods.engines.openvino_engine import OpenVino, _capabilities
 from methods.engines.torch_engine import TorchEngine
 from methods.steernerf.unet import UNet
+from tests.common import refusal, seeded
 from tests.methods.models import shaken
 
 needs_bf16 = pytest.mark.skipif(
@@ -33,8 +34,7 @@ def unet() -> tuple[nn.Module, list[Tensor]]:
     """The U-Net, and inputs of one size."""
     torch.manual_seed(1000)
     renderer = shaken(UNet(6, 1, 4, width=64, aligned=False)).requires_grad_(False)
-    generator = torch.Generator().manual_seed(0)
-    return renderer.network, list(torch.rand(3, 1, 12, 36, 44, generator=generator))
+    return renderer.network, list(torch.rand(3, 1, 12, 36, 44, generator=seeded(0)))
 
 
 def assert_close(got: Tensor, want: Tensor, tolerance: float) -> None:
@@ -74,14 +74,14 @@ def test_int8_weights_take_a_quarter(build):
 
 
 def test_what_an_engine_lacks_is_refused_by_name(monkeypatch):
-    with pytest.raises(Unavailable, match="expected one of fp32, bf16, int8, which engine=openv"):
+    with refusal("expected one of fp32, bf16, int8, which engine=openv", Unavailable):
         OpenVino("fp16")
-    with pytest.raises(Unavailable, match="on a CPU use bf16"):
+    with refusal("on a CPU use bf16", Unavailable):
         TorchEngine("fp16").check(CPU)
     # It would compute in float32 without saying so.
     capabilities = "methods.engines.openvino_engine._capabilities"
     monkeypatch.setattr(capabilities, lambda openvino: ["FP32", "INT8"])
-    with pytest.raises(Unavailable, match="openvino has no bfloat16 on this CPU, use precision=f"):
+    with refusal("openvino has no bfloat16 on this CPU, use precision=f", Unavailable):
         OpenVino("bf16")
 
 

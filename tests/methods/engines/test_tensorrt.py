@@ -11,8 +11,9 @@ import onnx
 import pytest
 import torch
 
-from bench.errors import SteerbenchError, Unavailable
+from bench.errors import Unavailable
 from methods.engines.tensorrt_engine import TensorRt
+from tests.common import refusal
 from tests.methods.engines import tensorrt_double
 from tests.methods.engines.test_engines import TOLERANCE, assert_close, unet
 
@@ -72,7 +73,7 @@ def test_what_tensorrt_refuses_is_said(broken, message, double, tmp_path, build,
     monkeypatch.setattr(f"tests.methods.engines.tensorrt_double.{broken}", lambda *arguments: None)
     network, inputs = unet()
     built = build(TensorRt("fp32"), network, inputs)
-    with pytest.raises(SteerbenchError, match=message):
+    with refusal(message):
         built.run(inputs[0])
     kept = broken.startswith(("Runtime", "CudaEngine"))
     assert len(list(tmp_path.glob("*.plan"))) == kept
@@ -90,17 +91,17 @@ def test_a_build_belongs_to_its_gpu_and_version(double, monkeypatch):
 
 @pytest.mark.parametrize("device", ["cpu", "cuda:1"])
 def test_what_is_not_the_first_gpu_is_refused(device, double):
-    with pytest.raises(Unavailable, match=f"this is device={device}: use device=cuda"):
+    with refusal(f"this is device={device}: use device=cuda", Unavailable):
         TensorRt("fp16").check(torch.device(device))
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="for a machine without a GPU")
 def test_without_a_gpu_that_is_the_reason_and_not_a_library():
-    with pytest.raises(Unavailable, match="torch sees none here: use engine=openvino"):
+    with refusal("torch sees none here: use engine=openvino", Unavailable):
         TensorRt("fp16")
 
 
 def test_without_tensorrt_the_command_that_installs_it_is_named(double, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorrt", None)
-    with pytest.raises(Unavailable, match=r'pip install .*"\.\[tensorrt\]"'):
+    with refusal(r'pip install .*"\.\[tensorrt\]"', Unavailable):
         TensorRt("fp16")

@@ -13,6 +13,7 @@ from torch.nn import functional
 from methods.engines import CALIBRATION, Engine
 from methods.engines.openvino_engine import OpenVino
 from methods.engines.tensorrt_engine import TensorRt
+from tests.common import seeded
 from tests.methods.engines.test_engines import CPU, unet
 
 Kind = Callable[[str, str], Engine]
@@ -41,13 +42,13 @@ class Layers(nn.Module):
 
 
 @pytest.fixture
-def no_bfloat16(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_bfloat16(monkeypatch) -> None:
     """OpenVINO computes in float32 what it does not quantise, on any CPU."""
     monkeypatch.setattr("methods.engines.openvino_engine._capabilities", lambda openvino: [])
 
 
 def noise(seed: int) -> Tensor:
-    return torch.randn(1, 4, 8, 8, generator=torch.Generator().manual_seed(seed))
+    return torch.randn(1, 4, 8, 8, generator=seeded(seed))
 
 
 def rounded(x: Tensor, largest: float) -> Tensor:

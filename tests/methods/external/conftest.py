@@ -9,8 +9,7 @@ from textwrap import dedent
 import pytest
 
 from methods.external.method import External
-
-ROOT = Path(__file__).parents[3]
+from tests.common import ROOT
 
 GREY = """
     import numpy as np
@@ -27,11 +26,11 @@ GREY = """
 
 
 @pytest.fixture
-def worker(tmp_path: Path) -> Callable[..., Path]:
+def worker(tmp_path) -> Callable[..., Path]:
     """Write a worker: `GREY`, then further lines, the last of which serves `Grey`."""
     folder = tmp_path / "worker"
 
-    def write(lines: str = "", before: str = GREY, after: str = "serve(Grey)\n") -> Path:
+    def write(lines="", before=GREY, after="serve(Grey)\n"):
         folder.mkdir(exist_ok=True)
         shutil.copy(ROOT / "steerbench_worker.py", folder)
         (folder / "grey.py").write_text(dedent(before) + dedent(lines) + after)
@@ -44,7 +43,7 @@ def worker(tmp_path: Path) -> Callable[..., Path]:
 def external() -> Iterator[Callable[..., External]]:
     """Make methods whose processes have ended after the test."""
 
-    def make(command: object, **settings) -> External:
+    def make(command, **settings):
         usual = {"python": None, "options": {}, "files": [], "lock": None, "seed": 3}
         usual |= {"environment": {}, "folders": []}
         limits = {"start_s": 60.0, "fit_s": 60.0, "frame_s": 60.0}

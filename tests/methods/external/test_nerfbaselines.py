@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from bench.types import Budget, NullProbe, composite
+from tests.common import assert_near
 
 VERSION = "1.2.12"
 METHOD = '''
@@ -58,7 +59,7 @@ register({"id": "mean", "method_class": "mean_method:Mean"})
 
 
 @pytest.fixture(scope="module")
-def nerfbaselines(tmp_path_factory: pytest.TempPathFactory) -> str:
+def nerfbaselines(tmp_path_factory) -> str:
     """A Python that has NerfBaselines: $NERFBASELINES_PYTHON, or that of a new environment, because
     it needs an older numpy than ours; skips where pip cannot install it."""
     if given := os.environ.get("NERFBASELINES_PYTHON"):
@@ -92,7 +93,7 @@ def test_a_registered_method_trains_renders_and_is_loaded(
         pictures.append(method.render(moved_scene.splits["test"].cameras[0], NullProbe()).rgb)
         seconds.append(method.train_s)
         assert (method.name, method.sizes()) == ("mean", {"model": 128 + 3 * 8})
-    torch.testing.assert_close(pictures[0][0, 0], expected, rtol=0, atol=1e-6)
+    assert_near(pictures[0][0, 0], expected, atol=1e-6)
     assert torch.equal(*pictures)
     assert seconds[0] == seconds[1] > 0  # the second was loaded
     assert method._packages["nerfbaselines"] == VERSION

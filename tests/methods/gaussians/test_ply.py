@@ -11,16 +11,18 @@ import torch
 from numpy.lib.recfunctions import append_fields, repack_fields
 from plyfile import PlyData, PlyElement
 
-from bench.types import NullProbe, Scene, SteerbenchError
+from bench.types import NullProbe, Scene
 from methods.gaussians import ply
 from methods.gaussians.model import Gaussians, rounded
 from methods.kernels.shade import shade
+from tests.common import assert_near, refusal, seeded
+from tests.methods.kernels.test_spherical import with_phase
 
 NEEDED = (*ply.POSITION, *ply.BASE, "opacity", *ply.SCALE, *ply.ROTATION)
 
 
 def some(count: int = 50, degree: int = 3) -> Gaussians:
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
 
     def rand(*shape: int) -> torch.Tensor:
         return torch.rand(*shape, generator=generator)
@@ -45,9 +47,8 @@ def test_what_is_written_is_read_and_holds_the_coordinates_of_the_data_set(
     path, given = tmp_path / "a.ply", some(degree=degree)
     ply.write(given, scene, path)
     found = ply.read(path, scene, print)
-    for name, value in given.named_parameters():
-        # A product and a sum in float32, of numbers below 8.
-        torch.testing.assert_close(getattr(found, name), value, rtol=0, atol=8 * 2.0**-22)
+    # A product and a sum in float32, of numbers below 8.
+    assert_near(found.state_dict(), given.state_dict(), atol=8 * 2.0**-22)
     vertex, means = PlyData.read(path)["vertex"][0], given.means[0].tolist()
     assert vertex["x"] == pytest.approx(-1 + 3 * means[0])
     assert vertex["z"] == pytest.approx(5 + 3 * means[2])
@@ -60,33 +61,21 @@ def test_positions_far_from_the_origin_keep_their_digits(moved_scene, tmp_path):
     ply.write(given, scene, tmp_path / "a.ply")
     assert PlyData.read(tmp_path / "a.ply")["vertex"]["y"].max() > 5e6
     found = ply.read(tmp_path / "a.ply", scene, print)
-    torch.testing.assert_close(found.means, given.means, rtol=0, atol=1e-6)  # float32: 0.2
+    assert_near(found.means, given.means, atol=1e-6)  # float32: 0.2
 
 
 def test_harmonics_of_a_file_have_the_condon_shortley_phase(moved_scene, tmp_path):
-    """Colours by the polynomials of degree 2 as the release of 3D Gaussians has them."""
-    path = tmp_path / "a.ply"
-    given = some(1, degree=2)
+    """As the polynomials in the release of 3D Gaussians have it."""
+    path, given = tmp_path / "a.ply", some(1, degree=2)
     ply.write(given, moved_scene, path)
-    vertex = PlyData.read(path)["vertex"][0]
-    x, y, z = 0.36, 0.48, 0.8
-    basis = [
-        0.28209479177387814,
-        -0.4886025119029199 * y,
-        0.4886025119029199 * z,
-        -0.4886025119029199 * x,
-        1.0925484305920792 * x * y,
-        -1.0925484305920792 * y * z,
-        0.31539156525252005 * (2 * z * z - x * x - y * y),
-        -1.0925484305920792 * x * z,
-        0.5462742152960396 * (x * x - y * y),
-    ]
-    harmonics = torch.cat((given.base, given.view), dim=1)
-    ours = shade(harmonics, torch.tensor([[x, y, z]]))[0].tolist()
+    vertex, towards = PlyData.read(path)["vertex"][0], torch.tensor([[0.36, 0.48, 0.8]])
+    (basis,) = with_phase(towards, 3)
+    ours = shade(torch.cat((given.base, given.view), dim=1), towards)[0].tolist()
     for channel in range(3):
         names = [f"f_dc_{channel}", *(f"f_rest_{8 * channel + k}" for k in range(8))]
-        theirs = sum(b * float(vertex[name]) for b, name in zip(basis, names, strict=True))
-        assert theirs == pytest.approx(ours[channel], abs=1e-5)
+        assert basis @ [float(vertex[name]) for name in names] == pytest.approx(
+            ours[channel], abs=1e-5
+        )
 
 
 def vertices_of(scene: Scene, path: Path, **changes: float) -> np.ndarray:
@@ -113,8 +102,8 @@ def test_text_the_other_byte_order_and_doubles_are_read_alike(how, kind, tiny_sc
     other = vertices.astype([(name, kind) for name in vertices.dtype.names])
     found, said = read_again(other, tmp_path / "b.ply", tiny_scene, **how)
     assert said == ""
-    for name, value in ply.read(tmp_path / "a.ply", tiny_scene, print).named_parameters():
-        torch.testing.assert_close(getattr(found, name), value, rtol=1e-6, atol=1e-6)
+    plain = ply.read(tmp_path / "a.ply", tiny_scene, print).state_dict()
+    torch.testing.assert_close(found.state_dict(), plain, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -177,25 +166,25 @@ def test_surfels_of_2dgs_are_flat(tiny_scene, tmp_path):
 def test_files_without_gaussians_are_refused(changes, complaint, tiny_scene, tmp_path):
     path = tmp_path / "a.ply"
     vertices = repack_fields(vertices_of(tiny_scene, path)[changes])
-    with pytest.raises(SteerbenchError, match=complaint):
+    with refusal(complaint):
         read_again(vertices, path, tiny_scene)
 
 
 @pytest.mark.parametrize("name", ["a.spz", "a.compressed.ply"])
 def test_packed_files_are_named_with_what_converts_them(name, tiny_scene, tmp_path):
     vertices = np.zeros(1, [("packed_position", "u4")])
-    with pytest.raises(SteerbenchError, match=f"splat-transform {name} a-plain.ply"):
+    with refusal(f"splat-transform {name} a-plain.ply"):
         read_again(vertices, tmp_path / name, tiny_scene)
 
 
 def test_a_missing_or_damaged_file_and_one_of_another_place_are_refused(tiny_scene, tmp_path):
     path = tmp_path / "a.ply"
-    with pytest.raises(SteerbenchError, match="expected a PLY file of 3D Gaussians, got no"):
+    with refusal("expected a PLY file of 3D Gaussians, got no"):
         ply.read(path, tiny_scene, print)
     ply.write(some(), tiny_scene, path)
-    with pytest.raises(SteerbenchError, match="none of 50 Gaussians lies inside the scene"):
+    with refusal("none of 50 Gaussians lies inside the scene"):
         ply.read(path, replace(tiny_scene, origin=torch.full((3,), 100.0)), print)
     for content in (path.read_bytes()[:-100], b"\x89PNG\r\n\x1a\n"):
         path.write_bytes(content)
-        with pytest.raises(SteerbenchError, match="could not read one"):
+        with refusal("could not read one"):
             ply.read(path, tiny_scene, print)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from bench.types import Rays, Scene
+from bench.types import Scene
 from methods.gaussians import training
 from methods.gaussians.model import Gaussians
 from methods.gaussians.training import (
@@ -23,13 +23,13 @@ from methods.gaussians.training import (
     spacing,
 )
 from methods.kernels.types import Pixels
+from tests.common import seeded
 from tests.methods.trainings import TEACHER, does_not_see_what_masks_hide, goes_on_after_a_kill
 from tests.methods.usual import usual
 
 
 def test_they_begin_on_surfaces_with_their_colours(ball_scene, teacher):
-    generator = torch.Generator().manual_seed(0)
-    points, colours = on_surfaces(teacher, ball_scene, 500, generator)
+    points, colours = on_surfaces(teacher, ball_scene, 500, seeded(0))
     radius = (points - 0.5).norm(dim=1)
     assert len(points) == 500
     assert abs(radius.median().item() - 0.3) < 2 * 1.6 / 40
@@ -40,16 +40,15 @@ def test_they_begin_on_surfaces_with_their_colours(ball_scene, teacher):
 def test_points_come_from_all_pictures_alike(ball_scene, monkeypatch):
     """Three of five pixels show matter, at their camera."""
 
-    def render(field: Any, rays: Rays, *_: Any) -> Pixels:
+    def render(field, rays, *_):
         alpha = torch.arange(len(rays.origins)) % 5 < 3
         return replace(Pixels.blank(len(alpha), 3), alpha=alpha.float())
 
     monkeypatch.setattr(training, "render_rays", render)
     field = SimpleNamespace(device=torch.device("cpu"))
-    trained: Any = SimpleNamespace(field=field, occupancy=None, sampling=None)
+    trained = SimpleNamespace(field=field, occupancy=None, sampling=None)
     cameras, each = ball_scene.splits["train"].cameras, 30
-    generator = torch.Generator().manual_seed(0)
-    points, _ = on_surfaces(trained, ball_scene, each * len(cameras), generator)
+    points, _ = on_surfaces(trained, ball_scene, each * len(cameras), seeded(0))
     found = [int((points == camera.c2w[:, 3]).all(dim=1).sum()) for camera in cameras]
     # Two draws of 18 points a picture, of which five in six are taken; each can be off by 2.
     assert found == pytest.approx([each] * len(cameras), abs=4)
@@ -59,12 +58,12 @@ def test_spacing_is_the_distance_of_neighbours(ball_scene):
     lattice = torch.cartesian_prod(*[0.1 * torch.arange(4.0)] * 3)
     torch.testing.assert_close(spacing(lattice), torch.full((64,), 0.1))
     assert (spacing(torch.zeros(10, 3)) > 0).all()  # all in one place
-    points, _ = anywhere(ball_scene, 100, torch.Generator().manual_seed(0))
+    points, _ = anywhere(ball_scene, 100, seeded(0))
     assert ((points >= 0.1) & (points <= 0.9)).all()
 
 
 def new_training(scene: Scene, steps: int = 40, **options: Any) -> GaussianTraining:
-    points, colours = anywhere(scene, 200, torch.Generator().manual_seed(0))
+    points, colours = anywhere(scene, 200, seeded(0))
     gaussians = Gaussians.at(points, colours, 0.5 * spacing(points), 0.5, degree=3)
     fitting = usual("method/gaussians", "fitting", **{"every": 10, **options})
     return GaussianTraining(gaussians, scene, steps, fitting, TEACHER)
@@ -107,7 +106,7 @@ def test_copies_are_together_as_opaque_as_the_one_they_replace(opacity, copies):
 def test_the_dead_move_to_the_living():
     gaussians, optimiser = some([0.9, DEAD / 2, 0.3, DEAD / 5])
     before = gaussians.means.detach().clone()
-    assert relocate(gaussians, optimiser, torch.Generator().manual_seed(0)) == 2
+    assert relocate(gaussians, optimiser, seeded(0)) == 2
     alive = before[[0, 2]]
     for moved in (1, 3):
         assert (gaussians.means[moved] == alive).all(dim=1).any()
@@ -118,7 +117,7 @@ def test_the_dead_move_to_the_living():
 def test_what_moved_and_what_it_moved_to_forget_their_moments():
     gaussians, optimiser = some([0.9, DEAD / 2, 1e-9])  # nothing else to move to
     gaussians.logits.data[2] = gaussians.logits.data[0]
-    assert relocate(gaussians, optimiser, torch.Generator().manual_seed(1)) == 1
+    assert relocate(gaussians, optimiser, seeded(1)) == 1
     moments = optimiser.state[gaussians.means]["exp_avg"]
     source = 0 if torch.equal(gaussians.means[1], gaussians.means[0]) else 2
     assert (moments[[1, source]] == 0).all()
@@ -137,7 +136,7 @@ def test_noise_moves_the_faint_along_their_shape_and_leaves_the_opaque():
     gaussians, _ = some([0.9] + [DEAD / 10] * 999)
     before = gaussians.means.detach().clone()
     gaussians.log_scales.data[:] = torch.tensor([0.1, 0.01, 0.001]).log()
-    disturb(gaussians, 1.0, torch.Generator().manual_seed(0))
+    disturb(gaussians, 1.0, seeded(0))
     moved = (gaussians.means - before).detach()
     assert moved[0].abs().max() < 1e-9
     # The variances of the shape are 0.01, 1e-4 and 1e-6, times a faintness of about 0.61.

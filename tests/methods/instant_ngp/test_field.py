@@ -8,18 +8,17 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from methods.instant_ngp.field import LOG_DENSITY_CLAMP, HashField, _ClampedExp
 from methods.kernels.encode import HashGrid, SampleGradients, encode
+from tests.common import assert_near, seeded
 from tests.methods.conftest import Work
 
 GRID = HashGrid(levels=4, features=2, log2_table=8, n_min=4, n_max=32)
-GENERATOR = torch.Generator().manual_seed(1)
+GENERATOR = seeded(1)
 POSITIONS = torch.rand(200, 3, generator=GENERATOR)
 DIRECTIONS = torch.randn(200, 3, generator=GENERATOR)
 
 
 def field(precision: str, **options) -> HashField:
-    made = HashField(
-        GRID, precision=precision, generator=torch.Generator().manual_seed(0), **options
-    )
+    made = HashField(GRID, precision=precision, generator=seeded(0), **options)
     with torch.no_grad():
         made.table.mul_(1e4)  # from +-1e-4 to +-1, so that outputs differ
     made.repack()
@@ -55,8 +54,8 @@ def test_a_known_encoding_changes_neither_density_nor_gradient(precision, collec
 def test_bfloat16_is_close_to_float32():
     exact, rounded = evaluate(field("fp32")), evaluate(field("bf16"))
     # Five layers and the table, each rounded to a relative 2^-8 of values that cancel in sums.
-    torch.testing.assert_close(rounded[1], exact[1], rtol=0, atol=0.03)
-    torch.testing.assert_close(rounded[0].log(), exact[0].log(), rtol=0, atol=0.1)
+    assert_near(rounded[1], exact[1], atol=0.03)
+    assert_near(rounded[0].log(), exact[0].log(), atol=0.1)
 
 
 def test_without_products_of_bfloat16_what_is_stored_in_it_is_multiplied_in_float32(monkeypatch):
@@ -70,9 +69,7 @@ def test_without_products_of_bfloat16_what_is_stored_in_it_is_multiplied_in_floa
     hidden = (encoded @ layers["density_in"].T).relu()
     log_density = (hidden @ layers["density_out"].T)[:, 0]
     # Sums of at most 64 products: 64 u = 4e-6 of the largest, which is some units.
-    torch.testing.assert_close(
-        rounded.density(POSITIONS)[0].log().double(), log_density, rtol=0, atol=2e-5
-    )
+    assert_near(rounded.density(POSITIONS)[0].log().double(), log_density, atol=2e-5)
 
 
 def test_sizes_are_those_of_the_precision():
@@ -104,11 +101,11 @@ def test_the_work_of_a_field_is_what_torch_counts():
 def test_features_that_are_appended_are_random():
     made = field("fp32")
     before = evaluate(made)
-    made.widen(6, torch.Generator().manual_seed(0))
+    made.widen(6, seeded(0))
     sigma, features = evaluate(made)
     assert made.channels == 6
     assert torch.equal(sigma, before[0])
-    torch.testing.assert_close(features[:, :3], before[1], rtol=0, atol=1e-6)
+    assert_near(features[:, :3], before[1], atol=1e-6)
     appended = made.layers["feature_out"].detach()[3:]
     # Xavier: uniform in +-sqrt(6 / (64 + 6)), 192 of them.
     assert 0.9 * math.sqrt(6 / 70) < appended.abs().max() < math.sqrt(6 / 70)

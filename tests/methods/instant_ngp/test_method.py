@@ -1,7 +1,5 @@
 """Instant-NGP as a method."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -9,6 +7,7 @@ import torch
 
 from bench.types import Budget, Log, NullProbe, Scene
 from methods.instant_ngp.method import InstantNgp
+from tests.common import refusal
 from tests.methods.trainings import GRID, PIXEL, QUICK, TAUGHT, shows_the_ball
 from tests.methods.usual import new_ngp
 
@@ -21,7 +20,7 @@ def fitted(scene: Scene, log: Log, device: str, budget: Budget = BUDGET, **optio
     return method
 
 
-def test_it_learns_a_ball(ball_scene: Scene, shared_log: Log, device: str) -> None:
+def test_it_learns_a_ball(ball_scene, shared_log, device):
     method = fitted(ball_scene, shared_log, device, TAUGHT)
     shows_the_ball(method, ball_scene, 24, 2 * PIXEL)
     cameras = ball_scene.splits["test"].cameras
@@ -31,9 +30,7 @@ def test_it_learns_a_ball(ball_scene: Scene, shared_log: Log, device: str) -> No
     assert torch.equal(method.render(cameras[1], NullProbe()).rgb, frame.rgb)
 
 
-def test_another_precision_is_another_training_of_its_own_size(
-    ball_scene: Scene, quiet_log: Log
-) -> None:
+def test_another_precision_is_another_training_of_its_own_size(ball_scene, quiet_log):
     first = fitted(ball_scene, quiet_log, "cpu")
     second = fitted(ball_scene, quiet_log, "cpu", precision="fp32")
     assert second.trained.field.packed is None
@@ -44,9 +41,7 @@ def test_another_precision_is_another_training_of_its_own_size(
 
 
 @pytest.mark.parametrize(("has_products", "said"), [(True, "bf16"), (False, "bf16 in fp32")])
-def test_settings_say_in_which_precision_a_field_is_multiplied(
-    monkeypatch: pytest.MonkeyPatch, has_products: bool, said: str
-) -> None:
+def test_settings_say_in_which_precision_a_field_is_multiplied(monkeypatch, has_products, said):
     known = {"cpu": has_products}
     monkeypatch.setattr("methods.instant_ngp.stage1.multiplies_bf16", known.__getitem__)
     for precision, shown in (("bf16", said), ("fp32", "fp32")):
@@ -55,6 +50,6 @@ def test_settings_say_in_which_precision_a_field_is_multiplied(
         assert method.settings() == {**others, "field_precision": shown}
 
 
-def test_bfloat16_packs_two_features() -> None:
-    with pytest.raises(ValueError, match=r"grid\.features is 4: use precision=fp32"):
+def test_bfloat16_packs_two_features():
+    with refusal(r"grid\.features is 4: use precision=fp32", ValueError):
         new_ngp(grid=replace(GRID, features=4), training=QUICK, device="cpu")

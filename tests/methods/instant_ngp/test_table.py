@@ -1,11 +1,9 @@
 """How long a hash table a scene needs."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
-from bench.types import Budget, Log, Scene, Split
+from bench.types import Budget, Split
 from methods.instant_ngp.table import LONG, SHORT, detail, hash_grid
 from methods.kernels.encode import HashGrid
 from tests.methods.trainings import QUICK
@@ -39,14 +37,10 @@ def test_detail_is_a_mean_over_pictures_from_all_over_the_path():
     assert detail(split_of(*[plain] * 16, *[dotted] * 16)) == pytest.approx(1.5)
 
 
-def test_a_length_that_is_given_is_kept():
-    assert hash_grid(log2_table=12, **SHAPE) == HashGrid(log2_table=12, **SHAPE)
-
-
 @pytest.mark.parametrize(("fine", "expected"), [(10**6, SHORT), (0, LONG)])
 def test_a_field_gets_the_table_that_its_scene_needs(
-    ball_scene: Scene, quiet_log: Log, monkeypatch: pytest.MonkeyPatch, fine: int, expected: int
-) -> None:
+    ball_scene, quiet_log, monkeypatch, fine, expected
+):
     monkeypatch.setattr("methods.instant_ngp.table.FINE", fine)
     method = new_ngp(grid=hash_grid(log2_table=None, **SHAPE), training=QUICK, device="cpu")
     method.fit(ball_scene, BUDGET, quiet_log)

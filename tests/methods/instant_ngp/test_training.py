@@ -7,10 +7,9 @@ from unittest.mock import Mock
 
 import pytest
 import torch
-from torch import Tensor
 
 from bench.console import ConsoleLog
-from bench.types import Budget, Rays, Scene, Split, SteerbenchError, Unavailable, composite
+from bench.types import Budget, Scene, Split, Unavailable, composite
 from methods.instant_ngp.cases import cases
 from methods.instant_ngp.field import HashField
 from methods.instant_ngp.pixels import RUN, UNSEEN
@@ -19,6 +18,7 @@ from methods.instant_ngp.training import MIN_RAYS, FieldTraining, PixelTraining
 from methods.kernels.types import Pixels
 from methods.rendering.occupancy import RESOLUTION, STEP
 from methods.training import checkpoint, loop
+from tests.common import refusal, seeded
 from tests.methods.trainings import (
     GRID,
     QUICK,
@@ -32,7 +32,7 @@ BUDGET = Budget("test", steps=40, samples=1024)
 
 
 def new_training(scene: Scene, **options: Any) -> FieldTraining:
-    field = HashField(GRID, generator=torch.Generator().manual_seed(0))
+    field = HashField(GRID, generator=seeded(0))
     return FieldTraining(field, scene, BUDGET, replace(QUICK, **options), seed=0)
 
 
@@ -47,10 +47,10 @@ def stage(scene: Scene, root: Path) -> Path:
 
 
 @pytest.fixture
-def unlit(ball_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> FieldTraining:
+def unlit(ball_scene, monkeypatch) -> FieldTraining:
     """A training that renders every pixel black and learns nothing."""
 
-    def render(rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
+    def render(rays, jitter, background):
         black = Pixels.blank(len(jitter), 3)
         return replace(black, values=black.values.requires_grad_()), BUDGET.samples
 
@@ -78,14 +78,14 @@ def test_the_error_shown_is_that_of_pixels_drawn_alike(unlit):
 def test_an_error_that_is_not_finite_stops_it(unlit):
     dark = unlit._render
 
-    def render(rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
+    def render(rays, jitter, background):
         pixels, samples = dark(rays, jitter, background)
         last = torch.zeros(len(jitter), 1)
         last[-1] = torch.nan
         return replace(pixels, values=pixels.values + last), samples
 
     unlit._render = render
-    with pytest.raises(SteerbenchError, match="rendered pixels"):
+    with refusal("rendered pixels"):
         unlit.advance()
 
 
@@ -108,7 +108,7 @@ def test_the_learning_rate_falls_from_the_first_to_the_last_step(ball_scene):
 
 
 def test_the_step_of_the_rays_suits_the_length_of_the_training_or_is_given():
-    def step(steps: int, march_step: float | None = None) -> float:
+    def step(steps, march_step=None):
         return field_options(march_step=march_step).sampling(replace(BUDGET, steps=steps)).step
 
     assert step(20_000) == STEP  # as long as the release trains
@@ -142,14 +142,14 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_last_good_checkpoint(
     monkeypatch.setattr(loop, "CHECKPOINT_S", -1.0)
     advance = FieldTraining.advance
 
-    def spoiled_at_10(training: FieldTraining) -> dict[str, float]:
+    def spoiled_at_10(training):
         if training.step == 10:
             with torch.no_grad():
                 training.field.layers["feature_mid"][0, 0] = torch.nan
         return advance(training)
 
     monkeypatch.setattr(FieldTraining, "advance", spoiled_at_10)
-    with pytest.raises(SteerbenchError, match=r"step 10.*feature_mid.*last good checkpoint"):
+    with refusal(r"step 10.*feature_mid.*last good checkpoint"):
         trained(ball_scene, tmp_path)
     training = new_training(ball_scene)
     loop.load(training, stage(ball_scene, tmp_path) / "checkpoint.safetensors")
@@ -162,14 +162,14 @@ def test_a_training_that_went_bad_in_its_last_step_is_not_finished(
 ):
     update = FieldTraining._update
 
-    def spoiled(training: FieldTraining) -> None:
+    def spoiled(training):
         update(training)
         if training.step == BUDGET.steps - 1:
             with torch.no_grad():
                 training.field.table[0, 0] = torch.inf
 
     monkeypatch.setattr(FieldTraining, "_update", spoiled)
-    with pytest.raises(SteerbenchError, match=r"step 40: not finite: table"):
+    with refusal(r"step 40: not finite: table"):
         trained(ball_scene, tmp_path)
     assert [path.name for path in stage(ball_scene, tmp_path).iterdir()] == ["lock"]
 
@@ -180,16 +180,16 @@ def test_a_file_that_is_damaged_or_of_another_training_is_named_with_what_to_do(
 ):
     path = stage(ball_scene, tmp_path) / f"{name}.safetensors"
     path.write_bytes(b"half a file")
-    with pytest.raises(SteerbenchError, match=rf"{name}\.safetensors.*remove it, and it is made"):
+    with refusal(rf"{name}\.safetensors.*remove it, and it is made"):
         trained(ball_scene, tmp_path)
     checkpoint.write(path, {"mean.weight": torch.zeros(3)}, {})
     whole = path.read_bytes()
     path.write_bytes(whole[:-1] + b"1")  # one weight is another number
-    with pytest.raises(SteerbenchError, match=rf"{name}\.safetensors.*its checksum is wrong"):
+    with refusal(rf"{name}\.safetensors.*its checksum is wrong"):
         trained(ball_scene, tmp_path)
     path.write_bytes(whole)
     message = rf"{name}\.safetensors: expected the file of this .*; remove it to train again"
-    with pytest.raises(SteerbenchError, match=message):
+    with refusal(message):
         trained(ball_scene, tmp_path)
 
 
@@ -205,13 +205,13 @@ def test_a_step_has_the_rays_that_were_asked_for(setting, ball_scene):
 def test_pictures_that_do_not_overlap_are_refused(ball_scene):
     train = ball_scene.splits["train"]
     alone = Split(train.cameras[:1], train.images[:1], train.names[:1])
-    with pytest.raises(SteerbenchError, match="no part of the unit cube is seen by 2 training"):
+    with refusal("no part of the unit cube is seen by 2 training"):
         new_training(replace(ball_scene, splits={"train": alone}))
 
 
 def test_a_checkpoint_that_cannot_be_written_says_so(tmp_path):
-    with pytest.raises(SteerbenchError, match=r"gone.*cannot write the checkpoint"):
-        checkpoint.write(tmp_path / "gone" / "field.safetensors", {}, {})
+    with refusal(r"gone.*cannot write the checkpoint"):
+        checkpoint.write(tmp_path / "gone/field.safetensors", {}, {})
 
 
 def test_a_random_background_is_one_colour_for_a_ray_and_its_truth(ball_scene):

@@ -1,17 +1,16 @@
 """The sparse Adam step against torch's dense one, and what it leaves alone."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
 from methods.kernels.adam import AdamState, hash_adam_, sparse_adam_
 from methods.kernels.encode import HashGrid, SampleGradients, encode, pack
+from tests.common import refusal, seeded
 
 
-def test_an_entry_makes_the_steps_of_adam_at_which_it_has_a_gradient(backend: str) -> None:
+def test_an_entry_makes_the_steps_of_adam_at_which_it_has_a_gradient(backend):
     """As if it were alone, whatever the others do; torch leaves out what has no gradient."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     table = torch.randn(50, 2, generator=generator)
     entries = [torch.nn.Parameter(entry.clone()) for entry in table]
     optimiser = torch.optim.Adam(entries, lr=1e-2, betas=(0.9, 0.99), eps=1e-15)
@@ -31,10 +30,10 @@ def test_an_entry_makes_the_steps_of_adam_at_which_it_has_a_gradient(backend: st
 
 
 @pytest.mark.parametrize("features", [1, 2, 3])
-def test_the_step_of_collected_gradients_is_that_of_their_sum(backend: str, features: int) -> None:
+def test_the_step_of_collected_gradients_is_that_of_their_sum(backend, features):
     """To the bit, as both add up in the order of the samples; over parts, levels and steps."""
     grid = HashGrid(levels=3, features=features, log2_table=12, n_min=4, n_max=64)
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     start = torch.randn(grid.entries, features, generator=generator)
     tables, states = (start.clone(), start), (AdamState.like(start), AdamState.like(start))
     words = pack(start) if features == 2 else None
@@ -55,13 +54,13 @@ def test_the_step_of_collected_gradients_is_that_of_their_sum(backend: str, feat
     assert words is None or torch.equal(words, pack(tables[0]))
 
 
-def test_wrong_arguments_are_named() -> None:
+def test_wrong_arguments_are_named():
     grid = HashGrid(levels=1, features=2, log2_table=6, n_min=4, n_max=4)
     gradients = SampleGradients([(torch.zeros(5, 3), torch.zeros(5, 3))])
     table = torch.zeros(grid.entries, 2)
-    with pytest.raises(ValueError, match="steps: expected shape"):
+    with refusal("steps: expected shape", ValueError):
         sparse_adam_(table, table.clone(), AdamState(table, table, torch.zeros(2)), 0.1)
-    with pytest.raises(ValueError, match=r"gradients: expected shape \[5, 2\], got \[5, 3\]"):
+    with refusal(r"gradients: expected shape \[5, 2\], got \[5, 3\]", ValueError):
         hash_adam_(table, gradients, grid, AdamState.like(table), 0.1)
-    with pytest.raises(ValueError, match="packed: expected shape"):
+    with refusal("packed: expected shape", ValueError):
         hash_adam_(table, gradients, grid, AdamState.like(table), 0.1, packed=torch.zeros(2))

@@ -12,7 +12,7 @@ MARCH = "methods.kernels.march.cases"
 @pytest.fixture
 def computed(monkeypatch) -> list[str]:
     """The modules whose cases are computed, which is what compiles."""
-    modules: list[str] = []
+    modules = []
     monkeypatch.setattr(compilation, "wrong_of", modules.append)
     return modules
 

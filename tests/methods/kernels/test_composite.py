@@ -14,6 +14,7 @@ from bench.case import U32
 from methods.kernels.composite import composite, visibility
 from methods.kernels.composite.experiments import exact, slope
 from methods.kernels.types import Intervals, Pixels, offsets_of
+from tests.common import assert_near, refusal, seeded
 
 Inputs = tuple[Tensor, Tensor, Intervals]
 
@@ -21,7 +22,7 @@ Inputs = tuple[Tensor, Tensor, Intervals]
 def samples(
     counts: list[int], channels: int = 3, dtype: torch.dtype = torch.float32, seed: int = 0
 ) -> Inputs:
-    generator = torch.Generator().manual_seed(len(counts) + seed)
+    generator = seeded(len(counts) + seed)
     total = sum(counts)
 
     def draw(*shape: int) -> Tensor:
@@ -32,28 +33,23 @@ def samples(
     return sigma, values, Intervals(t, delta, offsets_of(torch.tensor(counts)))
 
 
-def plain_composite(rows: list[list[float]], stop: float) -> list[float]:
-    """The sums of a ray by definition (Eq. 2, 3), in Python numbers. A sample is a row: density,
-    length, and the five numbers that are summed."""
-    sums, transmittance = [0.0] * 5, 1.0
-    for sigma, delta, *shown in rows:
-        if transmittance <= stop:
-            break
-        opacity = 1 - math.exp(-sigma * delta)
-        sums = [total + transmittance * opacity * x for total, x in zip(sums, shown, strict=True)]
-        transmittance *= 1 - opacity
-    return sums
+def by_definition(sigma: Tensor, delta: Tensor, shown: Tensor, stop: float) -> Tensor:
+    """The sums of a ray of the numbers that its samples show (Eq. 2, 3)."""
+    opacity = 1 - torch.exp(-sigma * delta)
+    behind = (1 - opacity).cumprod(dim=0)
+    before = torch.cat((torch.ones(1), behind))[:-1]
+    return (torch.where(before > stop, before * opacity, 0)[:, None] * shown).sum(dim=0)
 
 
 @pytest.mark.parametrize("stop", [0.0, 0.3])
 def test_reference_is_the_definition(stop):
     sigma, values, where = inputs = samples([4, 0, 1, 9], dtype=torch.float64)
     pixels = composite(*inputs, stop=stop, backend="reference")
-    summed = torch.column_stack((values, where.t, torch.ones_like(sigma)))
-    rows = torch.column_stack((sigma, where.delta, summed)).split([4, 0, 1, 9])
-    got = torch.column_stack((pixels.values, pixels.depth_sum, pixels.alpha)).tolist()
-    for ray, pixel in zip(rows, got, strict=True):
-        assert pixel == pytest.approx(plain_composite(ray.tolist(), stop), abs=1e-12)
+    shown = torch.column_stack((values, where.t, torch.ones_like(sigma)))
+    rays = zip(*(x.split([4, 0, 1, 9]) for x in (sigma, where.delta, shown)), strict=True)
+    wanted = torch.stack([by_definition(*ray, stop) for ray in rays])
+    got = torch.column_stack((pixels.values, pixels.depth_sum, pixels.alpha))
+    assert_near(got, wanted, atol=1e-12)
 
 
 def part(inputs: Inputs, index: Tensor, counts: list[int]) -> Inputs:
@@ -108,7 +104,7 @@ def test_visible_samples_are_those_with_a_weight_which_is_the_gradient_of_their_
     (gradient,) = torch.autograd.grad(pixels.values.sum(), values)
     found, counts, left = visibility(sigma, where, stop=0.05, front=1 - alpha, backend=backend)
     torch.testing.assert_close(found, gradient[:, 0], rtol=1e-5, atol=1e-7)
-    torch.testing.assert_close(left, 1 - pixels.alpha, rtol=0, atol=1e-6)
+    assert_near(left, 1 - pixels.alpha, atol=1e-6)
     assert 0 < counts[0] < 40
     ends = zip(found.split([40, 0, 1, 25]), counts.tolist(), strict=True)
     assert all((part[:count] > 0).all() and not part[count:].any() for part, count in ends)
@@ -116,11 +112,11 @@ def test_visible_samples_are_those_with_a_weight_which_is_the_gradient_of_their_
 
 def test_wrong_arguments_are_named():
     sigma, values, where = samples([5])
-    with pytest.raises(ValueError, match="values: expected shape"):
+    with refusal("values: expected shape", ValueError):
         composite(sigma, values[1:], where)
-    with pytest.raises(ValueError, match="offsets: expected to end at the 5 samples"):
+    with refusal("offsets: expected to end at the 5 samples", ValueError):
         composite(sigma, values, replace(where, offsets=torch.tensor([0, 6])))
-    with pytest.raises(ValueError, match="float32"):
+    with refusal("float32", ValueError):
         composite(*samples([5], dtype=torch.float64), backend="cpu")
 
 

@@ -10,13 +10,14 @@ from methods.kernels.composite import composite
 from methods.kernels.march import march
 from methods.kernels.march.contraction import HALF, contract, expand, stretch
 from methods.kernels.types import Occupancy
+from tests.common import assert_near, seeded
 
 STEP = math.sqrt(3) / 1024
 FULL = Occupancy(torch.ones(16, 16, 16), contracted=True)
 
 
 def some_points(count=1000):
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     away = 10 ** (6 * torch.rand(count, 1, generator=generator) - 3)
     return 0.5 + away * normalize(torch.randn(count, 3, generator=generator), dim=1)
 
@@ -25,7 +26,7 @@ def test_points_in_the_box_stay_and_all_others_go_to_the_rest_of_the_cube():
     points = some_points()
     inside = (points - 0.5).abs().amax(dim=1) <= HALF
     places = contract(points)
-    torch.testing.assert_close(places[inside], points[inside], rtol=0, atol=1e-7)
+    assert_near(places[inside], points[inside], atol=1e-7)
     size = (places - 0.5).abs().amax(dim=1)
     assert (size[~inside] >= HALF).all()
     assert (size <= 0.5).all()
@@ -47,7 +48,7 @@ def test_expand_inverts_contract_and_stretch_is_its_slope_along_an_axis():
 
 
 def test_a_ray_goes_to_infinity_in_few_steps_whose_lengths_add_up(backend):
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     origins = 0.5 + torch.randn(200, 3, generator=generator)  # in the box, near it and far off
     rays = Rays(origins, torch.randn(200, 3, generator=generator))
     samples = march(rays, FULL, STEP, backend=backend)
@@ -70,8 +71,7 @@ def test_a_ray_goes_to_infinity_in_few_steps_whose_lengths_add_up(backend):
 
 def test_a_wall_beyond_the_box_is_seen_at_its_depth_whatever_it_hides():
     wall = 3.0  # x from which on everything is solid: 10 half sides from the middle
-    generator = torch.Generator().manual_seed(0)
-    targets = torch.rand(100, 3, generator=generator) - 0.5
+    targets = torch.rand(100, 3, generator=seeded(0)) - 0.5
     directions = torch.cat((torch.ones(100, 1), targets[:, 1:]), dim=1)
     rays = Rays(torch.full((100, 3), 0.5), directions)  # t is the way along x
     samples = march(rays, FULL, STEP, backend="reference")
@@ -80,4 +80,4 @@ def test_a_wall_beyond_the_box_is_seen_at_its_depth_whatever_it_hides():
     pixels = composite(sigma, sigma[:, None], samples, stop=1e-4)
     step = STEP * (wall / HALF) ** 2 * 3  # b is up to 0.6 half sides farther than the axis
     torch.testing.assert_close(pixels.alpha, torch.ones(100))
-    torch.testing.assert_close(pixels.depth_sum, torch.full((100,), wall - 0.5), rtol=0, atol=step)
+    assert_near(pixels.depth_sum, torch.full((100,), wall - 0.5), atol=step)

@@ -6,7 +6,6 @@ import os
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from numba import njit
 
 from bench.case import U32
 from methods.kernels.cpu import EDGE, exp, pack_bf16
+from tests.common import ROOT
 
 
 @njit
@@ -62,16 +62,16 @@ print(round(called(np.float32(2))), *called.stats.cache_hits.values())
 
 @pytest.mark.slow
 def test_machine_code_is_used_until_a_file_changes_that_it_comes_from(tmp_path):
-    root, apart = Path(__file__).parents[3], shutil.ignore_patterns("__pycache__", "scenes")
+    apart = shutil.ignore_patterns("__pycache__", "scenes")
     for package in ("bench", "methods/kernels"):
-        shutil.copytree(root / package, tmp_path / package, ignore=apart)
-    shutil.copy(root / "methods/__init__.py", tmp_path / "methods")
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=apart)
+    shutil.copy(ROOT / "methods/__init__.py", tmp_path / "methods")
     caller, shared = tmp_path / "methods/caller", tmp_path / "methods/kernels/cpu.py"
     caller.mkdir()
     (caller / "__init__.py").touch()
     (caller / "cpu.py").write_text(CALLER)
 
-    def called() -> str:
+    def called():
         command = [sys.executable, "-c", "import methods.caller.cpu"]
         given = {**os.environ, "PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": ""}
         done = subprocess.run(command, cwd=tmp_path, env=given, capture_output=True, text=True)

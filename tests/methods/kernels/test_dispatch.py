@@ -8,6 +8,7 @@ import torch
 
 from bench.errors import Unavailable
 from methods.kernels import availability, dispatch, resolve
+from tests.common import refusal
 
 
 def test_auto_goes_by_the_device():
@@ -17,9 +18,9 @@ def test_auto_goes_by_the_device():
 
 
 def test_a_backend_that_is_unknown_or_of_another_device_is_refused():
-    with pytest.raises(Unavailable, match=r"'refrence'.*did you mean 'reference'"):
+    with refusal(r"'refrence'.*did you mean 'reference'", Unavailable):
         resolve("refrence", "cpu")
-    with pytest.raises(Unavailable, match="serves CPU tensors, these are on 'cuda'"):
+    with refusal("serves CPU tensors, these are on 'cuda'", Unavailable):
         resolve("cpu", "cuda")
 
 
@@ -27,7 +28,7 @@ def test_a_backend_that_is_unknown_or_of_another_device_is_refused():
 def test_backend_that_cannot_be_used_says_why(monkeypatch):
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
     availability.cache_clear()
-    with pytest.raises(Unavailable, match=r"sees no GPU|not installed"):
+    with refusal(r"sees no GPU|not installed", Unavailable):
         resolve("gpu", "cuda")
     availability.cache_clear()
 

@@ -1,7 +1,5 @@
 """The kernels of the GPU where their cases say nothing: on a GPU, else in Triton's interpreter."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import os
@@ -21,6 +19,7 @@ from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import composite, visibility
 from methods.kernels.encode import HashGrid, encode
 from methods.kernels.types import Intervals
+from tests.common import refusal, seeded
 
 pytestmark = pytest.mark.skipif(
     bool(availability()["gpu"]), reason="Triton has no build for this platform"
@@ -28,7 +27,7 @@ pytestmark = pytest.mark.skipif(
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
 
-def test_what_is_not_a_number_shows_and_what_is_behind_it_does_not() -> None:
+def test_what_is_not_a_number_shows_and_what_is_behind_it_does_not():
     """On a ray of several blocks of 64 samples; an opaque sample hides what is behind, too."""
     offsets = torch.tensor([0, 200, 202], device=DEVICE)
     sigma = torch.full((202,), 0.01, device=DEVICE)
@@ -45,8 +44,8 @@ def test_what_is_not_a_number_shows_and_what_is_behind_it_does_not() -> None:
     assert pixels.alpha[1] == 1
 
 
-def test_what_is_not_contiguous_is_read_all_the_same() -> None:
-    generator = torch.Generator().manual_seed(0)
+def test_what_is_not_contiguous_is_read_all_the_same():
+    generator = seeded(0)
     grid = HashGrid(levels=2, features=2, log2_table=6, n_min=4, n_max=20)
     positions = torch.rand(3, 50, generator=generator).to(DEVICE).T
     table = torch.rand(2, grid.entries, generator=generator).to(DEVICE).T.requires_grad_()
@@ -59,7 +58,7 @@ def test_what_is_not_contiguous_is_read_all_the_same() -> None:
     assert largest_error(*gradients) <= 6 * 50**0.5 * (fractions + 50 * U32)
 
 
-def test_a_thin_haze_keeps_its_light_to_the_last_digits() -> None:
+def test_a_thin_haze_keeps_its_light_to_the_last_digits():
     """1 - exp(-tau) of a tau far below 1, which a difference of float32 numbers does not have."""
     sigma = torch.logspace(-30, 0, 61, device=DEVICE)
     offsets = torch.arange(62, device=DEVICE)
@@ -72,7 +71,7 @@ def test_a_thin_haze_keeps_its_light_to_the_last_digits() -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(platform.system() != "Linux", reason="Triton brings its assembler for Linux")
-def test_every_kernel_compiles_for_gpus_that_are_not_here_without_spills(tmp_path: Path) -> None:
+def test_every_kernel_compiles_for_gpus_that_are_not_here_without_spills(tmp_path):
     environment = {name: text for name, text in os.environ.items() if name != "TRITON_INTERPRET"}
     done = subprocess.run(
         [sys.executable, "-P", Path(__file__).with_name("compiled.py")],
@@ -91,11 +90,11 @@ def test_every_kernel_compiles_for_gpus_that_are_not_here_without_spills(tmp_pat
     assert set(spilled) == {"0"}
 
 
-def test_what_it_does_not_serve_is_refused() -> None:
+def test_what_it_does_not_serve_is_refused():
     grid = HashGrid(levels=1, features=2, log2_table=3, n_min=2, n_max=2)
     table = torch.zeros(2, 8, device=DEVICE).T
     positions = torch.rand(2, 3, dtype=torch.float64, device=DEVICE)
-    with pytest.raises(ValueError, match="expects positions of float32"):
+    with refusal("expects positions of float32", ValueError):
         encode(positions, table, grid, backend="gpu")
-    with pytest.raises(ValueError, match="expects table to be contiguous"):
+    with refusal("expects table to be contiguous", ValueError):
         sparse_adam_(table, table, AdamState.like(table), 0.1, backend="gpu")

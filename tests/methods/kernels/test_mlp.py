@@ -1,29 +1,26 @@
 """The small network: its formula, what it refuses, and that threads do not change it."""
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from bench.threads import torch_threads
 from methods.kernels.mlp import mlp
+from tests.common import assert_near, refusal, seeded
 
 
 def network(count: int, dtype: torch.dtype = torch.float32) -> tuple[list[Tensor], list[Tensor]]:
     """Two inputs of 5 and 3 channels, and layers of 20 and 4 outputs, which need a gradient."""
-    generator = torch.Generator().manual_seed(count)
+    generator = seeded(count)
     inputs = [torch.randn(count, n, generator=generator).to(dtype) for n in (5, 3)]
     layers = [torch.randn(*n, generator=generator).to(dtype) for n in ((20, 8), (4, 20))]
     return inputs, [layer.requires_grad_() for layer in layers]
 
 
 def test_the_reference_is_the_formula():
-    inputs, layers = network(50, torch.float64)
-    first, last = (layer.detach().numpy() for layer in layers)
-    x = np.concatenate([part.numpy() for part in inputs], axis=1)
-    want = np.einsum("oh,sh->so", last, np.maximum(np.einsum("hi,si->sh", first, x), 0))
-    got = mlp(inputs, layers, backend="reference").detach().numpy()
-    np.testing.assert_allclose(got, want, rtol=0, atol=1e-12)
+    inputs, (first, last) = network(50, torch.float64)
+    want = torch.cat(inputs, dim=1).mm(first.T).relu().mm(last.T)
+    assert_near(mlp(inputs, [first, last], backend="reference"), want, atol=1e-12)
 
 
 def test_outputs_depend_on_neither_the_number_of_threads_nor_on_who_asks_for_gradients():
@@ -36,12 +33,12 @@ def test_outputs_depend_on_neither_the_number_of_threads_nor_on_who_asks_for_gra
                 found.append(mlp(inputs, layers, backend="cpu"))
     assert torch.equal(*found)
     # Two sums, of 8 and 20 products, in another order.
-    torch.testing.assert_close(found[0], learning.detach(), rtol=0, atol=1e-4)
+    assert_near(found[0], learning.detach(), atol=1e-4)
 
 
 def test_other_types_numbers_and_shapes_are_refused():
     inputs, layers = network(3)
-    with pytest.raises(ValueError, match="float64"):
+    with refusal("float64", ValueError):
         mlp(*network(3, torch.float64), backend="cpu")
     for name, given in {
         "inputs": ([*inputs, *inputs], layers),
@@ -49,7 +46,7 @@ def test_other_types_numbers_and_shapes_are_refused():
         "weights: expected shape": (inputs, layers[::-1]),
         "weights": (inputs, []),
     }.items():
-        with pytest.raises(ValueError, match=name):
+        with refusal(name, ValueError):
             mlp(*given)
 
 

@@ -1,50 +1,30 @@
-"""Spherical harmonics by what defines them: orthonormal, of their degree, in their order."""
-
-import math
+"""Spherical harmonics are those of scipy: orthonormal, of their degree, in their order."""
 
 import numpy as np
 import torch
-from torch import Tensor
+from scipy.special import sph_harm_y
+from torch.nn.functional import normalize
 
 from methods.kernels.spherical import CHANNELS, spherical_harmonics
+from tests.common import seeded
 
 
-def sphere_quadrature() -> tuple[Tensor, Tensor]:
-    """Directions and weights that integrate polynomials up to degree 6 over the sphere exactly."""
-    nodes, weights = np.polynomial.legendre.leggauss(8)
-    z = torch.tensor(nodes).repeat_interleave(16)
-    angle = torch.arange(16, dtype=torch.float64).repeat(8) * (2 * math.pi / 16)
-    radius = (1 - z * z).sqrt()
-    directions = torch.stack((radius * angle.cos(), radius * angle.sin(), z), dim=1)
-    return directions, torch.tensor(weights).repeat_interleave(16) * (2 * math.pi / 16)
+def with_phase(directions: torch.Tensor, degrees: int) -> np.ndarray:
+    """The real harmonics of all degrees below `degrees` in float64, [N, degrees^2], with the
+    Condon-Shortley phase."""
+    x, y, z = directions.double().T.numpy()
+    found = []
+    for degree in range(degrees):
+        for order in range(-degree, degree + 1):
+            value = sph_harm_y(degree, abs(order), np.arccos(z), np.arctan2(y, x))
+            part = value.imag if order < 0 else value.real
+            found.append(part * (2**0.5 if order else 1))
+    return np.stack(found, axis=1)
 
 
-def test_they_are_orthonormal():
-    directions, weights = sphere_quadrature()
-    values = spherical_harmonics(directions)
-    gram = (values * weights[:, None]).T @ values
-    torch.testing.assert_close(gram, torch.eye(CHANNELS).double(), rtol=0, atol=1e-12)
-
-
-def test_degree_by_parity_and_order_by_rotation():
-    directions, _ = sphere_quadrature()
-    values = spherical_harmonics(directions)
-    degree = torch.tensor([0] + [1] * 3 + [2] * 5 + [3] * 7)
-    # The first degree is the direction, as (y, z, x).
-    torch.testing.assert_close(
-        values[:, 1:4], math.sqrt(3 / (4 * math.pi)) * directions.roll(-1, dims=1)
-    )
-    mirrored = spherical_harmonics(-directions)
-    torch.testing.assert_close(mirrored, values * (-1.0) ** degree)
-    # About z, the pair (l, -m), (l, m) turns by m times the angle.
-    angle = 0.7
-    x, y, z = directions.unbind(dim=1)
-    turned = torch.stack(
-        (math.cos(angle) * x - math.sin(angle) * y, math.sin(angle) * x + math.cos(angle) * y, z), 1
-    )
-    rotated = spherical_harmonics(turned)
-    for first, orders in ((0, 0), (1, 1), (4, 2), (9, 3)):
-        for m in range(orders + 1):
-            sine, cosine = values[:, first + orders - m], values[:, first + orders + m]
-            want = math.cos(m * angle) * cosine - math.sin(m * angle) * sine
-            torch.testing.assert_close(rotated[:, first + orders + m], want)
+def test_they_are_those_of_scipy_without_the_phase():
+    directions = normalize(torch.randn(200, 3, generator=seeded(0)).double(), dim=1)
+    orders = [order for degree in range(4) for order in range(-degree, degree + 1)]
+    wanted = with_phase(directions, 4) * (-1.0) ** np.array(orders)
+    assert wanted.shape == (200, CHANNELS)
+    np.testing.assert_allclose(spherical_harmonics(directions), wanted, rtol=0, atol=1e-12)

@@ -7,6 +7,7 @@ import torch
 from methods.kernels.types import Occupancy
 from methods.kilonerf.field import KiloField, place_networks
 from methods.kilonerf.method import KiloTraining
+from tests.common import seeded
 from tests.methods.usual import lessons
 
 BOUNDS = torch.tensor([[0.1, 0.2, 0.1], [0.9, 0.8, 0.7]])
@@ -37,7 +38,7 @@ def test_the_pieces_of_a_cell_make_up_the_cell():
 
 def test_lessons_are_as_many_for_each_network_and_in_it():
     grid, pieces = place_networks(occupied((8, 8, 8), (8, 8, 9), (20, 12, 9)), BOUNDS, 4)
-    points = pieces.draw(50, torch.Generator().manual_seed(0))
+    points = pieces.draw(50, seeded(0))
     cube = ((points - grid.corner) / grid.side).floor().long()
     numbers = grid.networks[tuple(cube.T)]
     assert numbers.tolist() == [n for n in range(grid.count) for _ in range(50)]
@@ -45,14 +46,14 @@ def test_lessons_are_as_many_for_each_network_and_in_it():
 
 def test_networks_begin_alike_and_nothing_is_where_there_is_none():
     grid, _ = place_networks(occupied((8, 8, 8), (20, 12, 9)), BOUNDS, 4)
-    field = KiloField(grid, "auto", torch.Generator().manual_seed(0))
+    field = KiloField(grid, "auto", seeded(0))
     for parameter in field.parameters():
         assert (parameter == parameter[:1]).all()
     networks = grid.count * 6212 * 4  # bytes of float32 of the published size
     assert field.sizes() == {"networks": networks, "network_grid": 2 * grid.networks.numel()}
     with torch.no_grad():
         field.biases["density"].fill_(5.0)
-        positions = torch.rand(4000, 3, generator=torch.Generator().manual_seed(1))
+        positions = torch.rand(4000, 3, generator=seeded(1))
         sigma, geometry = field.density(positions)
         colour = field.features(geometry, field.encode_directions(torch.ones(4000, 3)))
     cube = ((positions - grid.corner) / grid.side).floor().long()
@@ -72,7 +73,7 @@ def test_a_scene_without_matter_has_no_network():
 
 def test_layers_that_see_directions_are_drawn_to_zero_by_the_gradient_of_their_norm():
     grid, _ = place_networks(occupied((8, 8, 8)), BOUNDS, 4)
-    field = KiloField(grid, "auto", torch.Generator().manual_seed(0))
+    field = KiloField(grid, "auto", seeded(0))
     for parameter in field.parameters():
         parameter.grad = torch.zeros_like(parameter)
     options = lessons("kilonerf", view_cost=0.25)

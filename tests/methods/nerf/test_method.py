@@ -1,20 +1,18 @@
 """NeRF as a method: its network is that of the paper, and skipping changes no picture."""
 
-from __future__ import annotations
-
 import torch
 from torch import nn
 
-from bench.types import Log, Scene
 from methods.kernels.composite import STOP
 from methods.nerf.field import NerfField
 from methods.rendering.sampling import Sampling
+from tests.common import assert_near, seeded
 from tests.methods.conftest import Work
 from tests.methods.small_students import fitted
 from tests.methods.trainings import EXACT_TEACHER
 
 
-def test_skipping_changes_no_picture_and_saves_products(ball_scene: Scene, shared_log: Log) -> None:
+def test_skipping_changes_no_picture_and_saves_products(ball_scene, shared_log):
     method = fitted("nerf", ball_scene, shared_log, 20, stop=STOP)
     assert method.sizes() == {"network": 4 * 595_844, "occupancy": 128**3 // 8}
     camera = ball_scene.splits["test"].cameras[0]
@@ -25,8 +23,8 @@ def test_skipping_changes_no_picture_and_saves_products(ball_scene: Scene, share
     # A ray has 1024 samples of the usual step at most; the faint ones, which only the dense picture
     # has colours of, weigh at most `Sampling.least_weight` each. Sums differ by their rounding.
     faint = 1024 / EXACT_TEACHER.training.march_step * Sampling(stop=STOP).least_weight
-    torch.testing.assert_close(fast.rgb, slow.rgb, rtol=0, atol=faint + 1e-5)
-    torch.testing.assert_close(fast.alpha, slow.alpha, rtol=0, atol=1e-5)
+    assert_near(fast.rgb, slow.rgb, atol=faint + 1e-5)
+    assert_near(fast.alpha, slow.alpha, atol=1e-5)
     # Weights of the network that the paper draws, without biases, and without those of the layer
     # between trunk and view, which no activation separates from the latter.
     trunk = 63 * 256 + 4 * 256**2 + (63 + 256) * 256 + 2 * 256**2
@@ -63,8 +61,8 @@ def gamma(p: torch.Tensor, frequencies: int) -> torch.Tensor:
     return torch.cat((p, *waves), dim=1)
 
 
-def test_the_network_is_that_of_the_paper() -> None:
-    generator = torch.Generator().manual_seed(0)
+def test_the_network_is_that_of_the_paper():
+    generator = seeded(0)
     field = NerfField("fp32", "auto", generator).double()
     paper = PaperNerf().double()
     own = [layer for layer in field.modules() if isinstance(layer, nn.Linear)]
@@ -80,5 +78,5 @@ def test_the_network_is_that_of_the_paper() -> None:
     opacity, rgb = paper(2 * positions - 1, unit)
 
     # Doubling an angle 10 times loses 10 bits of 53.
-    torch.testing.assert_close(sigma * 5 * 3**0.5 / 1024, opacity[:, 0], rtol=0, atol=1e-9)
-    torch.testing.assert_close(colour, rgb, rtol=0, atol=1e-9)
+    assert_near(sigma * 5 * 3**0.5 / 1024, opacity[:, 0], atol=1e-9)
+    assert_near(colour, rgb, atol=1e-9)

@@ -1,6 +1,7 @@
 """NSVF as a method: its voxels, its network, and where its embeddings begin."""
 
 import math
+from itertools import chain, pairwise
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from methods.instant_ngp.stage1 import train_field
 from methods.kernels.encode import encode
 from methods.kernels.types import Occupancy
 from methods.nsvf.field import NsvfField
+from tests.common import assert_near, refusal, seeded
 from tests.methods.small_students import SMALL, budget, fitted
 from tests.methods.trainings import EXACT_GRID, TEACHER
 
@@ -21,7 +23,7 @@ SINES = (torch.sin, torch.cos)
 
 def two_thirds() -> NsvfField:
     """Random voxels of a grid of 16^3, with random embeddings, in float64."""
-    generator = torch.Generator().manual_seed(2)
+    generator = seeded(2)
     occupancy = Occupancy(torch.rand(16, 16, 16, generator=generator) < 2 / 3)
     return NsvfField(occupancy, "fp32", "reference", generator).double()
 
@@ -31,7 +33,7 @@ def test_embeddings_are_those_of_grid_sample():
     dense = torch.full((17, 17, 17, 32), torch.nan, dtype=torch.float64)
     x, y, z = field.vertices.long().unbind(dim=1)
     dense[x, y, z] = field.embeddings.detach()
-    positions = torch.rand(500, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    positions = torch.rand(500, 3, dtype=torch.float64, generator=seeded(3))
     found, inside = field.embedding(positions)
     # grid_sample has its volume as [C, z, y, x] and its coordinates in [-1, 1].
     volume = dense.permute(3, 2, 1, 0)[None]
@@ -39,7 +41,7 @@ def test_embeddings_are_those_of_grid_sample():
     wanted = functional.grid_sample(volume, grid, align_corners=True)[0, :, 0, 0].T
     assert 100 < inside.sum() < 450
     # Positions become coordinates in another order of operations; NaN where a corner is missing.
-    torch.testing.assert_close(found[inside], wanted[inside], rtol=0, atol=1e-12)
+    assert_near(found[inside], wanted[inside], atol=1e-12)
 
 
 def test_density_is_zero_outside_voxels():
@@ -57,19 +59,17 @@ def test_the_network_is_that_of_the_publication():
     assert network == 545_284
     assert field.sizes() == {"embeddings": 128 * len(field.vertices), "network": 4 * 545_284}
 
-    def hidden(inputs: int, outputs: int) -> list[nn.Module]:
-        return [nn.Linear(inputs, outputs), nn.LayerNorm(outputs), nn.ReLU()]
+    def hidden(*widths):
+        pairs = [(nn.Linear(*pair), nn.LayerNorm(pair[1]), nn.ReLU()) for pair in pairwise(widths)]
+        return chain(*pairs)
 
-    trunk = nn.Sequential(*hidden(416, 256), *hidden(256, 256), *hidden(256, 256))
+    trunk = nn.Sequential(*hidden(416, 256, 256, 256))
     opacity = nn.Sequential(*hidden(256, 128), nn.Linear(128, 1), nn.ReLU())
-    colour = nn.Sequential(
-        *hidden(280, 256), *(m for _ in range(3) for m in hidden(256, 256)), nn.Linear(256, 3)
-    )
+    colour = nn.Sequential(*hidden(280, *[256] * 4), nn.Linear(256, 3))
     for mine, other in ((field.trunk, trunk), (field.opacity, opacity), (field.colour, colour)):
-        for value, own in zip(other.parameters(), mine.parameters(), strict=True):
-            value.data = own.data
-    places = torch.rand(300, 3, generator=torch.Generator().manual_seed(4))
-    d = functional.normalize(torch.randn(300, 3, generator=torch.Generator().manual_seed(5)), dim=1)
+        other.load_state_dict(dict(zip(other.state_dict(), mine.parameters(), strict=True)))
+    places = torch.rand(300, 3, generator=seeded(4))
+    d = functional.normalize(torch.randn(300, 3, generator=seeded(5)), dim=1)
     e, inside = field.embedding(places)
     encoded = torch.cat((e, *(f(math.pi * 2**k * e) for k in range(6) for f in SINES)), 1)
     seen = torch.cat([f(2**k * d) for k in range(4) for f in SINES], dim=1)
@@ -102,5 +102,5 @@ def test_embeddings_begin_as_the_teachers_features(ball_scene, shared_log):
 
 
 def test_a_teacher_of_other_channels_is_refused():
-    with pytest.raises(ValueError, match=r"^teacher.grid: expected 32 channels .* got 16"):
+    with refusal(r"^teacher.grid: expected 32 channels .* got 16", ValueError):
         SMALL["nsvf"](teacher=TEACHER)

@@ -5,12 +5,13 @@ import math
 import pytest
 import torch
 
-from bench.types import Scene, SteerbenchError
+from bench.types import Scene
 from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.types import Pixels
 from methods.plenoctree.method import OctreeTraining, PlenOctree, opaque_at_end
 from methods.plenoctree.octree import Octree, extract, fibonacci_sphere
+from tests.common import refusal, seeded
 from tests.methods.conftest import Work
 from tests.methods.small_students import extraction, fitted
 from tests.methods.trainings import PIXEL, TAUGHT, TEACHER, quality, shows_the_ball
@@ -24,8 +25,7 @@ def mean_quality(method: PlenOctree, scene: Scene, split: str) -> float:
 def extracted(teacher: TrainedField, scene: Scene, **others: float) -> tuple[Octree, torch.Tensor]:
     """An octree, and the centres of its leaves."""
     batches = PixelBatches(scene.splits["train"], torch.device("cpu"))
-    generator = torch.Generator().manual_seed(0)
-    octree = extract(teacher, batches, extraction(**others), generator)
+    octree = extract(teacher, batches, extraction(**others), seeded(0))
     return octree, (octree.voxels.coordinates + 0.5) / 128
 
 
@@ -90,7 +90,7 @@ def test_directions_are_spread_evenly():
     ],
 )
 def test_too_many_leaves_and_none_are_refused(options, complaint, ball_scene, teacher):
-    with pytest.raises(SteerbenchError, match=complaint):
+    with refusal(complaint):
         extracted(teacher, ball_scene, **options)
 
 

@@ -11,7 +11,7 @@ from bench.types import Rays
 from methods.instant_ngp.field import HashField
 from methods.kernels.composite import composite, visibility
 from methods.kernels.march import march
-from methods.kernels.types import Occupancy, Pixels
+from methods.kernels.types import Occupancy, Pixels, Samples
 from methods.rendering.batch import (
     KEPT_THIN,
     NEAR,
@@ -23,18 +23,19 @@ from methods.rendering.batch import (
 )
 from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import Sampling
-from tests.methods.conftest import Cloud, look_at_the_middle
+from tests.common import seeded
+from tests.methods.conftest import look_at_the_middle
 
 Thick = tuple[HashField, Occupancy, Rays]
 
 
 @pytest.fixture
-def thick(cloud: Cloud, device: str) -> Thick:
+def thick(cloud, device) -> Thick:
     """The cloud a hundred times as dense, so that it hides its own samples, and rays through it."""
     field, occupancy = cloud
     thin = field.density
 
-    def density(positions: Tensor, known: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def density(positions, known=None):
         sigma, geometry = thin(positions, known)
         return 100 * sigma, geometry
 
@@ -52,24 +53,29 @@ def learned(pixels: Pixels, field: HashField) -> list[Tensor]:
     return list(torch.autograd.grad(pixels.values.square().sum(), list(field.parameters())))
 
 
+def shaded(field: HashField, rays: Rays, samples: Samples) -> tuple[Tensor, Tensor]:
+    """Density and features of all samples."""
+    sigma, geometry = field.density(samples.positions)
+    return sigma, field.features(geometry, field.encode_directions(rays.directions)[samples.ray])
+
+
+def assert_alike(found: list[Tensor], wanted: list[Tensor]) -> None:
+    """Sums over up to 10^5 samples, in another grouping."""
+    assert len(found) == 6
+    for some, want in zip(found, wanted, strict=True):
+        torch.testing.assert_close(some, want, rtol=1e-3, atol=1e-4 * want.abs().max().item())
+
+
 def test_leaving_out_hidden_samples_changes_no_gradient(thick, device):
     field, occupancy, rays = thick
-    jitter = torch.rand(len(rays.origins), generator=torch.Generator().manual_seed(0)).to(device)
+    jitter = torch.rand(len(rays.origins), generator=seeded(0)).to(device)
     white = torch.ones(3, device=device)
-
     samples = march(rays, occupancy, STEP, jitter=jitter)
-    sigma, geometry = field.density(samples.positions)
-    values = field.features(geometry, field.encode_directions(rays.directions)[samples.ray])
-    whole = learned(composite(sigma, values, samples).over(white), field)
+    whole = learned(composite(*shaded(field, rays, samples), samples).over(white), field)
     shown = {"jitter": jitter, "background": white}
     pixels, used = render_batch(field, rays, occupancy, Sampling(), **shown)
-    grads = learned(pixels, field)
     assert used < 0.9 * len(samples)
-    assert len(grads) == 6
-    for some, want in zip(grads, whole, strict=True):
-        # Sums over up to 10^5 samples, in another grouping.
-        atol = 1e-4 * want.abs().max().item()
-        torch.testing.assert_close(some, want, rtol=1e-3, atol=atol)
+    assert_alike(learned(pixels, field), whole)
 
 
 def test_thin_samples_are_kept_in_turn_for_the_others(cloud, device):
@@ -151,12 +157,9 @@ def test_where_space_has_no_end_gradients_grow_with_the_squared_distance(cloud, 
     share = (away / NEAR).square().clamp(max=1)
     assert share.min() < 0.3
     assert share.max() == 1
-    sigma, geometry = field.density(samples.positions)
-    values = field.features(geometry, field.encode_directions(rays.directions)[samples.ray])
+    sigma, values = shaded(field, rays, samples)
     sigma.register_hook(lambda gradient: gradient * share)
     values.register_hook(lambda gradient: gradient * share[:, None])
     want = learned(composite(sigma, values, samples), field)
     pixels, _ = render_batch(field, rays, occupancy, Sampling())
-    for some, other in zip(learned(pixels, field), want, strict=True):
-        atol = 1e-4 * other.abs().max().item()
-        torch.testing.assert_close(some, other, rtol=1e-3, atol=atol)
+    assert_alike(learned(pixels, field), want)

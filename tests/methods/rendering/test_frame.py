@@ -14,6 +14,7 @@ from methods.rendering import frame as rendering
 from methods.rendering.frame import everywhere, rays_at_matter, render_frame, render_rays
 from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import FAINT, Sampling
+from tests.common import assert_near, seeded
 from tests.methods.conftest import GRID, Work, look_at_the_middle
 from tests.methods.solids import Solid, wall
 
@@ -50,9 +51,9 @@ def test_a_frame_is_its_rays_on_the_background(cloud):
     pixels = render_rays(field, cast(camera), occupancy, NullProbe(), Sampling())
     # The same rays among others: sums of float32 in another order.
     alpha = pixels.alpha.view(32, 20)
-    torch.testing.assert_close(frame.alpha, alpha, rtol=0, atol=1e-6)
+    assert_near(frame.alpha, alpha, atol=1e-6)
     shown = pixels.values.view(32, 20, 3) + (1 - alpha)[..., None] * background
-    torch.testing.assert_close(frame.values, shown, rtol=0, atol=1e-6)
+    assert_near(frame.values, shown, atol=1e-6)
     assert torch.equal(frame.depth.isfinite(), frame.alpha > EMPTY_ALPHA)
     assert 0 < frame.depth.isfinite().sum() < 32 * 20
     seen = frame.depth.isfinite()
@@ -74,7 +75,7 @@ def test_a_window_is_that_of_its_pixel(cloud):
     )
     assert whole.alpha[:, :16].any()
     assert not half.alpha[:, :16].any()
-    torch.testing.assert_close(half.alpha[:, 16:], whole.alpha[:, 16:], rtol=0, atol=1e-6)
+    assert_near(half.alpha[:, 16:], whole.alpha[:, 16:], atol=1e-6)
 
 
 def test_at_once_rays_look_as_in_rounds(cloud, device, monkeypatch):
@@ -92,9 +93,9 @@ def test_at_once_rays_look_as_in_rounds(cloud, device, monkeypatch):
         # All end a ray at the same transmittance; sums are added up in another grouping, as a chunk
         # has rounds of its own.
         a, b, c, d = (getattr(x, name) for x in (rounds, rounds_of_chunks, once, chunks))
-        torch.testing.assert_close(a, b, rtol=0, atol=3e-4)
-        torch.testing.assert_close(a, c, rtol=0, atol=3e-4)
-        torch.testing.assert_close(c, d, rtol=0, atol=1e-6)
+        assert_near(a, b, atol=3e-4)
+        assert_near(a, c, atol=3e-4)
+        assert_near(c, d, atol=1e-6)
 
 
 def test_samples_behind_the_early_stop_are_hardly_evaluated():
@@ -121,7 +122,7 @@ def test_faint_samples_are_black_and_not_looked_at_in_rounds(cloud, compacts, mo
         len(geometry), field.channels, device=geometry.device
     )
     seen = render_rays(field, rays, occupancy, NullProbe(), Sampling(stop=stop))
-    torch.testing.assert_close(seen.alpha, rendered.alpha, rtol=0, atol=0)
+    assert_near(seen.alpha, rendered.alpha, atol=0)
     missing = seen.alpha - seen.values[:, 0]
     samples = march(rays, occupancy, STEP).offsets.diff()
     assert missing.min() > -1e-5
@@ -132,7 +133,7 @@ def test_faint_samples_are_black_and_not_looked_at_in_rounds(cloud, compacts, mo
 @pytest.mark.parametrize("compacts", [True, False])
 def test_an_empty_grid_renders_nothing(compacts, monkeypatch):
     monkeypatch.setattr(rendering, "compacts", lambda device: compacts)
-    field = HashField(GRID, generator=torch.Generator().manual_seed(0))
+    field = HashField(GRID, generator=seeded(0))
     occupancy = Occupancy(torch.zeros(16, 16, 16, dtype=torch.bool))
     camera = look_at_the_middle(0.0, 0.0)
     rendered = render_rays(field, cast(camera), occupancy, NullProbe(), Sampling())

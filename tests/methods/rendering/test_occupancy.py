@@ -14,13 +14,14 @@ from methods.rendering.occupancy import (
     DensityGrid,
     learnable_cells,
 )
+from tests.common import seeded
 from tests.methods.conftest import look_at_the_middle
 from tests.methods.solids import Solid, slab
 
 UNIT_CUBE = torch.tensor([[0.0] * 3, [1.0] * 3])
 WHOLE = torch.ones(RESOLUTION, RESOLUTION, RESOLUTION, dtype=torch.bool)
 AROUND = [look_at_the_middle(turn / 4, lift) for turn in range(4) for lift in (-0.5, 0.5)]
-GENERATOR = torch.Generator().manual_seed(0)
+GENERATOR = seeded(0)
 
 
 def quarter(sigma: float) -> Solid:
@@ -74,7 +75,7 @@ def test_a_cell_is_occupied_until_it_was_visited_and_keeps_its_value_in_between(
 def test_a_density_that_is_not_a_number_is_as_good_as_none():
     grid, other = DensityGrid(WHOLE), DensityGrid(WHOLE)
     for one, sigma in ((grid, math.nan), (other, 0.0)):
-        one.update(quarter(sigma), torch.Generator().manual_seed(1), samples=4096)
+        one.update(quarter(sigma), seeded(1), samples=4096)
     assert torch.equal(grid.density, other.density)
 
 

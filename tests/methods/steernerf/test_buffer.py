@@ -3,7 +3,6 @@ reduction, on solids whose surface is known."""
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,11 +16,10 @@ from methods.rendering.frame import FeatureFrame, everywhere, render_frame
 from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import Sampling
 from methods.steernerf.buffer import RELIABLE_ALPHA, PointCloud
+from tests.common import assert_near
 from tests.methods.conftest import Work, look_at_the_middle
+from tests.methods.models import RELEASE
 from tests.methods.solids import Solid, ball, wall
-
-RELEASE = np.load(Path(__file__).parents[2] / "data" / "steernerf_release.npz")
-"""Two frames of 10 x 12 pixels, brought into a third of 40 x 48 by the released code."""
 
 
 def frame_of(camera: Camera, depth: Tensor | None = None, alpha: float = 1.0) -> FeatureFrame:
@@ -59,14 +57,14 @@ def test_a_still_frame_is_shown_in_the_first_pixel_of_each_cell(scale):
     assert torch.equal(index[::scale, ::scale].flatten(), torch.arange(48))
     assert (index >= 0).sum() == 48
     # Coordinates up to 2 are rounded a dozen times.
-    torch.testing.assert_close(depth, frame_of(low).depth.flatten(), rtol=0, atol=24 * 2.0**-24)
+    assert_near(depth, frame_of(low).depth.flatten(), atol=24 * 2.0**-24)
 
 
 def test_a_frame_of_nothing_is_shown_nowhere_else():
     """Its points lie at its camera: behind, or in front of, any other."""
     low = low_camera(2)
     cloud = PointCloud.of(frame_of(low, torch.full((6, 8), math.inf), alpha=0.0))
-    torch.testing.assert_close(cloud.points, low.c2w[:, 3].expand(48, 3), rtol=0, atol=1e-11)
+    assert_near(cloud.points, low.c2w[:, 3].expand(48, 3), atol=1e-11)
     ahead = replace(low, c2w=low.c2w.clone())
     ahead.c2w[:, 3] += 0.1 * low.c2w[:, 2]
     assert (shown(cloud, ahead) == -1).all()
@@ -101,12 +99,12 @@ def test_summed_depths_are_too_near_unless_the_opacity_is_divided_out():
     _, expected = project(low, summed.expected().points)
     error = 24 * 2 * 2.0**-24
     near = (frame.depth * frame.alpha).flatten()[:40]
-    torch.testing.assert_close(z[:40], near, rtol=0, atol=error)
+    assert_near(z[:40], near, atol=error)
     unclear = torch.zeros(48, dtype=torch.bool)
     unclear[26], unclear[40:] = True, True  # faint, and empty
     assert torch.equal(expected.isnan(), unclear)
     true = frame.depth.flatten()[~unclear]
-    torch.testing.assert_close(expected[~unclear], true, rtol=0, atol=10 * error)
+    assert_near(expected[~unclear], true, atol=10 * error)
 
 
 EVERYWHERE = Occupancy(torch.ones(32, 32, 32, dtype=torch.bool))
@@ -141,7 +139,7 @@ def test_a_surface_is_found_inside_the_interval_alone():
     assert interval.isfinite().all()
     # Where the surface stayed it is found, all of it, with fewer samples.
     same, fewer = render(Solid(wall(0.3)), interval)
-    torch.testing.assert_close(same.values, whole.values, rtol=0, atol=1e-5)
+    assert_near(same.values, whole.values, atol=1e-5)
     assert fewer < 0.5 * samples
     # Where it moved, nothing is made up for what is missing.
     moved, _ = render(Solid(wall(0.7)), interval)
@@ -157,6 +155,6 @@ def test_the_interval_is_that_of_the_pixel_alone_and_everything_where_nothing_is
     assert 0 < seen.sum() < SIZE**2
     assert (interval[~seen][:, 0] == 0).all()
     middle = interval[seen].mean(dim=-1)
-    torch.testing.assert_close(middle, frame.depth[seen], rtol=0, atol=1e-5)
+    assert_near(middle, frame.depth[seen], atol=1e-5)
     width = interval[seen].diff(dim=-1).squeeze(-1)
-    torch.testing.assert_close(width, torch.full_like(width, 2 * EPSILON), rtol=0, atol=1e-6)
+    assert_near(width, torch.full_like(width, 2 * EPSILON), atol=1e-6)

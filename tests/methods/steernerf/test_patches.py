@@ -16,6 +16,7 @@ from methods.steernerf import distillation
 from methods.steernerf.distillation import distilled_views
 from methods.steernerf.options import MotionOptions
 from methods.steernerf.patches import Patches
+from tests.common import refusal, seeded
 from tests.methods.conftest import SIZE, ball
 from tests.methods.models import (
     SMALL_GRID,
@@ -85,9 +86,9 @@ def test_distilled_views_are_found_again_without_rendering(
     assert len(views_of(trained, ball_scene, tmp_path, count=1)) == 1  # other views
     monkeypatch.delattr(distillation, "render_frame")
     assert same(views_of(trained, ball_scene, tmp_path), first)
-    with pytest.raises(NameError, match="render_frame"):
+    with refusal("render_frame", NameError):
         views_of(trained, ball_scene, tmp_path / "elsewhere")
-    left = (tmp_path / "elsewhere" / "stages").glob("*/*")
+    left = (tmp_path / "elsewhere/stages").glob("*/*")
     assert [path.name for path in left] == ["lock"]
     # The seed alone decides which they are.
     monkeypatch.undo()
@@ -108,7 +109,7 @@ def new_patches(
     ]
     scene = replace(scene, splits={"train": halves[0]})
     options = small_joint(distilled_share=share, motion=motion, **joint)
-    pipeline, generator = new_pipeline(frames=frames), torch.Generator().manual_seed(0)
+    pipeline, generator = new_pipeline(frames=frames), seeded(0)
     return Patches(pipeline, scene, halves[1], options, generator)
 
 

@@ -5,15 +5,15 @@ from functools import partial
 
 import pytest
 import torch
-from torch import Tensor
 
-from bench.types import Scene, Split, SteerbenchError
+from bench.types import Scene, Split
 from methods.instant_ngp.field import HashField
 from methods.steernerf.options import JointOptions
 from methods.steernerf.patches import Patches
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.stage2 import JointTraining
 from methods.steernerf.unet import UNet
+from tests.common import refusal, seeded
 from tests.methods.models import misty_field, small_joint, small_model, small_motion, trained_field
 from tests.methods.trainings import does_not_see_what_masks_hide, goes_on_after_a_kill
 
@@ -33,8 +33,7 @@ def new_training(
     trained = trained_field(field or misty_field(channels=model.channels))
     renderer = UNet(model.channels, frames, model.scale, width=8, aligned=True)
     pipeline = Pipeline(trained, scene.background, renderer, model)
-    generator = torch.Generator().manual_seed(1)
-    patches = Patches(pipeline, scene, Split([], [], []), options, generator)
+    patches = Patches(pipeline, scene, Split([], [], []), options, seeded(1))
     return JointTraining(renderer, patches, steps, trained if patches.learning else None)
 
 
@@ -62,7 +61,7 @@ def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(ball_scene, monkeyp
     patches = [replace(p, points=of) for p, of in zip(patches, doubled, strict=False)]
     truth = torch.stack([patch.truth for patch in patches])
 
-    def loss() -> Tensor:
+    def loss():
         batch = training.patches.render(patches)
         error = (renderer(batch.observations) - truth).square().mean()
         return error + 1e-2 * batch.opacity.square().mean()
@@ -70,20 +69,17 @@ def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(ball_scene, monkeyp
     parameters = [field.table, *field.layers.values(), *renderer.parameters()]
     gradient = torch.autograd.grad(loss(), parameters)
     assert all(g.abs().max() > 0 for g in gradient)
-    generator = torch.Generator().manual_seed(0)
+    generator, step = seeded(0), 1e-8  # so short that it hardly ever crosses a ReLU's kink
     for part in (slice(1), slice(1, 6), slice(6, None)):
-        group, step = parameters[part], 1e-8  # so short that it hardly ever crosses a ReLU's kink
-        directions = [torch.randn(p.shape, generator=generator).double() for p in group]
-        pairs = zip(gradient[part], directions, strict=True)
-        slope = sum((g * d).sum().item() for g, d in pairs)
+        group = parameters[part]
+        ways = [torch.randn(p.shape, generator=generator).double() for p in group]
+        slope = sum(map(torch.sum, map(torch.mul, gradient[part], ways))).item()
         values = []
         with torch.no_grad():
-            for sign in (1, -2):
-                for p, d in zip(group, directions, strict=True):
-                    p += sign * step * d
+            for share in (step, -2 * step):
+                torch._foreach_add_(group, ways, alpha=share)
                 values.append(loss().item())
-            for p, d in zip(group, directions, strict=True):
-                p += step * d
+            torch._foreach_add_(group, ways, alpha=step)
         assert (values[0] - values[1]) / (2 * step) == pytest.approx(slope, rel=1e-4)
 
 
@@ -100,25 +96,6 @@ def test_the_renderer_learns_and_the_field_unless_it_is_frozen(ball_scene, field
     of_field = {"table", "layers.density_out", "layers.feature_out"}
     assert {name for name in parts if name.startswith("renderer.")} <= changed
     assert of_field <= changed if field == "joint" else changed.isdisjoint(learned.state_dict())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("frames", [0, 2])
-def test_the_error_falls(ball_scene, frames):
-    """On patches that are kept: one patch is much harder than another."""
-    options = replace(OPTIONS, rate=3e-3, field_rate=1e-2)
-    training = new_training(ball_scene, options, frames=frames, steps=120)
-    kept = [training.patches.cut(training.patches.example()) for _ in range(32)]
-
-    @torch.no_grad()
-    def error() -> float:
-        batch = training.patches.render(kept)
-        return (training.renderer(batch.observations) - batch.truth).square().mean().item()
-
-    before = error()
-    for _ in range(120):
-        training.advance()
-    assert error() < 0.8 * before
 
 
 def test_both_learning_rates_of_the_release_fall_twice_to_the_same(ball_scene):
@@ -165,7 +142,5 @@ def test_a_loss_that_is_no_number_stops_and_names_what_is_not_finite(ball_scene)
     training = new_training(ball_scene)
     with torch.no_grad():
         training.renderer.network.last.bias[0] = torch.nan
-    with pytest.raises(
-        SteerbenchError, match=r"step 0: not finite: .*renderer\.network\.last\.bias.*rate"
-    ):
+    with refusal(r"step 0: not finite: .*renderer\.network\.last\.bias.*rate"):
         training.advance()

@@ -2,9 +2,7 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
@@ -14,11 +12,9 @@ from methods.engines import Built
 from methods.rendering.frame import FeatureFrame
 from methods.steernerf.buffer import Points
 from methods.steernerf.unet import RIM, Observation, UNet
+from tests.common import assert_near, seeded
 from tests.methods.conftest import look_at_the_middle
-from tests.methods.models import shaken
-
-RELEASE = np.load(Path(__file__).parents[2] / "data" / "steernerf_release.npz")
-"""What the released code computes on the formulas below."""
+from tests.methods.models import RELEASE, shaken
 
 POINTS = 20
 
@@ -34,7 +30,7 @@ def observe(
     dtype: torch.dtype = torch.float32,
 ) -> Observation:
     """Random features in steps of 1/256, and preceding points, of which some are not shown."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     values = torch.randint(257, (height, width, channels), generator=generator).to(dtype) / 256
     depth, alpha = torch.full((height, width), 1.5), torch.ones(height, width)
     size = scale**2 * height * width
@@ -75,7 +71,7 @@ def test_it_computes_what_the_released_network_computes(frames):
     # 19 layers, each of sums of up to 1,728 products: their errors add up like sqrt(1728) roundings
     # of float32 a layer, of numbers as large as the largest output.
     tolerance = 19 * math.sqrt(1728) * 2.0**-24 * float(wanted.abs().max())
-    torch.testing.assert_close(output[0], wanted, rtol=0, atol=tolerance)
+    assert_near(output[0], wanted, atol=tolerance)
 
 
 def test_its_first_weights_are_drawn_as_those_of_the_release():
@@ -123,7 +119,7 @@ def test_a_batch_of_two_is_one_after_the_other():
     alone = torch.cat([renderer([observation]) for observation in observations])
     # Activations of 1 to 10, sums of up to 2,000 products in another order, a few tens of
     # u = 1.1e-16 a layer, a few layers deep.
-    torch.testing.assert_close(renderer(observations), alone, rtol=0, atol=1e-12)
+    assert_near(renderer(observations), alone, atol=1e-12)
 
 
 @pytest.mark.parametrize("aligned", [True, False])
@@ -143,29 +139,24 @@ def test_the_base_keeps_pixels_or_corners_in_their_places(aligned):
         if aligned:  # centres are at +1/2; beyond the outer ones it is as there
             place = ((pixel + 0.5) / scale - 0.5).clamp(0, size - 1)
         ramp = base[0, :, 0, 0] if channel == 0 else base[0, 0, :, 1]
-        torch.testing.assert_close(ramp, place / 8, rtol=0, atol=1e-6)
+        assert_near(ramp, place / 8, atol=1e-6)
 
 
 @pytest.mark.parametrize("frames", [2, 3])
 def test_a_pixel_has_the_features_of_its_points_and_every_fourth_the_present_ones(frames):
-    """Frame by frame, in Python; with L = 3 one frame is missing."""
+    """Frame by frame; with L = 3 one frame is missing."""
     height, width, scale, features = 2, 3, 4, 5
     shown = observe(height, width, channels=features, frames=2, scale=scale)
     seen, renderer = [], unet(features, frames, scale)
     renderer.engine = Built(lambda x: seen.append(x) or x[:, :3], 0)
     renderer([shown])
-    (got,) = seen[0].permute(0, 2, 3, 1)
-    at_pixel = [dict(zip(p.pixel.tolist(), p.values, strict=True)) for p in shown.preceding]
-    nothing = torch.zeros(features)
-    for row in range(height * scale):
-        for column in range(width * scale):
-            here = row % scale == column % scale == 0
-            present = shown.frame.values[row // scale, column // scale] if here else nothing
-            pixel = row * width * scale + column
-            of_each = [present, *(points.get(pixel, nothing) for points in at_pixel)]
-            of_each += [nothing] * (frames - 2)
-            want = torch.cat([x[:3] for x in of_each] + [x[3:] for x in of_each])
-            assert torch.equal(got[row, column], want)
+    of_each = torch.zeros(frames + 1, scale * height, scale * width, features)
+    of_each[0, ::scale, ::scale] = shown.frame.values
+    for canvas, points in zip(of_each[1:], shown.preceding, strict=False):
+        inside = points.pixel < height * width * scale**2
+        canvas.view(-1, features)[points.pixel[inside]] = points.values[inside]
+    want = torch.cat([*of_each[..., :3], *of_each[..., 3:]], dim=2)
+    assert torch.equal(seen[0][0], want.permute(2, 0, 1))
 
 
 def test_features_of_16_bits_are_rounded_before_the_network_is_shown_them():

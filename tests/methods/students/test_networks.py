@@ -7,6 +7,7 @@ import torch
 
 from methods.kernels import multiplies_bf16
 from methods.students.networks import Dense, density_of, positional
+from tests.common import assert_near, seeded
 
 U = 2.0**-24
 
@@ -15,7 +16,7 @@ U = 2.0**-24
 @pytest.mark.parametrize("identity", [True, False])
 @pytest.mark.parametrize("frequencies", [1, 4, 10])
 def test_positional_encoding_is_its_formula(frequencies, identity, scale):
-    values = 2 * torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) - 1
+    values = 2 * torch.rand(300, 3, generator=seeded(0)) - 1
     found = positional(values, frequencies, identity=identity, scale=scale)
     assert found.shape == (300, 3 * (2 * frequencies + identity))
     exact = values.double()
@@ -24,19 +25,16 @@ def test_positional_encoding_is_its_formula(frequencies, identity, scale):
     # An angle below 4 is a product of two rounded numbers: off by 8 u, its functions by u more.
     # To double it doubles their error and adds 3 roundings: less than 2^(F - 1) (8 + 1 + 2 * 3) u.
     tolerance = 2 ** (frequencies - 1) * 15 * U
-    torch.testing.assert_close(found.double(), wanted, rtol=0, atol=tolerance)
+    assert_near(found.double(), wanted, atol=tolerance)
 
 
 def test_a_layer_multiplies_in_bfloat16_only_where_it_is_fast():
-    generator = torch.Generator().manual_seed(0)
-    inputs = torch.randn(50, 20, generator=generator)
-    exact, rounded = (
-        Dense(20, 30, precision, torch.Generator().manual_seed(1)) for precision in ("fp32", "bf16")
-    )
+    inputs = torch.randn(50, 20, generator=seeded(0))
+    exact, rounded = (Dense(20, 30, precision, seeded(1)) for precision in ("fp32", "bf16"))
     assert torch.equal(exact.weight, rounded.weight)
     wanted = inputs @ exact.weight.T + exact.bias
     # Sums of 20 products, each below 4 in all but a few cases, of two numbers rounded to 8 bits.
-    torch.testing.assert_close(exact(inputs), wanted, rtol=0, atol=20 * 20 * 4 * U)
+    assert_near(exact(inputs), wanted, atol=20 * 20 * 4 * U)
     got = rounded(inputs)
     assert got.dtype == (torch.bfloat16 if multiplies_bf16("cpu") else torch.float32)
     torch.testing.assert_close(got.float(), wanted, rtol=2**-7, atol=20 * 4 * 2.0**-8)

@@ -1,17 +1,13 @@
 """What the methods that start from a trained field have in common: a training survives a kill and
 is found again; they learn a ball; wrong settings are refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
-from bench.types import Log, NullProbe, Scene
+from bench.types import NullProbe
 from methods.instant_ngp.stage1 import train_field
-from methods.training import loop
 from tests.methods.small_students import SMALL, budget, fitted
 from tests.methods.trainings import EXACT_TEACHER, PIXEL, goes_on_after_a_kill, shows_the_ball
 
@@ -30,12 +26,12 @@ names = pytest.mark.parametrize("name", SMALL)
     ],
 )
 def test_a_killed_training_goes_on_as_if_it_had_not_been(
-    name: str, steps: int, killed_at: int, ball_scene: Scene, shared_log: Log, tmp_path: Path
-) -> None:
+    name, steps, killed_at, ball_scene, shared_log, tmp_path
+):
     given = budget(name, steps)
     trained = train_field(SMALL[name]().teacher, ball_scene, given, shared_log)
 
-    def training() -> loop.Training:
+    def training():
         return SMALL[name]().begin(trained, ball_scene, given)
 
     goes_on_after_a_kill(training, killed_at, tmp_path)
@@ -51,14 +47,12 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(
         ("nsvf", 60, 16, 1.0),
     ],
 )
-def test_it_learns_a_ball(
-    name: str, steps: int, least: float, off: float, ball_scene: Scene, shared_log: Log
-) -> None:
+def test_it_learns_a_ball(name, steps, least, off, ball_scene, shared_log):
     shows_the_ball(fitted(name, ball_scene, shared_log, steps), ball_scene, least, off)
 
 
 @names
-def test_a_training_is_found_again(name: str, ball_scene: Scene, shared_log: Log) -> None:
+def test_a_training_is_found_again(name, ball_scene, shared_log):
     first = fitted(name, ball_scene, shared_log)
     again = fitted(name, ball_scene, shared_log)
     other = fitted(name, ball_scene, shared_log, stop=0.5)  # is chosen after a training
@@ -70,7 +64,7 @@ def test_a_training_is_found_again(name: str, ball_scene: Scene, shared_log: Log
 
 
 @names
-def test_a_row_names_what_its_own_products_are_computed_in(name: str) -> None:
+def test_a_row_names_what_its_own_products_are_computed_in(name):
     """`stored` is another matter: it is what they are computed from."""
     teacher = replace(EXACT_TEACHER, precision="bf16")
     as_teacher = name in ("nerf", "nsvf")

@@ -3,17 +3,16 @@
 import pytest
 import torch
 
-from bench.types import Rays
 from methods.instant_ngp.pixels import PixelBatches
 from methods.kernels.corner_gather import OFFSETS
 from methods.kernels.types import Occupancy
-from methods.kernels.voxel_walk import Crossings, Voxels
+from methods.kernels.voxel_walk import Voxels
 from methods.students.voxels import corners_of, largest_weights, occupied_voxels
+from tests.common import seeded
 
 
 def scattered(share: float, size: int = 16) -> Occupancy:
-    generator = torch.Generator().manual_seed(0)
-    return Occupancy(torch.rand(size, size, size, generator=generator) < share)
+    return Occupancy(torch.rand(size, size, size, generator=seeded(0)) < share)
 
 
 def test_corners_are_where_they_belong_and_none_is_there_twice():
@@ -47,13 +46,12 @@ def test_the_largest_weight_of_a_voxel_is_that_over_all_rays(ball_scene, monkeyp
     voxels = Voxels(torch.cartesian_prod(*3 * [torch.arange(8, dtype=torch.int32)]), 8)
     weights, crossed, counts = iter((0.2, 0.7, 0.4)), [], []
 
-    def weigh(rays: Rays, crossings: Crossings) -> torch.Tensor:
+    def weigh(rays, crossings):
         counts.append(len(rays.origins))
         crossed.append(crossings.voxel.unique())
         return torch.full((len(crossings.voxel),), next(weights))
 
-    generator = torch.Generator().manual_seed(0)
-    found = largest_weights(voxels, weigh, batches, 25, generator, "cpu")
+    found = largest_weights(voxels, weigh, batches, 25, seeded(0), "cpu")
     assert counts == [10, 10, 5]
     want = torch.zeros(512)
     for chunk, weight in ((0, 0.2), (2, 0.4), (1, 0.7)):

@@ -13,6 +13,7 @@ from bench.scenes.embedded.solids import Carved, Ellipsoid
 from bench.scenes.embedded.textures import plain
 from bench.types import EMPTY_ALPHA, Camera
 from tests.bench.scenes.conftest import camera_at
+from tests.common import seeded
 
 RED = plain((1.0, 0.0, 0.0))
 
@@ -59,6 +60,11 @@ def test_depth_is_finite_exactly_where_there_is_opacity():
     assert ((frame.rgb >= 0) & (frame.rgb <= 1 + 1e-6)).all()
 
 
+def hits(part: Part, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+    local = (origins - torch.tensor(part.centre)) @ part.frame, directions @ part.frame
+    return part.shape.hit(*(x.unbind(-1) for x in local))
+
+
 @pytest.mark.parametrize("model", [totem, wires])
 @pytest.mark.parametrize("eye", [(1.0, -3.5, 1.5), (0.3, 0.2, 0.3), (0.0, 0.1, 4.0)])
 def test_the_nearest_of_all_parts_is_seen(monkeypatch, model, eye):
@@ -66,11 +72,8 @@ def test_the_nearest_of_all_parts_is_seen(monkeypatch, model, eye):
     monkeypatch.setattr(raytrace, "BAND_RAYS", 40 * 6)  # bands of six rows, the last of four
     depth = render(solids, camera, samples=1).depth.flatten()
     rays = cast(camera)
-    nearest = torch.full_like(depth, math.inf)
-    for part in solids.parts:
-        origins = (rays.origins - torch.tensor(part.centre)) @ part.frame
-        directions = rays.directions @ part.frame
-        nearest = nearest.minimum(part.shape.hit(origins.unbind(1), directions.unbind(1)))
+    met = [hits(part, rays.origins, rays.directions) for part in solids.parts]
+    nearest = torch.stack(met).amin(dim=0)
     # Only rounding may differ, and it can turn a ray that grazes an edge.
     differing = (nearest - depth).abs() > 1e-4  # not where both are infinite
     assert differing.sum() <= 2
@@ -80,15 +83,13 @@ def test_the_nearest_of_all_parts_is_seen(monkeypatch, model, eye):
 
 @pytest.mark.parametrize("model", [totem, wires])
 def test_shadows_are_those_of_all_parts_but_of_a_convex_one_on_itself(model):
-    solids, generator = model(), torch.Generator().manual_seed(3)
+    solids, generator = model(), seeded(3)
     points = 2.4 * torch.rand(6000, 3, generator=generator) - 1.2
     owners = torch.randint(len(solids.parts), (6000,), generator=generator).to(torch.int16)
     assert math.hypot(*LIGHT) == pytest.approx(1, abs=1e-6)
     dark = torch.zeros(6000, dtype=torch.bool)
     for number, part in enumerate(solids.parts):
-        origins = (points - torch.tensor(part.centre)) @ part.frame
-        light = torch.tensor(LIGHT) @ part.frame
-        found = part.shape.hit(origins.unbind(1), light.unbind(0)).isfinite()
+        found = hits(part, points, torch.tensor(LIGHT)).isfinite()
         dark |= found & ((owners != number) | isinstance(part.shape, Carved))
     # Rounding can turn a ray that grazes an edge.
     assert (solids.shadowed(owners, points) != dark).sum() <= 1
@@ -97,15 +98,12 @@ def test_shadows_are_those_of_all_parts_but_of_a_convex_one_on_itself(model):
 
 def test_highlights_move_with_the_viewer():
     glossy = Solids([Part(Ellipsoid((0.7, 0.7, 0.7)), RED, gloss=0.9)])
-    top = Solids([sphere(0.7)])
     places = []
     for eye in ((0.0, -4.0, 0.0), (1.5, -3.7, 0.0)):
         camera = camera_at(eye)
-        shiny, matt = (render(model, camera, 4) for model in (glossy, top))
-        row, column = divmod((shiny.rgb - matt.rgb)[..., 1].argmax().item(), camera.width)
-        depth = matt.depth[row, column]
-        ray = cast(camera, torch.tensor([[column + 0.5, row + 0.5]]))
-        places.append(ray.origins[0] + depth * ray.directions[0])
+        shiny, matt = (render(model, camera, 4) for model in (glossy, Solids([sphere(0.7)])))
+        place, rays = (shiny.rgb - matt.rgb)[..., 1].argmax(), cast(camera)
+        places.append(rays.origins[place] + matt.depth.flatten()[place] * rays.directions[place])
     assert (places[0] - places[1]).norm() > 0.05
 
 

@@ -15,6 +15,7 @@ from bench.scenes.embedded.solids import (
     Shape,
     Shifted,
 )
+from tests.common import assert_near, seeded
 
 SHAPES: dict[str, Shape] = {
     "ellipsoid": Ellipsoid((0.9, 0.4, 0.6)),
@@ -35,14 +36,14 @@ REACH, STEPS = 6.0, 1500
 
 
 @pytest.fixture(params=SHAPES)
-def shape(request: pytest.FixtureRequest) -> Shape:
+def shape(request) -> Shape:
     """Every kind of shape in turn."""
     return SHAPES[request.param]
 
 
 def rays(count: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Origins inside and around the shapes, directions of any length, [count, 3] float64."""
-    generator = torch.Generator().manual_seed(7)
+    generator = seeded(7)
     origins = 4 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 2
     directions = torch.randn(count, 3, generator=generator, dtype=torch.float64)
     directions[: count // 2] -= origins[: count // 2]  # half of them towards the middle
@@ -93,7 +94,7 @@ def test_normals_are_the_gradient_of_the_distance(shape):
     gradient = torch.stack(rise, dim=1) / 2e-6
     smooth = (gradient.norm(dim=1) - 1).abs() < 1e-3  # else an edge lies within the step
     assert smooth.float().mean() > 0.98
-    torch.testing.assert_close(shape.normal(points)[smooth], gradient[smooth], rtol=0, atol=1e-3)
+    assert_near(shape.normal(points)[smooth], gradient[smooth], atol=1e-3)
 
 
 def test_the_extent_holds_every_hit(shape):

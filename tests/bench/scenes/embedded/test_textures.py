@@ -3,6 +3,7 @@
 import torch
 
 from bench.scenes.embedded.textures import checker, lattice, noise, pips, polar_checker, spiral
+from tests.common import assert_near, seeded
 
 DARK, LIGHT = (0.1, 0.1, 0.2), (0.7, 0.6, 0.5)
 
@@ -11,16 +12,16 @@ def test_noise_is_that_of_its_lattice_continuous_and_has_a_period():
     corners = torch.cartesian_prod(*3 * [torch.arange(4.0)])
     x, y, z = corners.long().unbind(1)
     # The first coordinate of `grid_sample` runs along the last axis.
-    torch.testing.assert_close(noise(corners), lattice()[z, y, x], rtol=0, atol=1e-4)
-    points = 40 * torch.rand(1000, 3, generator=torch.Generator().manual_seed(0))
+    assert_near(noise(corners), lattice()[z, y, x], atol=1e-4)
+    points = 40 * torch.rand(1000, 3, generator=seeded(0))
     assert 0 <= noise(points).min() < 0.1 < 0.9 < noise(points).max() <= 1
-    torch.testing.assert_close(noise(points + 32), noise(points), rtol=0, atol=1e-3)
+    assert_near(noise(points + 32), noise(points), atol=1e-3)
     # A smoothstep is at most 1.5 steep along each axis, between values that differ by at most 1.
     assert (noise(points + 1e-2) - noise(points)).abs().max() < 3 * 1.5 * 1e-2 + 1e-3
 
 
 def test_patterns_alternate():
-    def light(texture, *points: tuple[float, float, float]) -> list[bool]:
+    def light(texture, *points):
         colours = texture(torch.tensor(points))
         return [torch.equal(colour, torch.tensor(LIGHT)) for colour in colours]
 

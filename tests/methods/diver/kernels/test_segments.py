@@ -5,6 +5,7 @@ import torch
 
 from bench.types import Rays
 from methods.diver.kernels.segments import Layers, cases, reference, render_segments
+from tests.common import assert_near, refusal
 
 RAYS = 40
 
@@ -36,15 +37,15 @@ def test_rays_that_are_rendered_in_chunks_have_the_same_pixels(size, monkeypatch
     monkeypatch.setattr(reference, "CHUNK_RAYS", size)
     apart = render_segments(*given(), stop=1e-2, backend="reference")
     # Products of other shapes are summed in another order: at most 32 roundings of numbers below 1.
-    torch.testing.assert_close(apart[0].values, together[0].values, rtol=0, atol=1e-5)
+    assert_near(apart[0].values, together[0].values, atol=1e-5)
     assert torch.equal(apart[1], together[1])
 
 
 def test_a_cpu_refuses_what_it_has_no_code_for():
     rays, corners, layers, towards = given()
     wide = Rays(rays.origins.double(), rays.directions.double())
-    with pytest.raises(ValueError, match="computes with float32"):
+    with refusal("computes with float32", ValueError):
         render_segments(wide, corners, layers, towards, stop=0.0, backend="cpu")
     narrow = Layers(*map(torch.zeros, ((8, 32), 8, (1, 8), 1, (8, 8), (3, 8), 3)))
-    with pytest.raises(ValueError, match=r"multiples of 16, got \[8, 32\]"):
+    with refusal(r"multiples of 16, got \[8, 32\]", ValueError):
         render_segments(rays, corners, narrow, towards[:, :8], stop=0.0, backend="cpu")

@@ -5,12 +5,12 @@ from skimage.metrics import structural_similarity
 from torch.nn import functional
 
 from methods.gaussians.kernels.ssim import ssim
+from tests.common import seeded
 
 
 def pictures() -> tuple[torch.Tensor, torch.Tensor]:
     """Two pictures of noise in a black frame wider than the window: no border is in sight."""
-    generator = torch.Generator().manual_seed(0)
-    inner = torch.rand(2, 3, 20, 24, generator=generator, dtype=torch.float64)
+    inner = torch.rand(2, 3, 20, 24, generator=seeded(0), dtype=torch.float64)
     one, other = functional.pad(inner, (11, 11, 11, 11)).movedim(1, -1)
     return one.contiguous(), other.contiguous()
 

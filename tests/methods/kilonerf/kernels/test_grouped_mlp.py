@@ -7,6 +7,7 @@ from torch import nn
 
 from bench.case import U32
 from methods.kilonerf.kernels.grouped_mlp import SHAPES, Networks, colours, densities
+from tests.common import assert_near
 
 
 def networks(count: int) -> tuple[Networks, list[dict[str, nn.Linear]]]:
@@ -42,7 +43,7 @@ def test_they_are_those_of_torch_one_by_one(backend):
             colour = layers["colour"](layers["direction"](joined).relu()).sigmoid()
             # Errors of the encoding, 188 u, pass three layers whose gains are below 6 each.
             assert abs(raw[s] - layers["density"](trunk)) < 188 * 6**3 * U32
-        torch.testing.assert_close(shown[s], colour, rtol=0, atol=188 * 6**3 * U32)
+        assert_near(shown[s], colour, atol=188 * 6**3 * U32)
 
 
 def test_the_hidden_channels_have_a_gradient_even_of_networks_that_stay():
