@@ -12,6 +12,7 @@ import os
 import random
 import signal
 import sys
+import time
 import warnings
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -108,6 +109,9 @@ def _checksum(tensor: torch.Tensor) -> int:
 
 SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM, signal.SIGUSR1
 """Those that programs handle; to look up the handlers of all takes longer than a small frame."""
+
+FEW, NOTABLE_S = 0.2, 2.0
+"""A method counts too little as training that tells less than this share of so many seconds."""
 
 AUTOCAST = "cpu", "cuda"
 """The types of device that torch casts for."""
@@ -349,7 +353,11 @@ def fit(
     """
     part = given(scene, method)
     guard = guard or Guard(part, log)
+    begun = time.monotonic()
     with Isolated(method, seed, log).call():
         method.fit(part, budget, log)
+    passed = time.monotonic() - begun
+    if passed > NOTABLE_S and method.train_s < FEW * passed:
+        log.info(f"{method.name}: `fit` took {passed:.0f} s, its train_s says {method.train_s:.3g}")
     check_originals()
     guard.check([method])

@@ -83,6 +83,17 @@ def as_lines(runs: Sequence[Run]) -> Lines:
     return Lines(lines, settings)
 
 
+def seedless(lines: Lines) -> list[str]:
+    """The lines whose seeds all have one quality: they ignore their seed, so that an interval over
+    seeds says nothing."""
+    found: list[str] = []
+    for line in lines.lines:
+        qualities = {run.values.get("psnr") for run in line.runs}
+        if len(line.runs) > 1 and len(qualities) == 1 and None not in qualities:
+            found.append(line.label)
+    return found
+
+
 def differing(runs: Sequence[Run]) -> dict[str, list[str]]:
     """What `varied` finds, under short names: the symbol of the paper, or the last part."""
     columns = varied(runs)

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from bench.errors import SteerbenchError, explained, unexpected
+from bench.errors import SteerbenchError, explained, some, unexpected
 from bench.records import made, read_record
 from bench.results import Store, existing_store
 from bench.sharing import whole
@@ -204,6 +204,10 @@ def _say_left_out(
     }
     families = sorted({re.sub(r"\..*", ".*", metric) for metric in metrics})
     say(f"left out: metrics without a limit: {', '.join(families)}")
+    for each in runs:
+        for seed, run in each.seeds.items():
+            if unknown := [x for x, of in run.values.items() if x in limits and math.isnan(of)]:
+                say(f"left out: of {each.command} seed={seed}, which has none: {some(unknown)}")
 
 
 def checked(

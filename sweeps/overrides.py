@@ -7,6 +7,7 @@ further choices. Installed packages bring folders of choices, too, named by entr
 import pkgutil
 import re
 import shlex
+import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -50,6 +51,8 @@ def composed(words: Sequence[str], **options: bool) -> DictConfig:
     SteerbenchError if a setting or a choice does not exist, or cannot be read.
     """
     paths = ",".join(quoted(f"file://{folder}") for folder in _typed(words))
+    for folder in _typed(words):
+        _say_hidden(folder)
     overrides = [*_overrides(words), *([f"hydra.searchpath=[{paths}]"] if paths else [])]
     try:
         with initialize_config_dir(str(CONFIGS), version_base="1.3"):
@@ -323,6 +326,14 @@ def _typed(words: Sequence[str]) -> Iterator[Path]:
         name, equals, value = word.partition("=")
         if name in FLAGS:
             yield Path(value if equals else after).resolve()
+
+
+@cache
+def _say_hidden(folder: Path) -> None:
+    """Say which choices in a folder are not used, because there are some of these names here."""
+    for file in sorted(folder.rglob("*.yaml")):
+        if (CONFIGS / file.relative_to(folder)).is_file():
+            print(f"{file}: not used: a choice of ours has this name", file=sys.stderr)
 
 
 @cache

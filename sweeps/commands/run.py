@@ -74,10 +74,15 @@ def _finish(ended: Sequence[tuple[Job, Ended]], form: str | None) -> None:
 
 def _show(runs: Sequence[Run], failed: Mapping[str, str], form: str | None) -> None:
     from reports.comparison import columns_of, comparison
-    from reports.lines import as_lines
-    from sweeps.terminal import show
+    from reports.lines import as_lines, seedless
+    from sweeps.terminal import note, show
 
     lines = as_lines(runs)
+    for label in seedless(lines):
+        note(
+            f"{label}: all seeds have the same PSNR, so that the interval says nothing: is "
+            "`seed: ${seed}` in the YAML of the method?"
+        )
     first, *further = comparison(lines, failed)
     show(first, lines.frame(columns_of(lines)) if form else None, form)
     for table in () if form else further:

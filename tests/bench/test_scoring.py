@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from bench.errors import SteerbenchError
 from bench.metrics import flicker, quantise
 from bench.scoring import Scoring, taken
 from bench.types import Camera, Frame, composite

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from reports.comparison import columns_of, comparison
-from reports.lines import as_lines, results
+from reports.lines import as_lines, results, seedless
 from tests.reports.conftest import rename, rewrite, run_of
 
 FACTS = dict.fromkeys(("scene", "split", "trajectory", "budget", "protocol", "device"), "same")
@@ -67,6 +67,13 @@ def test_the_same_settings_on_other_machines_are_lines_of_their_own(make):
     lines = as_lines(runs)
     assert len(lines.lines) == 2
     assert lines.settings["machine"] == ["same, EPYC, 2 threads", "same, Xeon, 2 threads"]
+
+
+def test_a_line_whose_seeds_are_all_alike_is_known(make):
+    alike = [make({"frames": 0}, seed) for seed in range(3)]
+    others = [make({"frames": 2}, seed, 30 + seed) for seed in range(3)]
+    assert seedless(as_lines([*alike, *others])) == ["L=0"]
+    assert seedless(as_lines(alike[:1])) == []
 
 
 def test_a_seed_counts_once_in_a_line(make):

@@ -93,3 +93,12 @@ def test_a_choice_that_is_no_yaml_of_settings_is_named_in_one_line(content, stee
     refused = steerbench("run", f"--config-dir={tmp_path / 'further'}", "method=mine").refused()
     assert "mine.yaml: expected" in refused or "method: its YAML file: expected" in refused
     assert refused.count("\n") == 1
+
+
+def test_a_choice_of_ones_own_that_has_a_name_of_ours_is_said_not_to_be_used(tmp_path, capsys):
+    own = tmp_path / "budget" / "tiny.yaml"
+    own.parent.mkdir()
+    own.write_text("steps: 7\n")
+    for _ in range(2):
+        composed([f"--config-dir={tmp_path}", "budget=tiny"])
+    assert capsys.readouterr().err == f"{own}: not used: a choice of ours has this name\n"
