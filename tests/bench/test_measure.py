@@ -441,6 +441,9 @@ def test_reported_times_far_below_what_passed_here_are_doubted_in_every_row(
     # As large a share of a short frame is the rounding of clocks.
     short = FrameRecord({"other": 10_000}, {}, {}, wall_ns=500_000)
     assert not bench.measure._doubted_times([short])
+    quick = FrameRecord({"other": 1_000}, {}, {}, wall_ns=1_100_000)
+    assert bench.measure._doubted_times([quick] * 2)
+    assert not bench.measure._doubted_times([quick, honest, honest])
     assert not bench.measure._doubted_times([frame(1.0)])  # which nobody reported
 
 
