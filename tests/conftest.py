@@ -23,6 +23,7 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from bench import neighbours
+from bench.cameras import look_at
 from bench.console import ConsoleLog
 from bench.measure import Task, measure, train
 from bench.metrics import declare_torchvision
@@ -153,11 +154,11 @@ def _tiny_split(count: int, seed: int) -> Split:
 def camera_on_orbit(turn: float) -> Camera:
     """A camera 2 units from the middle of the unit cube, looking at it."""
     angle = 2 * math.pi * turn
-    forward = torch.tensor([math.cos(angle), math.sin(angle), 0.0])
-    down = torch.tensor([0.0, 0.0, -1.0])
-    rotation = torch.stack((torch.linalg.cross(down, forward), down, forward), dim=1)
-    centre = torch.full((3,), 0.5) - 2.0 * forward
-    return Camera(torch.cat((rotation, centre[:, None]), dim=1), 60.0, 60.0, 20.0, 16.0, 40, 32)
+    middle = torch.full((3,), 0.5)
+    away = torch.tensor([math.cos(angle), math.sin(angle), 0.0])
+    up = torch.tensor([0.0, 0.0, 1.0])
+    c2w = look_at(middle - 2 * away, middle, up)
+    return Camera(c2w, 60.0, 60.0, 20.0, 16.0, 40, 32)
 
 
 class OffsetMethod:

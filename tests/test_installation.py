@@ -76,12 +76,6 @@ def steerbench(installed, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_demo_of_the_wheel_writes_its_page(steerbench, tmp_path):
-    steerbench("run", "+experiment=demo", *TINY)
-    assert "| gaussians |" in (tmp_path / "outputs/demo/report.md").read_text()
-
-
-@pytest.mark.slow
 def test_the_wheel_runs_a_plug_in_and_a_worker(steerbench, tmp_path):
     """Those of the documents: the class in this process, the program in another."""
     write_files("extending.md", tmp_path)

@@ -110,13 +110,16 @@ def test_lpips_is_that_of_its_authors_with_the_weights_in_the_order_of_their_lay
     """Its formula, in words of our own, is in `recompute.py`."""
     a = noise(50, 44, 7)
     b = (a + 0.2 * (noise(50, 44, 8) - 0.5)).clamp(0, 1)
-    measured = Lpips(net, lpips_weights, quiet_log)(a.to(device), b.to(device))
+    ours = Lpips(net, lpips_weights, quiet_log)
+    measured = ours(a.to(device), b.to(device))
     import lpips  # after `Lpips`, see `bench.metrics`
 
+    theirs = lpips.LPIPS(net=net, pnet_rand=True, verbose=False)
     weights = torch.load(lpips_weights / f"{file}_features.pth", weights_only=True)
-    model = lpips.LPIPS(net=net, pnet_rand=True, verbose=False)
-    model.net.load_state_dict(dict(zip(model.net.state_dict(), weights.values(), strict=True)))
-    expected = model(*((2 * x - 1).permute(2, 0, 1)[None] for x in (a, b))).item()
+    names = theirs.net.state_dict()
+    theirs.net.load_state_dict(dict(zip(names, weights.values(), strict=True)))
+    one, other = ((2 * x - 1).permute(2, 0, 1)[None] for x in (a, b))
+    expected = theirs(one, other).item()
     # float32 convolutions of up to 4,608 products a position: relative error below 1e-4.
     assert measured == pytest.approx(expected, rel=1e-3)
 

@@ -125,10 +125,13 @@ def zone(count: int) -> tuple[list[Camera], float]:
     """Cameras on every side, between 2 and 2.5 units from the target; and how far the third nearest
     of one of them is at most, in degrees."""
     generator = seeded(7)
-    ways = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
-    eyes = ways * (2 + torch.rand(count, 1, generator=generator) / 2)
-    third = (ways @ ways.T).clamp(-1, 1).acos().sort(dim=1).values[:, 3]
-    return [camera_at(eye.tolist()) for eye in eyes], math.degrees(third.max())
+    ways = torch.randn(count, 3, generator=generator)
+    ways /= ways.norm(dim=1, keepdim=True)
+    distances = 2 + torch.rand(count, 1, generator=generator) / 2
+    cameras = [camera_at(eye.tolist()) for eye in distances * ways]
+    angles = (ways @ ways.T).clamp(-1, 1).acos()
+    third = angles.sort(dim=1).values[:, 3]
+    return cameras, math.degrees(third.max())
 
 
 @given(SEEDS)

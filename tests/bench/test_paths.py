@@ -17,6 +17,7 @@ from bench.scenes.remarks import Remarks
 from bench.scenes.transforms import program_maps
 from bench.trajectories import follow
 from bench.types import Camera, Scene, Split
+from tests.bench.scenes.conftest import intrinsics
 from tests.common import assert_near, refusal, write_json
 
 
@@ -65,8 +66,7 @@ def test_a_path_comes_back_as_it_was_written(scene, tmp_path, asked, lens, shift
     for camera, written in zip(read, (first, second), strict=True):
         torch.testing.assert_close(camera.c2w, written.c2w)
         assert (camera.width, camera.height) == (32, 24)
-        found, wanted = ((c.fx, c.fy, c.cx, c.cy) for c in (camera, written))
-        assert found == pytest.approx(wanted)
+        assert intrinsics(camera) == pytest.approx(intrinsics(written))
 
 
 def test_a_transforms_file_gives_intrinsics_or_leaves_them_to_the_test_camera(scene, tmp_path):
@@ -84,7 +84,7 @@ def test_a_transforms_file_gives_intrinsics_or_leaves_them_to_the_test_camera(sc
     ):
         path = stored(tmp_path, record | {"frames": [{"transform_matrix": pose}] * 2})
         first, _ = read_path(path, scene, Remarks())
-        assert (first.fx, first.fy, first.cx, first.cy) == pytest.approx(wanted)
+        assert intrinsics(first) == pytest.approx(wanted)
 
 
 @pytest.mark.parametrize(

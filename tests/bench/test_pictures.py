@@ -28,51 +28,61 @@ def noise(channels: int = 3, size: tuple[int, int] = (16, 20), seed: int = 0) ->
     return torch.randint(256, (*size, channels), dtype=torch.uint8, generator=seeded(seed))
 
 
+@pytest.fixture
+def scored(quiet_log):
+    """Scores pairs of pictures."""
+
+    def score(pairs, protocol=QUICK, **how):
+        return pictures.score(pairs, protocol, {}, FACTS, quiet_log, **how)
+
+    return score
+
+
 GREY = torch.full((16, 20, 3), 100, dtype=torch.uint8)
 
 
-def test_pictures_have_a_psnr_and_a_sequence_a_flicker_where_the_error_changes(tmp_path, quiet_log):
+def test_pictures_have_a_psnr_and_a_sequence_a_flicker_where_the_error_changes(tmp_path, scored):
     shown = {"1.png": GREY + 51, "2.png": GREY + 51, "10.png": GREY}  # off by 0.2, then not
     ours = write(tmp_path / "ours", shown)
     true = write(tmp_path / "true", dict.fromkeys(shown, GREY))
     pairs = pictures.pairs_with_folder(ours, true)
-    found = pictures.score(pairs, QUICK, {}, FACTS, quiet_log)
+    found = scored(pairs)
     off = 20 * math.log10(255 / 51)
     assert found.frames["psnr"].tolist() == pytest.approx([off, off, math.inf], abs=1e-5)
     assert set(found.rows["metric"]) == {"psnr", "ssim"}
     assert set(found.rows["resolution"]) == {"20x16"}
-    found = pictures.score(pairs, QUICK, {}, FACTS, quiet_log, sequence=True)
+    found = scored(pairs, sequence=True)
     assert math.isnan(found.frames["flicker"][0])
     assert found.frames["flicker"][1:].tolist() == pytest.approx([0.0, 0.2], abs=1e-6)
 
 
 @pytest.mark.parametrize(("background", "level"), [("white", 255), ("black", 0)])
-def test_alpha_is_put_on_the_background_of_the_protocol(tmp_path, quiet_log, background, level):
+def test_alpha_is_put_on_the_background_of_the_protocol(tmp_path, scored, background, level):
     clear = torch.zeros(16, 20, 4, dtype=torch.uint8)
     plain = torch.full((16, 20, 3), level, dtype=torch.uint8)
     ours, true = write(tmp_path / "ours", {"a.png": clear}), write(tmp_path / "b", {"a.png": plain})
     protocol = replace(QUICK, name="mine", background=background)
     for pair in (ours, true), (true, ours):
-        found = pictures.score(pictures.pairs_with_folder(*pair), protocol, {}, FACTS, quiet_log)
+        found = scored(pictures.pairs_with_folder(*pair), protocol)
         assert found.frames["psnr"][0] == math.inf
 
 
-def test_names_match_without_their_endings_and_folders(tmp_path, quiet_log):
+def test_names_match_without_their_endings_and_folders(tmp_path, scored):
     images = [noise(seed=number) for number in (9, 10)]
     ours = write(tmp_path / "ours", {"r_9.bmp": images[0], "r_10.bmp": images[1]})
     split = Split([], images, ["test/r_9.png", "test/r_10.png"])
-    found = pictures.score(pictures.pairs_with_split(ours, split), QUICK, {}, FACTS, quiet_log)
+    found = scored(pictures.pairs_with_split(ours, split))
     assert found.frames["psnr"].tolist() == [math.inf] * 2
     assert found.frames["name"].tolist() == split.names
     mask = torch.arange(16)[:, None].expand(16, 20) > 3
     spoiled = [torch.where(mask[..., None], image, 0) for image in images]
     masked = pictures.pairs_with_split(ours, replace(split, images=spoiled, masks=[mask, None]))
-    again = pictures.score(masked, QUICK, {}, FACTS, quiet_log)
+    again = scored(masked)
     assert again.frames["psnr"].isin([math.inf]).tolist() == [True, False]
 
 
 @pytest.mark.parametrize("folder", ["", "out/"])
-def test_pictures_in_subfolders_match_by_their_path(tmp_path, quiet_log, folder):
+def test_pictures_in_subfolders_match_by_their_path(tmp_path, scored, folder):
     images = {name: noise(seed=k) for k, name in enumerate(("back/1", "front/1", "front/2"))}
     for name, image in images.items():
         path = tmp_path / f"ours/{folder}{name}.png"
@@ -83,7 +93,7 @@ def test_pictures_in_subfolders_match_by_their_path(tmp_path, quiet_log, folder)
         pictures.pairs_with_split(tmp_path / "ours", split),
         pictures.pairs_with_split(tmp_path / "ours", split, "order"),
     ):
-        found = pictures.score(pairs, QUICK, {}, FACTS, quiet_log)
+        found = scored(pairs)
         assert found.frames["psnr"].tolist() == [math.inf] * 3
     flat = write(tmp_path / "flat", {"1.png": noise(), "2.png": noise()})
     with refusal(r"true pictures of different names.* several of 1"):
@@ -152,17 +162,17 @@ def test_two_truths_of_one_name_have_no_picture_of_their_own(tmp_path):
         (None, noise(), r"ours/a.png: expected a whole picture"),
     ],
 )
-def test_a_picture_that_cannot_be_scored_is_named(tmp_path, quiet_log, ours, true, message):
+def test_a_picture_that_cannot_be_scored_is_named(tmp_path, scored, ours, true, message):
     theirs = write(tmp_path / "ours", {"a.png": noise() if ours is None else ours})
     if ours is None:  # a file cut in half
         whole = (theirs / "a.png").read_bytes()
         (theirs / "a.png").write_bytes(whole[: len(whole) // 2])
     pairs = pictures.pairs_with_folder(theirs, write(tmp_path / "true", {"a.png": true}))
     with refusal(message):
-        pictures.score(pairs, QUICK, {}, FACTS, quiet_log)
+        scored(pairs)
 
 
-def test_what_a_run_rendered_has_its_figures(store, stored_run, tiny_scene, tmp_path, quiet_log):
+def test_what_a_run_rendered_has_its_figures(store, stored_run, tiny_scene, tmp_path, scored):
     kept = sorted((store.folder / stored_run / "pictures").glob("*-rendered.png"))
     measured = store.frames(stored_run).set_index("frame")
     measured = measured.loc[[int(path.stem.partition("-")[0]) for path in kept]]
@@ -172,6 +182,6 @@ def test_what_a_run_rendered_has_its_figures(store, stored_run, tiny_scene, tmp_
     split = tiny_scene.splits["test"]
     truths = dict(zip(split.names, split.images, strict=True))
     pairs = pictures.pairs_with_split(folder, Split([], [truths[name] for name in names], names))
-    found = pictures.score(pairs, QUICK, {}, FACTS, quiet_log).frames
+    found = scored(pairs).frames
     for metric in ("psnr", "ssim"):
         assert found[metric].tolist() == measured[metric].tolist()

@@ -11,6 +11,7 @@ from bench.cameras import scale_camera
 from bench.paths import write_path
 from bench.trajectories import (
     Step,
+    Trajectory,
     approached,
     follow,
     from_split,
@@ -28,11 +29,16 @@ from tests.common import refusal
 from tests.conftest import camera_on_orbit
 
 
+def truths(path: Trajectory) -> list[int | None]:
+    """The number of the picture of each frame, if it has one."""
+    return [step.truth for step in path.steps]
+
+
 def test_a_whole_split_is_rendered_in_its_order_with_its_ground_truth(tiny_scene):
     trajectory = from_split(tiny_scene)
     test = tiny_scene.splits["test"]
     assert [step.camera for step in trajectory.steps] == list(test.cameras)
-    assert [step.truth for step in trajectory.steps] == list(range(6))
+    assert truths(trajectory) == list(range(6))
     assert (trajectory.name, trajectory.split, trajectory.resolution) == ("test", "test", "40x32")
     cameras = [scale_camera(test.cameras[0], 20, 16), *test.cameras[1:]]
     mixed = replace(tiny_scene, splits={"test": Split(cameras, test.images, test.names)})
@@ -41,7 +47,7 @@ def test_a_whole_split_is_rendered_in_its_order_with_its_ground_truth(tiny_scene
 
 def test_a_limit_stands_in_the_name_and_cuts_before_a_frame_whose_predecessor_is_out(tiny_scene):
     thinned = from_split(tiny_scene, limit=3)
-    assert [step.truth for step in thinned.steps] == [0, 2, 5]
+    assert truths(thinned) == [0, 2, 5]
     assert thinned.name == "test-3of6"
     assert from_split(tiny_scene, limit=99).name == "test"
     assert [step.cut for step in from_split(tiny_scene, limit=2).steps] == [False, True]
@@ -72,7 +78,7 @@ def test_a_smooth_path_goes_through_the_cameras_in_even_steps():
     scene = orbit_of([0, 4, 7.5])
     path = smooth(scene)
     cameras = scene.splits["test"].cameras
-    assert [step.truth for step in path.steps] == [0, None, None, None, 1, None, None, None, 2]
+    assert truths(path) == [0, None, None, None, 1, None, None, None, 2]
     assert [s.camera for s in path.steps if s.truth is not None] == list(cameras)
     turns = [turn_deg(a.camera, b.camera) for a, b in pairwise(path.steps)]
     assert turns == pytest.approx([1.0] * 4 + [3.5 / 4] * 4, abs=1e-3)
@@ -80,9 +86,9 @@ def test_a_smooth_path_goes_through_the_cameras_in_even_steps():
         distance = (step.camera.c2w[:, 3] - 0.5).norm().item()
         assert 2 * math.cos(math.radians(2)) - 1e-5 <= distance <= 2 + 1e-5
     path = smooth(orbit_of([0, 1, 2, 3]))  # close enough: no frame between them
-    assert [step.truth for step in path.steps] == [0, 1, 2, 3]
+    assert truths(path) == [0, 1, 2, 3]
     path = smooth(orbit_of([0, 1, 2, 3]), degrees=0.5, limit=2)
-    assert [step.truth for step in path.steps] == [0, None, 1]
+    assert truths(path) == [0, None, 1]
     assert path.name == "test-smooth0.5deg-2of4"
 
 
@@ -97,8 +103,7 @@ def test_a_smooth_path_is_even_also_where_cameras_only_move():
     ):
         camera.c2w[:, 3] += move
     # atan(0.1) is 5.7 degrees, atan(0.05) 2.9.
-    truths = [step.truth for step in smooth(scene).steps]
-    assert truths == [0, *[None] * 5, 1, *[None] * 2, 2]
+    assert truths(smooth(scene)) == [0, *[None] * 5, 1, *[None] * 2, 2]
 
 
 def test_a_static_path_stays_where_it_is_and_an_orbit_takes_the_first_cameras():
@@ -168,14 +173,14 @@ def test_a_loop_goes_there_and_back_until_its_frames_are_used_up():
     assert not any(step.cut for step in path.steps)
     assert path.name == "test-loop11-1deg"
     scene = orbit_of([0, 1, 2])
-    assert [step.truth for step in loop(scene, frames=5, limit=2).steps] == [0, 1, 0, 1, 0]
-    assert [step.truth for step in loop(scene, frames=3, limit=1).steps] == [0, 0, 0]
+    assert truths(loop(scene, frames=5, limit=2)) == [0, 1, 0, 1, 0]
+    assert truths(loop(scene, frames=3, limit=1)) == [0, 0, 0]
 
 
 def test_each_camera_is_approached_once_after_a_cut_from_a_motion_of_its_own(tiny_scene):
     path = approached(tiny_scene, "test", lead=2, degrees=3.3, seed=0, limit=0)
     cameras = tiny_scene.splits["test"].cameras
-    assert [step.truth for step in path.steps] == [x for n in range(6) for x in (None, None, n)]
+    assert truths(path) == [x for n in range(6) for x in (None, None, n)]
     assert [step.cut for step in path.steps] == [True, False, False] * 6
     assert [step.camera for step in path.steps if step.truth is not None] == list(cameras)
     assert path.preceding == [0, 1, 2] * 6  # steady for a method that looks back on `lead` frames
@@ -186,7 +191,7 @@ def test_each_camera_is_approached_once_after_a_cut_from_a_motion_of_its_own(tin
     path = approached(tiny_scene, "test", lead=0, degrees=3.3, seed=0, limit=0)
     assert [(step.truth, step.cut) for step in path.steps] == [(n, True) for n in range(6)]
     limited = approached(tiny_scene, "test", lead=1, degrees=3.3, seed=0, limit=3)
-    assert [step.truth for step in limited.steps] == [None, 0, None, 2, None, 5]
+    assert truths(limited) == [None, 0, None, 2, None, 5]
     assert limited.name == "test-approached1-3.3deg-3of6"
     first, again, other = (approached(tiny_scene, "test", 1, 3.3, seed, 0) for seed in (0, 0, 1))
     poses = [[step.camera.c2w.tolist() for step in path.steps] for path in (first, again, other)]
@@ -202,7 +207,7 @@ def test_a_path_of_a_file_is_named_after_it_and_has_no_truths(tmp_path):
     assert path.name.startswith("there-")
     assert path.reads == (tmp_path / "there.json",)
     assert path.preceding == [0, 1]
-    assert [step.truth for step in path.steps] == [None, None]
+    assert truths(path) == [None, None]
     torch.testing.assert_close(path.steps[1].camera.c2w, cameras[1].c2w)
 
 
@@ -210,13 +215,13 @@ def test_the_keys_of_a_spline_are_a_splits_cameras_or_those_of_a_file(tmp_path):
     scene = orbit_of([0, 4, 8, 12, 16])
     cameras = scene.splits["test"].cameras
     of_split = spline(scene, None, keys=3)
-    assert [step.truth for step in of_split.steps if step.truth is not None] == [0, 2, 4]
+    assert [truth for truth in truths(of_split) if truth is not None] == [0, 2, 4]
     assert of_split.preceding[-1] == len(of_split.steps) - 1 > 2
     assert of_split.name == "test-3of5-spline1deg"
     write_path(tmp_path / "keys.json", cameras[:2], scene)
     of_file = spline(scene, str(tmp_path / "keys.json"))
     assert len(of_file.steps) > 2
-    assert {step.truth for step in of_file.steps} == {None}
+    assert set(truths(of_file)) == {None}
     assert of_file.reads == (tmp_path / "keys.json",)
 
 

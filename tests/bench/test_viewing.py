@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bench.cameras import look_at
-from bench.types import Camera, Frame, Probe
+from bench.types import Camera, Frame
 from bench.viewing import COARSE, FLUENT_MS, Ask, Painter, Turns, difference, divided, seen_from
 
 CAMERA = Camera(torch.eye(3, 4), 40.0, 40.0, 16.0, 12.0, 32, 24)
@@ -19,16 +19,16 @@ class Counting:
 
     name, frames = "counting", 0
 
-    def reset(self) -> None:
+    def reset(self):
         self.frames = 0
 
-    def render(self, camera: Camera, probe: Probe) -> Frame:
+    def render(self, camera, probe):
         self.frames += 1
         with probe.stage("count"):
             rgb = torch.full((camera.height, camera.width, 3), self.frames / 255)
         return Frame(rgb, rgb[..., 0], rgb[..., 0])
 
-    def settings(self) -> dict[str, str]:
+    def settings(self):
         return {"device": "cpu"}
 
 

@@ -1,4 +1,4 @@
-"""Muon for convolutions, against its definition by singular vectors, and torch's for matrices."""
+"""Muon for convolutions against that of torch for matrices."""
 
 import pytest
 import torch

@@ -285,17 +285,21 @@ def smallest(name: str, **where: Any) -> Method:
     return steernerf("joint", model=small_model(step=64.0, frames=1), joint=lessons, **few, **where)
 
 
+@pytest.fixture
+def tiny(ball_scene) -> Scene:
+    splits = {name: fewer(split, 3, side=8) for name, split in ball_scene.splits.items()}
+    return replace(ball_scene, splits=splits)
+
+
 @pytest.mark.slow
 @needs_triton
 @pytest.mark.parametrize("name", ["ngp", "steernerf", "gaussians"])
-def test_by_triton_it_trains_and_renders_as_on_the_cpu(name, ball_scene, tmp_path, monkeypatch):
+def test_by_triton_it_trains_and_renders_as_on_the_cpu(name, tiny, tmp_path, monkeypatch):
     from triton.runtime.interpreter import interpreter_builder as builder
 
     # What takes half of the time, and is looked for by the tests of the kernels.
     monkeypatch.setattr(builder, "options", replace(builder.options, sanitize_overflow=False))
     monkeypatch.setattr(field, "BATCH_QUANTUM", 64)
-    splits = {name: fewer(split, 3, side=8) for name, split in ball_scene.splits.items()}
-    tiny = replace(ball_scene, splits=splits)
     budget = replace(BUDGET, steps=1, samples=64, renderer_steps=1)
 
     def drawn(device):
@@ -311,7 +315,7 @@ def test_by_triton_it_trains_and_renders_as_on_the_cpu(name, ball_scene, tmp_pat
 @pytest.mark.slow
 @needs_triton
 @pytest.mark.usefixtures("products_of_bfloat16")
-def test_steps_and_frames_are_few_launches(gpu, ball_scene, tmp_path, monkeypatch):
+def test_steps_and_frames_are_few_launches(gpu, tiny, tmp_path, monkeypatch):
     """Each takes some microseconds, whatever it computes."""
     steps = []
     advance, march = FieldTraining.advance, Mock(wraps=frame.march)
@@ -326,18 +330,15 @@ def test_steps_and_frames_are_few_launches(gpu, ball_scene, tmp_path, monkeypatc
         monkeypatch.setattr(owner, name, getattr(owner, name).__wrapped__)
     monkeypatch.setattr(FieldTraining, "advance", advanced)
     monkeypatch.setattr(frame, "march", march)
-    splits = {name: fewer(split, 3, side=8) for name, split in ball_scene.splits.items()}
     method = smallest("ngp", device="cuda", backend="gpu")
-    method.fit(
-        replace(ball_scene, splits=splits), replace(BUDGET, samples=64), ConsoleLog(tmp_path, True)
-    )
+    method.fit(tiny, replace(BUDGET, samples=64), ConsoleLog(tmp_path, True))
     assert max(steps[1:]) <= 200  # the first updates the density grid
-    frames(method, replace(ball_scene, splits=splits))  # what later ones need is made once
+    frames(method, tiny)  # what later ones need is made once
     for samples in longest_ray(STEP), 1:
         monkeypatch.setattr(frame, "GPU_SAMPLES", samples)
         march.reset_mock()
         before = gpu.launched
-        method.render(splits["test"].cameras[0], NullProbe())
+        method.render(tiny.splits["test"].cameras[0], NullProbe())
         assert gpu.launched - before <= 87 + 37 * march.call_count
     assert march.call_count > 1
 

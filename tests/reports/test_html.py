@@ -27,18 +27,18 @@ FIRST = re.compile(r"first: tiny, .*, frame 1 of 6")
 class Parsed(HTMLParser):
     """The elements of a page, each with its attributes."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
         self.elements: list[tuple[str, dict[str, str]]] = []
         self.feed(text)
 
-    def of(self, tag: str) -> list[dict[str, str]]:
+    def of(self, tag):
         return [attributes for name, attributes in self.elements if name == tag]
 
-    def values(self, attribute: str) -> list[str]:
+    def values(self, attribute):
         return [found[attribute] for _, found in self.elements if attribute in found]
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         self.elements.append((tag, {name: value or "" for name, value in attrs}))
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from bench.case import Case
 from bench.errors import Unavailable
+from reports.tables import Table
 from sweeps.commands.compile import wrong_of
 from sweeps.processes import lock_file
 from tests.common import refusal
@@ -47,6 +48,13 @@ def asked(monkeypatch) -> list[tuple[list[str], int]]:
     return calls
 
 
+@pytest.fixture
+def shown(monkeypatch) -> list[Table]:
+    tables = []
+    monkeypatch.setattr("sweeps.commands.checks.show", tables.append)
+    return tables
+
+
 def test_the_last_line_is_json_and_a_wrong_kernel_fails(steerbench, asked):
     outcome = steerbench("kernels", "--filter", "enc", "--repeats", "3")
     assert asked == [(["encode"], 3)]
@@ -57,9 +65,7 @@ def test_the_last_line_is_json_and_a_wrong_kernel_fails(steerbench, asked):
     assert outcome.json == [SMALL, REFERENCE, RIGHT, WRONG]
 
 
-def test_a_fast_version_has_a_line_with_the_time_of_its_reference(steerbench, asked, monkeypatch):
-    shown = []
-    monkeypatch.setattr("sweeps.commands.checks.show", shown.append)
+def test_a_fast_version_has_a_line_with_the_time_of_its_reference(steerbench, asked, shown):
     steerbench("kernels")
     (table,) = shown
     wrong, right, small = (dict(zip(table.columns, line, strict=True)) for line in table.lines)
@@ -143,7 +149,7 @@ def test_the_last_line_of_stress_is_json_and_a_case_that_fails_fails_it(steerben
     assert [row["status"] for row in outcome.json] == ["ok", "failed"]
 
 
-def test_cases_nearest_to_their_tolerances_are_shown_again(steerbench, monkeypatch):
+def test_cases_nearest_to_their_tolerances_are_shown_again(steerbench, shown, monkeypatch):
     seen = {"cpu": 5e-7, "reference": 4e-7, "gpu": Unavailable("no GPU")}
     cells = {("cpu", "fp32"): 1e-6, ("reference", "fp32"): 5e-7, ("gpu", "fp32"): 1e-6}
 
@@ -157,8 +163,6 @@ def test_cases_nearest_to_their_tolerances_are_shown_again(steerbench, monkeypat
         for number in range(10)
     ]
     monkeypatch.setattr("methods.checks.found", lambda name: cases)
-    shown = []
-    monkeypatch.setattr("sweeps.commands.checks.show", shown.append)
     steerbench("stress")
     nearest = shown[-1].lines
     assert [line[1] for line in nearest] == ["9", "8", "7", "6", "5"]

@@ -33,27 +33,32 @@ something is broken."""
 class Page:
     """A browser that has the page open: cameras go there, pictures and controls come back."""
 
-    def __init__(self, viewer: Viewer, socket: Any) -> None:
+    def __init__(self, viewer, socket):
         self._viewer, self._socket = viewer, socket
         self._controls: dict[str, dict[str, Any]] = {}
         self.picture = np.zeros((0, 0, 3), int)
         """The last one, [H, W, 3] from 0 to 255."""
 
-    def look(self, x: float = 0.5) -> None:
+    def look(self, x=0.5):
         pose = {"wxyz": (1.0, 0.0, 0.0, 0.0), "position": (x, 0.5, -1.0), "fov": np.pi / 3}
         far = {"near": 0.01, "far": 1000.0, "look_at": (x, 0.5, 0.5)}
         size = {"image_height": 300, "image_width": 600, "up_direction": (0.0, -1.0, 0.0)}
         self._send("ViewerCameraMessage", **pose, **far, **size)
 
-    def choose(self, label: str, value: Any) -> None:
+    def see(self):
+        """Look, and wait for a picture."""
+        self.look()
+        self.until(lambda: self.picture.size > 0)
+
+    def choose(self, label, value):
         self.until(lambda: label in self._controls)
         uuid = self._controls[label]["uuid"]
         self._send("GuiUpdateMessage", uuid=uuid, updates={"value": value})
 
-    def close(self) -> None:
+    def close(self):
         self._socket.close()
 
-    def until(self, holds: Callable[[], bool]) -> None:
+    def until(self, holds):
         """Let the viewer draw and receive what it sends until something holds."""
         for _ in range(ROUNDS):
             if holds():
@@ -63,10 +68,10 @@ class Page:
                 self._receive(self._socket.recv(timeout=TICK_S))
         pytest.fail("it did not come to hold")
 
-    def _send(self, kind: str, **fields: Any) -> None:
+    def _send(self, kind, **fields):
         self._socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
 
-    def _receive(self, data: bytes) -> None:
+    def _receive(self, data):
         size = int.from_bytes(data[8:16], "little")
         inner = zstandard.ZstdDecompressor().decompress(data[16 : 16 + size])
         for message in msgspec.msgpack.decode(inner)["messages"]:
@@ -102,8 +107,7 @@ def opened(steerbench, tmp_path) -> Iterator[Callable[..., Viewer]]:
 def test_a_turned_knob_is_another_method(opened):
     viewer = opened("method=shades")
     with browser(viewer) as page:
-        page.look()
-        page.until(lambda: page.picture.size > 0)
+        page.see()
         before = page.picture.mean()
         assert before < 250
         page.choose("level", "level 1.0")
@@ -115,8 +119,7 @@ def test_a_turned_knob_is_another_method(opened):
 def test_two_methods_stand_side_by_side(opened):
     viewer = opened("method.level=0.4", "--beside", "shades")
     with browser(viewer) as page:
-        page.look()
-        page.until(lambda: page.picture.size > 0)
+        page.see()
         left, right = page.picture[:, 1].mean(), page.picture[:, -2].mean()
         assert abs(left - 102) < 3
         (seen,) = viewer.browsers.values()

@@ -22,6 +22,10 @@ def camera_at(eye: tuple[float, float, float], size: int = 96) -> Camera:
     return Camera(c2w, 1.3 * size, 1.3 * size, size / 2, size / 2, size, size)
 
 
+def intrinsics(camera: Camera) -> tuple[float, float, float, float]:
+    return camera.fx, camera.fy, camera.cx, camera.cy
+
+
 def png(header: bytes, data: bytes) -> bytes:
     """A PNG of a header and compressed rows that need not suit one another."""
     chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(data)), (b"IEND", b""))

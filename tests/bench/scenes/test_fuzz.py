@@ -20,7 +20,7 @@ from bench.memory import MemoryMeter
 from bench.scenes import blender, nsvf, transforms
 from bench.scenes.images import decode_bytes
 from bench.types import Scene, SteerbenchError
-from tests.bench.scenes.conftest import encoded, png
+from tests.bench.scenes.conftest import encoded, intrinsics, png
 from tests.common import write_json
 
 QUIET = ConsoleLog(Path(), quiet=True)
@@ -162,7 +162,7 @@ def loads_or_refuses(load: Callable[[], Scene]) -> None:
     for split in scene.splits.values():
         for camera, image in zip(split.cameras, split.images, strict=True):
             assert camera.c2w.isfinite().all()
-            numbers = torch.tensor((camera.fx, camera.fy, camera.cx, camera.cy))
+            numbers = torch.tensor(intrinsics(camera))
             assert numbers.isfinite().all()
             assert (numbers[:2] > 0).all()
             assert image.shape[:2] == (camera.height, camera.width)

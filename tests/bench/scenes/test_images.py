@@ -22,7 +22,7 @@ from bench.scenes.images import (
     shrunk_camera,
 )
 from bench.types import Camera
-from tests.bench.scenes.conftest import encoded, picture
+from tests.bench.scenes.conftest import encoded, intrinsics, picture
 from tests.common import refusal
 
 HERE = Path("picture.png")
@@ -38,14 +38,18 @@ def test_shrink_is_the_exact_mean_weighted_by_alpha(factor):
     """In whole numbers; halves are rounded up."""
     image = torch.from_numpy(picture(factor, 17, 11))
     image[:factor, :factor, 3] = 0  # a block that nothing is seen in
-    rows, columns = 11 // factor, 17 // factor
+    rows = 11 // factor
+    columns = 17 // factor
     whole = image[: rows * factor, : columns * factor].long()
     blocks = whole.view(rows, factor, columns, factor, 4)
-    mass = blocks[..., 3:].sum((1, 3))
-    colours = (blocks[..., :3] * blocks[..., 3:]).sum((1, 3))
-    means = (2 * colours + mass) // (2 * mass).clamp(min=1)
+    colours, alphas = blocks.split([3, 1], dim=4)
+    mass = alphas.sum((1, 3))
+    total = (colours * alphas).sum((1, 3))
+    means = (2 * total + mass) // (2 * mass).clamp(min=1)
     alpha = (2 * mass + factor**2) // (2 * factor**2)
-    assert torch.equal(shrink(image, factor).long(), torch.cat((means, alpha), dim=2))
+    small = shrink(image, factor)
+    assert torch.equal(small[..., :3].long(), means)
+    assert torch.equal(small[..., 3:].long(), alpha)
 
 
 def test_what_fills_no_block_is_left_out_and_the_camera_stays_exact():
@@ -54,7 +58,7 @@ def test_what_fills_no_block_is_left_out_and_the_camera_stays_exact():
     assert shrink(torch.zeros(11, 17, 3, dtype=torch.uint8), 4).shape == (2, 4, 3)
     camera = shrunk_camera(pinhole(17, 11), 4, HERE)
     assert (camera.width, camera.height) == (4, 2)
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (2.5, 3.0, 17 / 8, 11 / 8)
+    assert intrinsics(camera) == (2.5, 3.0, 17 / 8, 11 / 8)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from PIL import Image
 
 from bench.cameras import move_camera
 from bench.scenes import nsvf
-from tests.bench.scenes.conftest import picture
+from tests.bench.scenes.conftest import intrinsics, picture
 from tests.common import assert_near, refusal
 
 MATRIX = "9 0 4.5 0\n0 8 2.5 0\n0 0 1 0\n0 0 0 1\n"
@@ -89,7 +89,7 @@ def test_boxes_that_are_too_small_are_enlarged_further(folder, log, name, furthe
 def test_every_form_of_intrinsics(folder, log, text, expected):
     (folder / "intrinsics.txt").write_text(text)
     camera = nsvf.load(folder, log=log).splits["train"].cameras[0]
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == expected
+    assert intrinsics(camera) == expected
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ What TensorRT itself makes of the models is not tested here; see `tensorrt_doubl
 
 import math
 import sys
+from pathlib import Path
 
 import numpy as np
 import onnx
@@ -36,15 +37,19 @@ def test_pictures_of_each_size_have_a_plan_which_is_found_again(precision, doubl
     assert plans == {f"1x12x{size}.plan" for size in ("36x44", "28x40", "36x24")}
 
 
+def graph_of(folder: Path) -> tuple[list[onnx.NodeProto], dict[str, np.ndarray]]:
+    """The nodes and the constants of the model in a folder."""
+    graph = onnx.load(folder / "network.onnx").graph
+    return graph.node, {x.name: onnx.numpy_helper.to_array(x) for x in graph.initializer}
+
+
 def test_int8_is_symmetric_with_biases_in_float32(double, tmp_path, build):
     build(TensorRt("int8"), *unet())
-    graph = onnx.load(tmp_path / "network.onnx").graph
-    values = {x.name: onnx.numpy_helper.to_array(x) for x in graph.initializer}
-    pairs = [n for n in graph.node if n.op_type in ("QuantizeLinear", "DequantizeLinear")]
+    nodes, values = graph_of(tmp_path)
+    pairs = [n for n in nodes if n.op_type in ("QuantizeLinear", "DequantizeLinear")]
     assert pairs
     assert not any(np.any(values[node.input[2]]) for node in pairs)
-    convolutions = [node.input for node in graph.node if node.op_type == "Conv"]
-    biases = [inputs[2] for inputs in convolutions if len(inputs) > 2]
+    biases = [name for node in nodes if node.op_type == "Conv" for name in node.input[2:]]
     assert biases
     assert all(values[bias].dtype == np.float32 for bias in biases)
 

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
 import torch
 from torch import Tensor, nn
@@ -15,6 +14,7 @@ from methods.engines.openvino_engine import OpenVino
 from methods.engines.tensorrt_engine import TensorRt
 from tests.common import seeded
 from tests.methods.engines.test_engines import CPU, unet
+from tests.methods.engines.test_tensorrt import graph_of
 
 Kind = Callable[[str, str], Engine]
 
@@ -28,14 +28,14 @@ class Layers(nn.Module):
     """Two convolutions, and one of what is pooled between them, side by side. Weights are so large
     that what they make leaves its range, too."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         torch.manual_seed(0)
         self.first, self.second = nn.Conv2d(4, 8, 3, padding=1), nn.Conv2d(8, 3, 3, padding=1)
         self.pooled = nn.Conv2d(8, 12, 1)
         self.requires_grad_(False).first.weight.mul_(2)
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x):
         between = self.first(x).relu()
         pooled = self.pooled(functional.max_pool2d(between, 2))
         return torch.cat((self.second(between), functional.pixel_shuffle(pooled, 2)), dim=1)
@@ -64,12 +64,11 @@ def weights(kind: Kind, folder: Path) -> dict[tuple[int, ...], tuple[np.ndarray,
         kernels = [op.input_value(1).get_node() for op in convolved]
         pairs = [(k.input_value(0).get_node().input_value(0), k.input_value(1)) for k in kernels]
         found = [[x.get_node().data for x in pair] for pair in pairs]
-        return {q.shape: (q, scale) for q, scale in found}
-    graph = onnx.load(folder / "network.onnx").graph
-    values = {x.name: onnx.numpy_helper.to_array(x) for x in graph.initializer}
-    makers = {name: node for node in graph.node for name in node.output}
-    kernels = [makers[node.input[1]] for node in graph.node if node.op_type == "Conv"]
-    found = [[values[name] for name in kernel.input[:2]] for kernel in kernels]
+    else:
+        nodes, values = graph_of(folder)
+        makers = {name: node for node in nodes for name in node.output}
+        kernels = [makers[node.input[1]] for node in nodes if node.op_type == "Conv"]
+        found = [[values[name] for name in kernel.input[:2]] for kernel in kernels]
     return {q.shape: (q, scale) for q, scale in found}
 
 

@@ -38,7 +38,9 @@ def by_definition(sigma: Tensor, delta: Tensor, shown: Tensor, stop: float) -> T
     opacity = 1 - torch.exp(-sigma * delta)
     behind = (1 - opacity).cumprod(dim=0)
     before = torch.cat((torch.ones(1), behind))[:-1]
-    return (torch.where(before > stop, before * opacity, 0)[:, None] * shown).sum(dim=0)
+    weights = before * opacity
+    weights[before <= stop] = 0
+    return weights @ shown
 
 
 @pytest.mark.parametrize("stop", [0.0, 0.3])

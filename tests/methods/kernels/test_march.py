@@ -12,10 +12,7 @@ from methods.kernels.types import Occupancy
 from tests.common import refusal, seeded
 
 STEP = math.sqrt(3) / 1024
-
-
-def full() -> Occupancy:
-    return Occupancy(torch.ones(16, 16, 16, dtype=torch.bool))
+FULL = Occupancy(torch.ones(16, 16, 16, dtype=torch.bool))
 
 
 def dust(seed: int) -> Occupancy:
@@ -30,14 +27,20 @@ def rays_through_the_cube(count: int) -> Rays:
 
 def plain_march(rays: Rays, phases: Tensor, grid: Occupancy) -> list[Tensor]:
     """All t_k inside the cube and an occupied cell, in float64, by ray."""
-    origins, directions = rays.origins.double(), rays.directions.double()
-    ends = torch.stack((-origins / directions, (1 - origins) / directions))
-    near, far = ends.amin(dim=0).amax(dim=1).clamp(min=0), ends.amax(dim=0).amin(dim=1)
-    steps = (torch.arange(1100) + phases[:, None]) * STEP  # the diagonal has 1024
-    t = near[:, None] + steps / directions.norm(dim=1)[:, None]
-    cells = (origins[:, None] + t[..., None] * directions[:, None]) * grid.resolution
-    occupied = grid.cells[cells.long().clamp(0, grid.resolution - 1).unbind(dim=-1)]
-    return [at[kept] for at, kept in zip(t, occupied & (t < far[:, None]), strict=True)]
+    origins = rays.origins.double()
+    directions = rays.directions.double()
+    faces = torch.stack((0 - origins, 1 - origins)) / directions
+    near = faces.amin(dim=0).amax(dim=1).clamp(min=0)
+    far = faces.amax(dim=0).amin(dim=1)
+    numbers = torch.arange(1100) + phases[:, None]  # the diagonal has 1024
+    steps = STEP / directions.norm(dim=1)
+    found = []
+    for ray, t in enumerate(near[:, None] + numbers * steps[:, None]):
+        t = t[t < far[ray]]
+        places = origins[ray] + t[:, None] * directions[ray]
+        cells = (places * grid.resolution).long().clamp(0, grid.resolution - 1)
+        found.append(t[grid.cells[cells.unbind(dim=1)]])
+    return found
 
 
 @pytest.mark.parametrize("jitter", [None, torch.linspace(0, 0.99, 40)])
@@ -92,7 +95,7 @@ def test_rays_that_miss_or_make_no_sense_have_no_samples(backend):
     nan, inf = math.nan, math.inf
     origins = torch.tensor([[2.0, 2, 2], [0.5, 0.5, 0.5], [nan, 0, 0], [0.5, 0.5, 0.5], [0.5] * 3])
     directions = torch.tensor([[1.0, 0, 0], [0, 0, 0], [1, 0, 0], [nan, 1, 0], [inf, 1, 0]])
-    samples = march(Rays(origins, directions), full(), STEP, backend=backend)
+    samples = march(Rays(origins, directions), FULL, STEP, backend=backend)
     assert len(samples) == 0
     assert samples.resume.tolist() == [-1] * 5
 
@@ -109,11 +112,11 @@ def test_clearance_is_the_distance_to_the_nearest_brick_along_the_farthest_axis(
 def test_wrong_arguments_are_named():
     origins = torch.zeros(2, 3)
     with refusal("directions: expected shape", ValueError):
-        march(Rays(origins, torch.zeros(3, 3)), full(), STEP)
+        march(Rays(origins, torch.zeros(3, 3)), FULL, STEP)
     with refusal("step: expected a positive length, got 0", ValueError):
-        march(Rays(origins, origins), full(), 0.0)
+        march(Rays(origins, origins), FULL, 0.0)
     with refusal("limit: expected 1 or more, got 0", ValueError):
-        march(Rays(origins, origins), full(), STEP, limit=0)
+        march(Rays(origins, origins), FULL, STEP, limit=0)
     for side in (24, 1024):  # a clearance of 256 bricks would not fit into a byte
         with refusal(f"multiple of 16, at most 1008, got {side}", ValueError):
             Occupancy(torch.zeros(1, 1, 1).bool().expand(side, side, side))

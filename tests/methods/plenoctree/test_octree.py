@@ -30,17 +30,26 @@ def test_the_picture_of_the_visible_leaves_is_that_of_all_composited_by_definiti
     every = cast(look_at_the_middle(0.13, 0.4))
     rays = Rays(every.origins[::9], every.directions[::9])
     pixels, _, _ = render_voxels(rays, visible.voxels, visible.light, stop=0.0)
-    origins, directions = (x.double()[:, None] for x in (rays.origins, rays.directions))
+
+    origins = rays.origins.double()[:, None]
+    directions = rays.directions.double()[:, None]
     lower = octree.voxels.coordinates.double() / 16
-    ends = torch.stack([(lower + more - origins) / directions for more in (0, 1 / 16)])
-    near, far = ends.amin(dim=0).amax(dim=2), ends.amax(dim=0).amin(dim=2)  # [R, N]
-    depth = octree.light.density.clamp(min=0) * (far - near).clamp(min=0) * directions.norm(dim=2)
+    first = (lower - origins) / directions
+    last = (lower + 1 / 16 - origins) / directions
+    near = torch.minimum(first, last).amax(dim=2)  # [R, N]
+    far = torch.maximum(first, last).amin(dim=2)
+    length = (far - near).clamp(min=0) * directions.norm(dim=2)
     near, order = near.sort(dim=1)
+    depth = octree.light.density.clamp(min=0) * length
     depth = depth.gather(1, order)
-    weights = (depth - depth.cumsum(dim=1)).exp() * -torch.expm1(-depth)
-    basis = spherical_harmonics(normalize(directions[:, 0], dim=1))[:, :4]
-    logits = torch.einsum("rk,rnkc->rnc", basis, octree.light.harmonics.double()[order])
-    colours = (weights[..., None] * logits.sigmoid()).sum(dim=1)
+    light = torch.exp(depth - depth.cumsum(dim=1))
+    weights = light * -torch.expm1(-depth)
+
+    towards = normalize(directions[:, 0], dim=1)
+    basis = spherical_harmonics(towards)[:, :4]
+    harmonics = octree.light.harmonics.double()[order]
+    shown = torch.einsum("rk,rnkc->rnc", basis, harmonics).sigmoid()
+    colours = (weights[..., None] * shown).sum(dim=1)
     # 24 leaves at most, densities below 35, entry and exit rounded as in the kernel's cases.
     assert_near(pixels.values.double(), colours, atol=1e-4)
     assert_near(pixels.alpha.double(), weights.sum(dim=1), atol=1e-4)

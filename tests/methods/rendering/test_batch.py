@@ -126,7 +126,7 @@ def test_a_teacher_tells_which_samples_are_hidden(cloud, device):
     class Teacher:
         """As dense everywhere as is given, without colours."""
 
-        def __init__(self, sigma: float) -> None:
+        def __init__(self, sigma):
             self.density = lambda places: (torch.full_like(places[:, 0], sigma), places)
 
     own, most = render_batch(field, rays, occupancy, Sampling(stop=0))

@@ -1,4 +1,4 @@
-"""A radiance field that is no network: its rays, its density grid, padding."""
+"""A radiance field that is no network: its density grid, padding."""
 
 import torch
 

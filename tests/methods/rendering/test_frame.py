@@ -16,6 +16,7 @@ from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import FAINT, Sampling
 from tests.common import assert_near, seeded
 from tests.methods.conftest import GRID, Work, look_at_the_middle
+from tests.methods.rendering.test_batch import rays_on
 from tests.methods.solids import Solid, wall
 
 
@@ -80,7 +81,7 @@ def test_a_window_is_that_of_its_pixel(cloud):
 
 def test_at_once_rays_look_as_in_rounds(cloud, device, monkeypatch):
     field, occupancy = cloud
-    rays = cast(place_camera(look_at_the_middle(0.1, 0.4), device))
+    rays = rays_on(device)
     window = torch.tensor((0.0, 1.7), device=device).expand(len(rays.origins), 2)
     found = []
     for compacts, chunk in ((True, 10_000), (True, 100), (False, 10_000), (False, 100)):
@@ -112,7 +113,7 @@ def test_samples_behind_the_early_stop_are_hardly_evaluated():
 def test_faint_samples_are_black_and_not_looked_at_in_rounds(cloud, compacts, monkeypatch):
     monkeypatch.setattr(rendering, "compacts", lambda device: compacts)
     field, occupancy = cloud
-    rays = cast(place_camera(look_at_the_middle(0.1, 0.4), field.device))
+    rays = rays_on(field.device)
     stop, work = 0.01, Work()
     rendered = render_rays(field, rays, occupancy, work, Sampling(stop=stop))
     assert work.done["shaded_samples"] > 0

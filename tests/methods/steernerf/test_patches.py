@@ -50,11 +50,8 @@ def views_of(
 
 def same(first: Split, second: Split) -> bool:
     """Whether poses, intrinsics and pictures are equal to the last bit."""
-    cameras = zip(first.cameras, second.cameras, strict=True)
-    pictures = zip(first.images, second.images, strict=True)
-    return all(torch.equal(pack_camera(a), pack_camera(b)) for a, b in cameras) and all(
-        torch.equal(a, b) for a, b in pictures
-    )
+    pairs = zip(*([*map(pack_camera, x.cameras), *x.images] for x in (first, second)), strict=True)
+    return all(torch.equal(*pair) for pair in pairs)
 
 
 def test_a_distilled_view_is_what_the_field_shows_among_the_training_cameras(

@@ -101,9 +101,13 @@ def test_highlights_move_with_the_viewer():
     places = []
     for eye in ((0.0, -4.0, 0.0), (1.5, -3.7, 0.0)):
         camera = camera_at(eye)
-        shiny, matt = (render(model, camera, 4) for model in (glossy, Solids([sphere(0.7)])))
-        place, rays = (shiny.rgb - matt.rgb)[..., 1].argmax(), cast(camera)
-        places.append(rays.origins[place] + matt.depth.flatten()[place] * rays.directions[place])
+        shiny = render(glossy, camera, 4)
+        matt = render(Solids([sphere(0.7)]), camera, 4)
+        glow = (shiny.rgb - matt.rgb)[..., 1]
+        brightest = glow.argmax()
+        depth = matt.depth.flatten()[brightest]
+        rays = cast(camera)
+        places.append(rays.origins[brightest] + depth * rays.directions[brightest])
     assert (places[0] - places[1]).norm() > 0.05
 
 
