@@ -12,6 +12,7 @@ from rich import progress
 from rich.console import Console
 
 from bench.errors import explained
+from bench.kinds import Say
 from bench.results import content_key
 
 PLAIN_INTERVAL_S = 10.0  # between two progress lines without a terminal to draw a bar on
@@ -25,7 +26,7 @@ class ConsoleLog:
     def __init__(
         self, root: Path, quiet: bool = False, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self.followers: list[Callable[[str], object]] = []  # each gets every line of progress
+        self.followers: list[Say] = []  # each gets every line of progress
         self._root = root
         self._console = Console(stderr=True, quiet=quiet)
         self._clock = clock

@@ -6,13 +6,14 @@
 import tempfile
 import tomllib
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 from bench.download import fetch
 from bench.errors import unexpected
+from bench.kinds import Labels, Texts
 from bench.scenes.files import data_folder
 from bench.sharing import file_sha256, locked
 from bench.threads import in_parallel
@@ -33,7 +34,7 @@ class Published:
     folder: str | None = None  # URL of the folder with all files
 
     @cached_property
-    def hashes(self) -> Mapping[str, str]:
+    def hashes(self) -> Labels:
         """SHA-256 of each file, by its path, which starts with the scene's name."""
         text = (LISTS / f"{self.name}.registry.txt").read_text(encoding="utf-8")
         return dict(line.split() for line in text.splitlines())
@@ -42,7 +43,7 @@ class Published:
     def scenes(self) -> set[str]:
         return {name.split("/")[0] for name in self.hashes}
 
-    def of(self, scene: str) -> dict[str, str]:
+    def of(self, scene: str) -> Texts:
         return {name: d for name, d in self.hashes.items() if name.startswith(f"{scene}/")}
 
 
@@ -70,7 +71,7 @@ def get(data: Published, scene: str, folder: Path, log: Log) -> Path:
     return folder / scene
 
 
-def _unpack(archive: Path, wanted: Mapping[str, str], folder: Path) -> None:
+def _unpack(archive: Path, wanted: Labels, folder: Path) -> None:
     """Extract the `wanted` files, if they are correct, from the zip file into `folder`."""
     with tempfile.TemporaryDirectory(dir=folder) as new:
         try:
@@ -89,7 +90,7 @@ def _unpack(archive: Path, wanted: Mapping[str, str], folder: Path) -> None:
             (Path(new) / name).replace(folder / name)
 
 
-def _wrong(folder: Path, wanted: Mapping[str, str]) -> list[str]:
+def _wrong(folder: Path, wanted: Labels) -> list[str]:
     """The `wanted` files that are present but differ, or missing although a loader needs them."""
     needed = [n for n in wanted if (folder / n).exists() or not any(m in n for m in GROUND_TRUTH)]
     return [name for name in needed if file_sha256(folder / name) != wanted[name]]
@@ -131,7 +132,7 @@ def verify(path: str | Path, log: Log) -> VerifyReport:
     )
 
 
-def _expected(root: Path) -> tuple[Path, Mapping[str, str]]:
+def _expected(root: Path) -> tuple[Path, Labels]:
     """The folder that the listed paths are relative to, and the list of hashes."""
     known = published()
     for data in known:

@@ -2,11 +2,13 @@
 
 import importlib
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
+
+from bench.kinds import Names
 
 NAMED = 5  # an error names at most this many things and gives the number of the rest
 
@@ -62,7 +64,7 @@ def nearest(name: str, there: Iterable[str]) -> str:
     return names[near[0]] if near else some([*names.values()]) or "nothing"
 
 
-def some(names: Sequence[str]) -> str:
+def some(names: Names) -> str:
     """The first of `names`, and how many more there are."""
     further = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return ", ".join(names[:NAMED]) + further

@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from PIL import ImageFile
 
+from bench.kinds import Say, Texts, Values
 from bench.provenance import is_edited
 from bench.threads import in_parallel
 from bench.types import Budget, Camera, Log, Method, Scene, SteerbenchError
@@ -128,7 +129,7 @@ OF_IMPORTS = ("the environment", "filters of warnings")
 """Parts that libraries change when they are first imported; no line is said of these."""
 
 
-def _state() -> dict[str, Any]:
+def _state() -> Values:
     """The global state that is put back, but for random numbers, by what it is called."""
     device = torch.get_default_device()
     return {
@@ -163,7 +164,7 @@ def _folder() -> str:
         return ""
 
 
-def _set_environment(variables: dict[str, str]) -> None:
+def _set_environment(variables: Texts) -> None:
     os.environ.clear()
     os.environ.update(variables)
 
@@ -262,7 +263,7 @@ def _draw_from(drawn: tuple[Any, ...]) -> None:
 
 
 @contextmanager
-def put_back(tell: Callable[[str], object] = lambda part: None) -> Iterator[None]:
+def put_back(tell: Say = lambda part: None) -> Iterator[None]:
     """Put the global state of this process back as it was when the body ends; `tell` gets each part
     but random numbers that the body changed."""
     before = _state()

@@ -12,7 +12,6 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,6 +21,7 @@ from torch import Tensor
 from bench.clock import FrameRecord, StageClock, counted
 from bench.errors import unexpected
 from bench.isolation import Guard, Isolated, check_originals, fit, lent, moved, sees_scored
+from bench.kinds import Labels, Names, Numbers, Row, Values
 from bench.memory import MemoryMeter, give_back
 from bench.metrics import Lpips, psnr_of_mse
 from bench.neighbours import Neighbours, Watch
@@ -149,7 +149,7 @@ class _Take:
             _shown(task),
             task.scene.surface,
         )
-        self.rows: list[dict[str, Any]] = []  # of the first round
+        self.rows: list[Row] = []  # of the first round
         # Of its steady frames with a ground truth, how far they are from the first method's: MSE,
         # and largest difference of any channel.
         self.apart: list[tuple[float, float]] = []
@@ -229,7 +229,7 @@ def _shown(task: Task) -> set[int]:
 
 
 def _measurement(
-    take: _Take, task: Task, missing: Mapping[str, str], neighbours: Neighbours, in_turns: int
+    take: _Take, task: Task, missing: Labels, neighbours: Neighbours, in_turns: int
 ) -> Measurement:
     """What was measured of one of `in_turns` methods."""
     scene = task.scene
@@ -242,12 +242,12 @@ def _measurement(
     records, means = take.timed(len(take.clock.frames) - protocol.rounds * len(take.rows))
     rows_of_frames = [row | _costs(timed) for row, timed in zip(take.rows, records, strict=True)]
     frames = _frame_table(rows_of_frames, scoring.names)
-    summary: list[dict[str, Any]] = []
+    summary: list[Row] = []
     for phase in (STEADY, COLD):
         of_phase = frames[frames["phase"] == phase]
         if len(of_phase):
             summary += [row | {"phase": phase} for row in phase_rows(of_phase)]
-    whole: dict[str, float] = {}
+    whole: Numbers = {}
     if protocol.rounds > 1:
         whole |= {"frame_ms.fastest": min(means), "frame_ms.slowest": max(means)}
     if take.apart:  # the PSNR from the MSE over all frames, inf if they are equal
@@ -273,7 +273,7 @@ def _measurement(
         **facts,
     )
     known = [row["metric"] for row in summary if row["n"]]
-    record: dict[str, Any] = {
+    record: Values = {
         "protocol": asdict(protocol),
         "budget": asdict(budget),
         "scene": {"name": scene.name, "digest": scene.digest, "unit_length": scene.unit_length},
@@ -289,18 +289,18 @@ def _measurement(
     return Measurement(rows, frames, scoring.images, record)
 
 
-def _sizes(method: Method) -> dict[str, float]:
+def _sizes(method: Method) -> Numbers:
     """The bytes of each component of `method`, and of all; none if it tells none."""
     sizes = method.sizes()
-    found: dict[str, float] = {}
+    found: Numbers = {}
     for part, size in sizes.items():
         found[f"size_bytes.{part}"] = counted(f"{method.name}: size of {part}", size)
     return found | {"size_bytes.total": sum(found.values())} if found else {}
 
 
-def _costs_of_training(method: Method) -> dict[str, float]:
+def _costs_of_training(method: Method) -> Numbers:
     """Seconds and peak memory of the training, and the seconds of compiling if that was needed."""
-    found: dict[str, float] = {}
+    found: Numbers = {}
     found["train_s"] = method.train_s
     found["train_peak_bytes"] = getattr(method, "train_peak_bytes", math.nan)
     seconds = getattr(method, "compile_s", 0.0)
@@ -332,7 +332,7 @@ def _doubted_times(records: Sequence[FrameRecord]) -> str:
     )
 
 
-def _waits(of_frames: Sequence[Counter[CodeLine]]) -> list[dict[str, Any]]:
+def _waits(of_frames: Sequence[Counter[CodeLine]]) -> list[Row]:
     """Where the host waits for the GPU in a steady frame, the most frequent first."""
     return [
         {"waits": count / len(of_frames), "line": line.place, "source": line.source}
@@ -443,7 +443,7 @@ def _score(
     protocol = task.protocol
     if index == len(task.trajectory.steps) // 2:
         take.middle = frame.rgb.cpu()
-    figures: dict[str, Any] = {"frame": index, "phase": phase}
+    figures: Values = {"frame": index, "phase": phase}
     scored = step.truth is not None
     truth: Tensor | None = None
     mask: Tensor | None = None
@@ -472,7 +472,7 @@ def _score(
     take.rows.append(figures | scores)
 
 
-def _costs(record: FrameRecord) -> dict[str, float]:
+def _costs(record: FrameRecord) -> Numbers:
     return {
         "frame_ms": record.total_ns / 1e6,
         **({} if record.wall_ns is None else {"wall_ms": record.wall_ns / 1e6}),
@@ -482,7 +482,7 @@ def _costs(record: FrameRecord) -> dict[str, float]:
     }
 
 
-def _frame_table(table: list[dict[str, Any]], scores: Sequence[str]) -> pd.DataFrame:
+def _frame_table(table: list[Row], scores: Names) -> pd.DataFrame:
     """One row per frame; missing stages and counters are 0, missing scores NaN."""
     frames = pd.DataFrame(table)
     touched = [name for name in map(str, frames) if name.startswith(("stage_ms.", "work."))]

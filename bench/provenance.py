@@ -16,7 +16,7 @@ import struct
 import subprocess
 import sys
 import sysconfig
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from functools import cache
 from importlib import metadata
@@ -25,6 +25,7 @@ from types import CodeType, FunctionType, ModuleType
 from typing import Any, NamedTuple
 
 from bench.errors import SteerbenchError, unexpected
+from bench.kinds import Named, Texts
 
 ROOT = Path(__file__).resolve().parent.parent
 OURS = ("bench", "methods")
@@ -55,7 +56,7 @@ def commit() -> str:
     return _commit_of(Path(__file__)) or metadata.version("steerbench")
 
 
-def repositories(*things: Any) -> dict[str, str]:
+def repositories(*things: Any) -> Texts:
     """The commits of the git checkouts that files of others among the `sources` of `things` lie in,
     with `-dirty` if changed, by their top-level package."""
     first = {name.partition("/")[0]: path for name, path in sorted(sources(*things).items())}
@@ -110,11 +111,11 @@ def computed_by(*things: Any) -> dict[str, object]:
     }
 
 
-def _tuning() -> dict[str, str]:
+def _tuning() -> Texts:
     return {name: of for name, of in sorted(os.environ.items()) if TUNING.match(name)}
 
 
-def conditions_apart(then: Mapping[str, Any]) -> str:
+def conditions_apart(then: Named) -> str:
     """What may change times since a run with `then` as record of its machine, although it changes
     no result; empty if nothing."""
     cores = len(os.sched_getaffinity(0))
@@ -247,7 +248,7 @@ def _is_text(node: object) -> bool:
     return alone and isinstance(node.value.value, str)  # type: ignore[attr-defined]
 
 
-def libraries(*things: Any) -> dict[str, str]:
+def libraries(*things: Any) -> Texts:
     """Versions of all installed distributions that the `sources` of `things` import.
 
     A class that loads libraries by name lists them in its attribute `libraries`.

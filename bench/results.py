@@ -14,7 +14,7 @@ import os
 import shutil
 import time
 import uuid
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from glob import escape
@@ -26,6 +26,7 @@ import pandas as pd
 from PIL import Image
 
 from bench.errors import SteerbenchError, explained, not_there, some, unexpected
+from bench.kinds import Say
 from bench.provenance import commit, machine
 from bench.records import Record, read_record
 from bench.sharing import check_sums, whole, write_sums
@@ -164,7 +165,7 @@ class Store:
 
     def rows(
         self,
-        report: Callable[[str], object] = lambda line: None,
+        report: Say = lambda line: None,
         keys: Collection[str] | None = None,
     ) -> pd.DataFrame:
         """Every row of all runs, or of those in `keys`; `report` gets a line on those that cannot

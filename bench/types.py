@@ -35,6 +35,10 @@ from torch import Tensor
 from bench.errors import SteerbenchError as SteerbenchError
 from bench.errors import Unavailable as Unavailable
 from bench.errors import unexpected
+from bench.kinds import Names, Sizes, Texts
+
+TwoTensors = tuple[Tensor, Tensor]
+ThreeTensors = tuple[Tensor, Tensor, Tensor]
 
 EMPTY_ALPHA = 1e-3  # pixels with a lower opacity are empty: their depth is +inf
 BACKGROUNDS = {"white": 1.0, "black": 0.0}  # by name, every channel of `Scene.background`
@@ -131,7 +135,7 @@ class Split:
 
     cameras: Sequence[Camera]
     images: Sequence[Tensor]
-    names: Sequence[str]
+    names: Names
     masks: Sequence[Tensor | None] = ()
 
     def __len__(self) -> int:
@@ -269,10 +273,10 @@ class Method(Protocol):
     def render(self, camera: Camera, probe: Probe) -> Frame:
         """Render one frame of the current sequence."""
 
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         """Bytes by component, as stored in a file of the model."""
 
-    def settings(self) -> dict[str, str]:
+    def settings(self) -> Texts:
         """The resolved `device`, `backend`, `engine`, `precision` and `field_precision`, which rows
         show as docs/protocol.md explains."""
 

@@ -8,6 +8,7 @@ from functools import partial
 import pandas as pd
 
 from bench.errors import SteerbenchError
+from bench.kinds import Labels, Names, Texts
 from bench.rows import UNITS, half_interval
 from reports.lines import COMMON, Lines, Settings
 from reports.runs import Repeated, Run, grouped, joined, listed
@@ -28,7 +29,7 @@ COLD_FRAMES = (
 )
 
 
-def comparison(lines: Lines, failures: Mapping[str, str]) -> list[Table]:
+def comparison(lines: Lines, failures: Labels) -> list[Table]:
     """The figures of `lines`, then those of their cold frames if they have any.
 
     Figures are ranked only among lines under the same conditions, if there are at least two; the
@@ -58,7 +59,7 @@ def _table(
     title: str,
     settings: Settings,
     lines: Sequence[Repeated],
-    metrics: Sequence[str],
+    metrics: Names,
 ) -> Table:
     columns = dict(settings)
     phases = [str(line.runs[0].headline["phase"].iloc[0]) for line in lines]
@@ -169,7 +170,7 @@ def machines(runs: Sequence[Run]) -> str:
     return joined(f"{x['cpu']} with {x['threads']} threads" for x in found)
 
 
-def conditions(runs: Sequence[Run], names: Sequence[str]) -> dict[str, str]:
+def conditions(runs: Sequence[Run], names: Names) -> Texts:
     """The facts `names` of `runs`, each with all of its values."""
     return {name: joined(run.facts[name] for run in runs) for name in names}
 

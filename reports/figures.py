@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import cycle
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
@@ -19,6 +18,7 @@ from matplotlib.transforms import Bbox
 from numpy.typing import ArrayLike
 
 from bench.clock import OTHER
+from bench.kinds import Named, Values
 from bench.results import COLD
 from reports.comparison import written
 from reports.images import Picture
@@ -106,7 +106,7 @@ def quality_against(
     _, unit, label = COSTS[metric]
     figure, axes = _of_quality(label)
     first = next(iter(settings.values()), range(len(lines)))  # methods
-    styles: Sequence[Mapping[str, Any]] = [_style(number) for number in range(len(lines))]
+    styles: Sequence[Named] = [_style(number) for number in range(len(lines))]
     handles: Sequence[Line2D] = ()
     crowded = len(set(first)) < len(lines) or len(lines) > MOST_NAMES
     if crowded and any(len(set(of)) > 1 for of in settings.values()):
@@ -141,7 +141,7 @@ def quality_against(
 
 def _legend(
     settings: Settings,
-) -> tuple[Sequence[Mapping[str, Any]], Sequence[Line2D]]:
+) -> tuple[Sequence[Named], Sequence[Line2D]]:
     """The style of each line by its settings, and what a legend says of them: the first setting
     that differs has colours, the others markers."""
     first, *rest = (
@@ -231,7 +231,7 @@ def as_number(value: str) -> float | None:
         return None
 
 
-def _style(number: int) -> dict[str, Any]:
+def _style(number: int) -> Values:
     marker, colour = MARKERS[number % len(MARKERS)], COLOURS[number % len(COLOURS)]
     return {"marker": marker, "color": colour, "linestyle": "none"}
 
@@ -247,7 +247,7 @@ def _of_quality(across: str, height: float = 4.5) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def frontier_plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+def frontier_plot(rows: Sequence[Named], path: Path) -> None:
     """Write a PNG: error of a frame against its time, log-log, one point per setting.
 
     The left panel shows the error against the ground truth, with the Pareto frontier as a
@@ -283,7 +283,7 @@ def frontier_plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 def _circle(axes: Axes, rows: pd.DataFrame, column: str) -> None:
     """Circle the points of `rows`, and name each on its left unless another name is there."""
-    style: dict[str, Any] = {"textcoords": "offset points", "size": 8, "ha": "right", "va": "top"}
+    style: Values = {"textcoords": "offset points", "size": 8, "ha": "right", "va": "top"}
     names: list[np.ndarray] = []
     for setting, ms, error in zip(rows["setting"], rows["ms"], _rms(rows[column]), strict=True):
         place = (ms, error)

@@ -1,13 +1,14 @@
 """Runs as lines of a table: seeds are repetitions, and settings that differ are columns."""
 
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
 import pandas as pd
 
+from bench.kinds import Names, Say, Texts
 from bench.results import COLUMNS, Store, content_key
 from reports.runs import Repeated, Run, grouped, over_common_frames, readable, unseeded
 from reports.tables import QUALITY
@@ -46,7 +47,7 @@ class Lines:
     def runs(self) -> list[Run]:
         return [run for line in self.lines for run in line.runs]
 
-    def frame(self, metrics: Sequence[str]) -> pd.DataFrame:
+    def frame(self, metrics: Names) -> pd.DataFrame:
         """A row each: settings, number of seeds, means of metrics and halves of their intervals."""
         figures: dict[str, Sequence[Any]] = {
             **self.settings,
@@ -91,7 +92,7 @@ def differing(runs: Sequence[Run]) -> dict[str, list[str]]:
     return {short[name]: values for name, values in columns.items()}
 
 
-def shortened(names: Sequence[str]) -> dict[str, str]:
+def shortened(names: Names) -> Texts:
     """The last part of each of the `names` of settings or, if several columns end so, all of it."""
     ends = [*(name.rpartition(".")[2] for name in names), *TAKEN]
     return {
@@ -122,7 +123,7 @@ def varied(runs: Sequence[Run]) -> dict[str, list[str]]:
     return columns
 
 
-def results(store: Store, report: Callable[[str], object] = lambda line: None) -> pd.DataFrame:
+def results(store: Store, report: Say = lambda line: None) -> pd.DataFrame:
     """Every row of all runs, with a column for each setting that differs between them and, where
     runs differ in no setting, one with the commits and the time of each.
 
@@ -157,7 +158,7 @@ def _line_of(run: Run) -> str:
     return content_key({"settings": _settings(run), "where": list(map(str, run.conditions))})
 
 
-def _settings(run: Run) -> dict[str, str]:
+def _settings(run: Run) -> Texts:
     """The settings of a run by name, without seeds, as text; none for scored pictures."""
     config = run.record["made_of"].get("config", {})
     return {name: _text(name, of) for name, of in unseeded(config) if name not in HIDDEN}

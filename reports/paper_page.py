@@ -11,6 +11,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from bench.kinds import Labels, Named
 from reports import figures
 from reports.claims import NOT_MEASURED, claim_table, finding_table
 from reports.images import Part, Picture, frame_section, kept_frames
@@ -37,7 +38,7 @@ def _parts(
     tables: Sequence[PaperTable],
     measured: Measured,
     runs: Sequence[Run],
-    missing: Mapping[str, str],
+    missing: Labels,
 ) -> Iterator[Part]:
     shown = PAGE if any(table.number is not None for table in tables) else _of_own(tables)
     yield f"# {shown['title']}"
@@ -72,7 +73,7 @@ def _parts(
     yield f"## Runs\n\nTheir keys in the store, and the commands:\n\n```\n{sources}\n```"
 
 
-def _of_own(tables: Sequence[PaperTable]) -> Mapping[str, Any]:
+def _of_own(tables: Sequence[PaperTable]) -> Named:
     """Title, plots and images of all lines, for tables that are not the paper's."""
     every = ((table.name, key, line) for table in tables for key, line in table.lines.items())
     lines = {line.label: (name, key) for name, key, line in every}
@@ -83,7 +84,7 @@ def _of_own(tables: Sequence[PaperTable]) -> Mapping[str, Any]:
     }
 
 
-def _plot(plot: Mapping[str, Any], lines: Sequence[Repeated]) -> Iterator[Part]:
+def _plot(plot: Named, lines: Sequence[Repeated]) -> Iterator[Part]:
     """A plot of `lines` with heading and caption, if any was measured."""
     if "metric" in plot:
         drawn = figures.quality_plot(lines, plot["metric"])

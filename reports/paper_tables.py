@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
+from bench.kinds import Labels, Names, Numbers, Texts
 from reports.claims import Claim, Comparison, apart, compare, gap, told
 from reports.comparison import conditions, line_table, machines, marked, shown_as, written
 from reports.lines import COMMON
@@ -39,7 +40,7 @@ class Line:
     """
 
     label: str
-    job: Mapping[str, str]
+    job: Labels
     published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     every_seed: bool = False
     called: str = ""
@@ -61,17 +62,17 @@ class PaperTable:
 
     name: str
     title: str
-    metrics: Sequence[str]
+    metrics: Names
     lines: Mapping[str, Line]
-    data_sets: Sequence[str] = ("",)
-    published_on: Mapping[str, str] = field(default_factory=dict)
+    data_sets: Names = ("",)
+    published_on: Labels = field(default_factory=dict)
     beside: Sequence[str] = ()
     number: int | None = None
     notes: Sequence[str] = ()
     claims: Sequence[Claim] = ()
-    scenes: Sequence[str] = ()
+    scenes: Names = ()
     reference: str = ""
-    instead: Mapping[str, str] = field(default_factory=dict)
+    instead: Labels = field(default_factory=dict)
 
     @property
     def called(self) -> str:
@@ -136,7 +137,7 @@ class Shown:
         """The data set; of the first block, which has the title of the table, ""."""
         return "" if self.data_set == self.table.data_sets[0] else self.data_set
 
-    def published(self, metric: str) -> dict[str, float]:
+    def published(self, metric: str) -> Numbers:
         """The paper's figures, by key, of the lines that have one."""
         figures = {key: line.published.get(self.data_set, {}) for key, line in self.lines.items()}
         return {key: of[metric] for key, of in figures.items() if metric in of}
@@ -152,7 +153,7 @@ def comparisons(table: PaperTable, measured: Measured) -> list[Comparison]:
     ]
 
 
-def measured_where(runs: Sequence[Run]) -> dict[str, str]:
+def measured_where(runs: Sequence[Run]) -> Texts:
     """Under which conditions, and on which machines, `runs` were measured."""
     return {**conditions(runs, (*COMMON, "seed", "commit")), "machine": machines(runs)}
 
@@ -226,7 +227,7 @@ def distance_table(block: Shown) -> Table:
     return _of_columns("Distances", "here (paper)", [reference, *runs.values()], columns)
 
 
-def _scenes(metrics: Sequence[str], lines: Sequence[Repeated]) -> Table:
+def _scenes(metrics: Names, lines: Sequence[Repeated]) -> Table:
     """Means over seeds, one line per scene and line."""
     shown = [
         Repeated(f"{scene}: {line.label}", line.by_scene[scene])

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bench.errors import SteerbenchError, unexpected, unknown
+from bench.kinds import Words
 from bench.rows import half_interval, path_interval
 from reports.runs import Run
 from reports.tables import NETS, QUALITY, Table
@@ -46,7 +47,7 @@ LIMITS: Mapping[str, Limit] = {
 """The metrics that are compared, unless a baseline has limits of its own."""
 
 
-def limited(words: Sequence[str], limits: Mapping[str, Limit] = LIMITS) -> dict[str, Limit]:
+def limited(words: Words, limits: Mapping[str, Limit] = LIMITS) -> dict[str, Limit]:
     """`limits` with those of `words` (psnr=0.2, frame_ms=10%); SteerbenchError if one is wrong."""
     directions = {metric: {"↑": 1, "↓": -1}.get(of.better) for metric, of in QUALITY.items()}
     known = {**{name: Limit(better) for name, better in directions.items() if better}, **LIMITS}

@@ -16,6 +16,7 @@ import torch
 
 from bench.clock import OTHER
 from bench.errors import SteerbenchError
+from bench.kinds import Labels, Named, Numbers, Say, Texts, Values
 from bench.metrics import psnr
 from bench.neighbours import Neighbours
 from bench.records import Record
@@ -48,7 +49,7 @@ class Run:
     label: str
     rows: pd.DataFrame = field(repr=False)
     read_frames: Callable[[], pd.DataFrame] = field(repr=False)
-    record: Mapping[str, Any] = field(repr=False)
+    record: Named = field(repr=False)
     pictures: Path = field(repr=False)
 
     @property
@@ -83,9 +84,9 @@ class Run:
         return math.fsum(figures) if figures else None
 
     @property
-    def parts(self) -> dict[str, float]:
+    def parts(self) -> Numbers:
         """The mean ms of each part of a frame, as the method groups its stages, the rest last."""
-        grouping: Mapping[str, str] = self.record.get("parts", {})
+        grouping: Labels = self.record.get("parts", {})
         found = dict.fromkeys((*grouping.values(), OTHER), 0.0)
         for metric, value in self.values.items():
             if metric.startswith(STAGE):
@@ -151,7 +152,7 @@ class Run:
         return float(np.mean(found)) if found else math.nan
 
     @property
-    def provenance(self) -> dict[str, str]:
+    def provenance(self) -> Texts:
         """Where the figures come from, except the command and the settings."""
         machine, record, row = self.record["machine"], self.record, self.facts
         memory = f"{machine['memory_bytes'] / 2**30:.0f} GiB"
@@ -184,7 +185,7 @@ class Run:
         return ", ".join((self.facts["commit"], *(f"{top} {of}" for top, of in others.items())))
 
     @property
-    def settings(self) -> dict[str, str]:
+    def settings(self) -> Texts:
         """The settings of the method by the names that one types; none for scored pictures."""
         method = self.record["made_of"].get("config", {}).get("method", {})
         named = ((name, str(value)) for name, value in flat({"method": method}))
@@ -234,7 +235,7 @@ class Repeated:
         return half_interval(np.array(self._figures(metric)))
 
     @property
-    def parts(self) -> dict[str, float]:
+    def parts(self) -> Numbers:
         """The mean ms of each part of a frame; see `Run.parts`."""
         of_runs = pd.DataFrame([run.parts for run in self.runs]).fillna(0.0)
         return {str(part): float(ms) for part, ms in of_runs.mean().items()}
@@ -247,7 +248,7 @@ class Repeated:
 def readable(
     store: Store,
     keys: Collection[str] | None = None,
-    report: Callable[[str], object] = lambda unreadable: None,
+    report: Say = lambda unreadable: None,
 ) -> list[Run]:
     """Every readable run, or those in `keys`, labelled with its method, in the order of storing.
 
@@ -297,7 +298,7 @@ def _label(command: object, rows: pd.DataFrame) -> str:
     return typed[-1].partition("=")[2] if typed else str(rows["method"].iloc[0])
 
 
-def flat(node: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+def flat(node: Named, before: str = "") -> Iterator[tuple[str, Any]]:
     """The values of nested settings by the names that one types."""
     for name, value in node.items():
         if isinstance(value, Mapping) and value:
@@ -306,7 +307,7 @@ def flat(node: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]
             yield f"{before}{name}", value
 
 
-def unseeded(config: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+def unseeded(config: Named) -> Iterator[tuple[str, Any]]:
     """The `flat` settings of a run without its seed, and without those of its method, which have
     the same."""
     for name, value in flat(config):
@@ -369,7 +370,7 @@ def over_scenes(runs: Sequence[Run]) -> Run:
         n=("n", "sum"),
     )
     names = map(str, runs[0].facts.index)
-    facts: dict[str, Any] = {name: joined(run.facts[name] for run in runs) for name in names}
+    facts: Values = {name: joined(run.facts[name] for run in runs) for name in names}
     facts["scene"] = f"mean of {', '.join(str(run.facts['scene']) for run in runs)}"
     facts["seed"] = runs[0].facts["seed"]
     key = facts["run"] = content_key({"mean of": [run.key for run in runs]})[:16]
@@ -380,7 +381,7 @@ def over_scenes(runs: Sequence[Run]) -> Run:
     return Run(key, runs[0].label, rows, frames, _record(runs), runs[0].pictures)
 
 
-def _record(runs: Sequence[Run]) -> dict[str, Any]:
+def _record(runs: Sequence[Run]) -> Values:
     """The record of the first run, with the scenes, machines and missing figures of all."""
     records = [run.record for run in runs]
     machines = [record["machine"] for record in records]
@@ -406,7 +407,7 @@ def joined(values: Iterable[object]) -> str:
     return " / ".join(dict.fromkeys(map(str, values)))
 
 
-def listed(values: Mapping[str, Any]) -> str:
+def listed(values: Named) -> str:
     """Names with their values, as text."""
     return ", ".join(
         f"{name} {' + '.join(value) or 'none' if isinstance(value, list) else value}"

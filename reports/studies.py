@@ -10,10 +10,10 @@ import statistics
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 from bench.clock import OTHER
 from bench.convergence import observed_order
+from bench.kinds import Numbers, Values
 from reports.comparison import conditions
 from reports.figures import frontier_plot
 from reports.images import Part, Picture
@@ -63,7 +63,7 @@ class Measured:
         return self.run.values.get(metric, math.nan)
 
     @property
-    def work(self) -> dict[str, float]:
+    def work(self) -> Numbers:
         return {
             metric.removeprefix(WORK): value
             for metric, value in self.run.values.items()
@@ -142,7 +142,7 @@ def on_frontier(lines: Sequence[Measured]) -> list[Measured]:
     return rated
 
 
-def _point(line: Measured) -> dict[str, Any]:
+def _point(line: Measured) -> Values:
     return {
         "setting": line.line.label,
         "knob": line.line.group,

@@ -12,6 +12,7 @@ from functools import partial
 
 import pandas as pd
 
+from bench.kinds import Numbers
 from bench.results import COLD, STEADY
 
 NOT_AVAILABLE = "n/a"
@@ -132,7 +133,7 @@ def run_tables(rows: pd.DataFrame) -> list[Table]:
     return [table for table in (*tables, _memory(rows)) if table.lines]
 
 
-def _values(rows: pd.DataFrame, prefix: str = "") -> dict[str, float]:
+def _values(rows: pd.DataFrame, prefix: str = "") -> Numbers:
     """Figures of one run by metric, for metrics with `prefix`, which is removed from the names."""
     some = rows[rows["metric"].str.startswith(prefix)]
     return dict(zip(some["metric"].str.removeprefix(prefix), some["value"], strict=True))

@@ -6,12 +6,13 @@ import json
 import math
 import re
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from bench.errors import SteerbenchError, explained, unexpected
+from bench.kinds import Labels, Named, Say, Values, Words
 from bench.records import made, read_record
 from bench.results import Store, existing_store
 from bench.sharing import whole
@@ -33,8 +34,8 @@ class Entry:
 
     subject: Sequence[str]
     command: str
-    settings: Mapping[str, str]
-    seeds: dict[str, Any]  # the Run of each in a store, the Figures of each in a baseline
+    settings: Labels
+    seeds: Values  # the Run of each in a store, the Figures of each in a baseline
 
     def differences(self, other: Entry) -> list[str]:
         """The names of the settings of `other` that are not as here."""
@@ -66,7 +67,7 @@ class Entry:
         return next(there, None)
 
 
-def _stored(store: Store, say: Callable[[str], object]) -> list[Entry]:
+def _stored(store: Store, say: Say) -> list[Entry]:
     """The runs of `store` that stand for their jobs, by entry; `say` gets a line on versions."""
     found: dict[str, Entry] = {}
     for run in standing(store, say):
@@ -124,7 +125,7 @@ def read(path: Path) -> tuple[Mapping[str, Limit], list[Entry]]:
         raise SteerbenchError(f"no baseline: {error}; {way}") from error
 
 
-def _limits(held: Mapping[str, Any], where: str) -> dict[str, Limit]:
+def _limits(held: Named, where: str) -> dict[str, Limit]:
     """The limits in a baseline, of metrics that exist, in their direction."""
     limits = {}
     known = limited([f"{metric}=0" for metric in held])  # refuses what is no metric
@@ -167,7 +168,7 @@ def _refuse_endless(where: str, values: Iterable[float], but_for: Sequence[float
             raise unexpected(where, "a finite number", str(value)[:20])
 
 
-def record(path: Path, outputs: Path, words: Sequence[str], say: Callable[[str], object]) -> None:
+def record(path: Path, outputs: Path, words: Words, say: Say) -> None:
     """Write figures to `path`; `words` are limits (psnr=0.2), `say` gets what is left out. A
     baseline that is there keeps its other limits and its choice of runs."""
     store, limits = existing_store(outputs), LIMITS
@@ -192,9 +193,7 @@ def record(path: Path, outputs: Path, words: Sequence[str], say: Callable[[str],
     store.rows(report=say)  # on those that cannot be read
 
 
-def _say_left_out(
-    runs: Sequence[Entry], limits: Mapping[str, Limit], say: Callable[[str], object]
-) -> None:
+def _say_left_out(runs: Sequence[Entry], limits: Mapping[str, Limit], say: Say) -> None:
     metrics = {
         metric
         for each in runs
@@ -206,9 +205,7 @@ def _say_left_out(
     say(f"left out: metrics without a limit: {', '.join(families)}")
 
 
-def checked(
-    path: Path, outputs: Path, say: Callable[[str], object] = lambda line: None
-) -> list[list[Assertion]]:
+def checked(path: Path, outputs: Path, say: Say = lambda line: None) -> list[list[Assertion]]:
     """Whether every metric of each run of the baseline `path` is as good in the store; `say` gets
     a line on which of several versions of a run were taken."""
     limits, entries = read(path)
@@ -284,7 +281,7 @@ def _failure_of(
     return None
 
 
-def _without_seed(words: Sequence[str]) -> tuple[list[str], str]:
+def _without_seed(words: Words) -> tuple[list[str], str]:
     """The words of a command but for its seed, and this, 0 where none is given."""
     seeds = ["0", *(word.removeprefix("seed=") for word in words if word.startswith("seed="))]
     return [word for word in words if not word.startswith("seed=")], seeds[-1]

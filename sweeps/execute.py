@@ -28,6 +28,7 @@ from omegaconf import DictConfig, OmegaConf, flag_override, open_dict
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
+from bench.kinds import Words
 from bench.results import content_key
 from bench.study import study_of
 from reports.runs import grouped, load_runs
@@ -70,7 +71,7 @@ class Launcher:
     """Where work is done, as Hydra's `config` says; errors quote the `words` of the command."""
 
     config: DictConfig
-    words: Sequence[str]
+    words: Words
 
     def run(self, groups: Sequence[Group]) -> list[dict[str, Ended]]:
         """How the jobs of each group ended, by their keys.
@@ -115,7 +116,7 @@ def own_folder(config: DictConfig) -> None:
         config.hydra.overrides.hydra.append(setting("hydra.sweep.dir", str(folder)))
 
 
-def divided(words: Sequence[str]) -> tuple[list[str], list[str]]:
+def divided(words: Words) -> tuple[list[str], list[str]]:
     """The settings of runs among `words`, and those of Hydra."""
     of_hydra = [word for word in words if word.lstrip("+~").startswith(("hydra.", "hydra/"))]
     return [word for word in words if word not in of_hydra], of_hydra
@@ -223,7 +224,7 @@ def run_jobs(jobs: Sequence[Job], launcher: Launcher) -> list[Ended]:
     return [ended[job.key] for job in jobs]
 
 
-def run_all(jobs: Sequence[Job], words: Sequence[str]) -> list[Ended]:
+def run_all(jobs: Sequence[Job], words: Words) -> list[Ended]:
     """Run the jobs, see `run_jobs`, with the launcher that `words` of a command choose
     (`hydra/launcher=joblib`). Notes on the work go below the outputs of the jobs."""
     place = setting("outputs", str(jobs[0].outputs))

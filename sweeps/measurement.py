@@ -18,6 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable, explained, unexpected
 from bench.isolation import Guard, as_begun, put_back
+from bench.kinds import Named, Values, Words
 from bench.measure import MethodFailed, Task, measure, train
 from bench.neighbours import Neighbours
 from bench.provenance import (
@@ -60,7 +61,7 @@ AUTOMATIC = {"device": DEVICE, "backend": re.compile("reference|cpu|gpu")}
 """Settings that may be "auto", and what they can become in a key."""
 
 
-def described(config: DictConfig) -> dict[str, Any]:
+def described(config: DictConfig) -> Values:
     """The settings that determine a run; equal for equal jobs.
 
     Left out are: locations, except the last part of a scene's folder, which rows show; `split`,
@@ -82,7 +83,7 @@ def described(config: DictConfig) -> dict[str, Any]:
     return kept
 
 
-def job_key(settings: Mapping[str, Any], turns: str) -> str:
+def job_key(settings: Named, turns: str) -> str:
     """Equal for jobs with the same `settings` (see `described`) and the same `turns`; raises
     SteerbenchError if a number is infinite or NaN."""
     try:
@@ -114,12 +115,12 @@ class Job:
     trajectory, protocol and seed; a job without `turns` is measured alone."""
 
     config: DictConfig  # the composed run.yaml
-    command: Sequence[str]  # the words that make it alone, for the record
+    command: Words  # the words that make it alone, for the record
     name: str = ""  # at the terminal
     turns: str = ""
 
     @cached_property
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Values:
         return described(self.config)
 
     @cached_property
@@ -261,7 +262,7 @@ class _Ready:
     job: Job
     method: Method
     task: Task
-    parts: Mapping[str, Any]
+    parts: Named
     loaded: frozenset[str]  # the names of all modules before
 
     def check_unchanged(self) -> None:
@@ -298,7 +299,7 @@ def _ready(jobs: Sequence[Job], log: Log) -> list[_Ready]:
     if any(each.task.budget != ready[0].task.budget for each in ready):
         raise SteerbenchError("budget: expected the same for all that is measured in turns")
     keys = [content_key(each.parts) for each in ready]
-    shared: dict[str, Any] = {"beside": sorted(keys)}
+    shared: Values = {"beside": sorted(keys)}
     if ready[0].task.protocol.compared:
         shared["compared_with"] = keys[0]
     return [replace(each, parts={**each.parts, **shared}) for each in ready]
@@ -339,19 +340,19 @@ def _prepared(job: Job, log: Log) -> _Ready:
     return _Ready(job, method, task, parts, loaded)
 
 
-def became(settings: Mapping[str, Any], method: Method, scene: Scene) -> dict[str, Any]:
+def became(settings: Named, method: Method, scene: Scene) -> Values:
     """`settings` with what "auto" stands for on this machine, and what `method` leaves to the scene
     as it is for this one: who types the same has the same run."""
     shown = method.settings()
     automatic = {
         name: shown[name] for name, form in AUTOMATIC.items() if form.fullmatch(shown[name])
     }
-    decided: Mapping[str, Any] = {}
+    decided: Named = {}
     if hasattr(method, "decided"):
         decided = method.decided(scene)
 
-    def resolved(node: Mapping[str, Any], before: str) -> dict[str, Any]:
-        found = {}
+    def resolved(node: Named, before: str) -> Values:
+        found: Values = {}
         for name, value in node.items():
             if isinstance(value, Mapping):
                 found[name] = resolved(value, f"{before}{name}.")
@@ -364,7 +365,7 @@ def became(settings: Mapping[str, Any], method: Method, scene: Scene) -> dict[st
     return resolved(settings, "")
 
 
-def _read_by(method: Method, trajectory: Trajectory, settings: Mapping[str, Any]) -> list[str]:
+def _read_by(method: Method, trajectory: Trajectory, settings: Named) -> list[str]:
     """The checksums of the files that a method and a path read, and of those whose names are
     settings of the method."""
     named = [Path(text) for _, text in flat(settings["method"]) if isinstance(text, str)]
@@ -438,7 +439,7 @@ def _measure(ready: Sequence[_Ready], guard: Guard, log: Log) -> None:
     for each in ready:
         each.job.store.remove(each.run)
     for each, measurement in zip(ready, measurements, strict=True):
-        record: dict[str, Any] = {
+        record: Values = {
             **measurement.record,
             "command": shlex.join(each.job.command),
             "scene_path": scene_folder(each.job.config),

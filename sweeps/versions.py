@@ -3,11 +3,12 @@ and the store keeps them all."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
 from bench.errors import some
+from bench.kinds import Say
 from bench.measure import measure
 from bench.provenance import digest
 from bench.results import Store
@@ -15,7 +16,7 @@ from reports.runs import Run, readable
 from sweeps.measurement import job_key, targets
 
 
-def standing(store: Store, say: Callable[[str], object]) -> list[Run]:
+def standing(store: Store, say: Say) -> list[Run]:
     """One run of each job and scene in `store`, the one used last first.
 
     Of several versions the run of the present code stands; of several of these, or if there is
@@ -46,7 +47,7 @@ def standing(store: Store, say: Callable[[str], object]) -> list[Run]:
     return taken
 
 
-def by_job(store: Store, say: Callable[[str], object]) -> Mapping[str, Sequence[Run]]:
+def by_job(store: Store, say: Say) -> Mapping[str, Sequence[Run]]:
     """The `standing` runs by the key of each job that asked for them.
 
     A job has several if its settings fit scenes in different folders.

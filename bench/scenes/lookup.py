@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 from unicodedata import normalize
 
 from bench.errors import unexpected
+from bench.kinds import Names
 from bench.types import Log
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -62,7 +63,7 @@ def _children(folder: Path | None) -> list[Path]:
         return []
 
 
-def find_all(root: Path, names: Sequence[str]) -> list[Path | None]:
+def find_all(root: Path, names: Names) -> list[Path | None]:
     """The picture of each of `names` from the folder `root`; None if there is none.
 
     It is called like that, perhaps with "/" for "\\"; or in another case of letters, or with an
@@ -96,7 +97,7 @@ def find_all(root: Path, names: Sequence[str]) -> list[Path | None]:
 
 def report(
     root: Path,
-    names: Sequence[str],
+    names: Names,
     files: Sequence[Path | None],
     where: str,
     log: Log,

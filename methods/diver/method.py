@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from bench.kinds import Sizes
 from bench.study import Axis, Study, Variant, turned
 from bench.types import Budget, Probe, Rays, Scene
 from methods.diver.kernels.segments import Corners, Layers, render_segments
@@ -53,7 +54,7 @@ class Baked:
         )
         self.across, self.view_bias = across.clone(), decoder.view.bias + along @ bias[1:]
 
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         """Bytes of the features, of a bit per cell that marks voxels, and of the decoder."""
         decoder = (*vars(self.layers).values(), self.across, self.view_bias)
         return {
@@ -125,5 +126,5 @@ class Diver(Student):
 
         return self.baked.occupancy, render
 
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         return self.baked.sizes()

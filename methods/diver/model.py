@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.types import Rays
+from bench.types import Rays, TwoTensors
 from methods.diver.kernels.segments import segment_weights
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.corner_gather import corner_gather
@@ -33,14 +33,14 @@ class Decoder(nn.Module):
         self.view = Dense(CHANNELS + DIRECTION_CHANNELS, CHANNELS, "fp32", generator)
         self.colour = Dense(CHANNELS, 3, "fp32", generator)
 
-    def density(self, features: Tensor) -> tuple[Tensor, Tensor]:
+    def density(self, features: Tensor) -> TwoTensors:
         """Density [S], integrated over the segment, before its ReLU; and what `colours` needs
         [S, 32]."""
         hidden = self.second(self.first(features).relu()).relu()
         sigma, geometry = self.third(hidden).split((1, CHANNELS), dim=1)
         return sigma.squeeze(1), geometry
 
-    def view_parts(self) -> tuple[Tensor, Tensor]:
+    def view_parts(self) -> TwoTensors:
         """Weights of the geometry [32, 32] and of the direction [32, 27] in the layer `view`."""
         return self.view.weight.split((CHANNELS, DIRECTION_CHANNELS), dim=1)
 

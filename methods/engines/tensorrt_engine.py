@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from bench.errors import SteerbenchError, Unavailable
+from bench.kinds import Values
 from bench.types import Log
 from methods import engines
 from methods.engines import Built, Calibration, Engine, Folder, Precision, Samples
@@ -134,7 +135,7 @@ def _quantise(exported: Path, samples: Sequence[Tensor], path: Path, *, uncalibr
     )
 
 
-def _fixed_ranges(prepared: Path) -> dict[str, Any]:
+def _fixed_ranges(prepared: Path) -> Values:
     """Options of the quantiser that set the ranges of `engines.largest`, whatever the samples
     contain. A tensor padded with zeros keeps its range."""
     import onnx

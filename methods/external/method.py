@@ -21,6 +21,7 @@ import numpy as np
 import torch
 
 from bench.errors import SteerbenchError, explained, some, unexpected
+from bench.kinds import Labels, Named, Sizes, Texts, Values
 from bench.provenance import code_sha256, computed_by, files_at, sums_of
 from bench.records import read_record
 from bench.results import content_key
@@ -32,7 +33,7 @@ from methods.external.worker import Header, Worker
 
 WORKERS = Path(__file__).with_name("workers")  # those that come with steerbench
 
-UNTOLD: dict[str, Any] = {
+UNTOLD: Values = {
     **{"device": "cpu", "precision": "unknown", "memory": 0},
     **{"can": [], "knobs": {}, "files": [], "packages": {}},
 }
@@ -46,9 +47,9 @@ class External:
 
     command: str
     python: str | None
-    options: Mapping[str, Any]
+    options: Named
     files: list[str]
-    environment: Mapping[str, str]
+    environment: Labels
     lock: str | None
     folders: list[str]
     start_s: float
@@ -134,7 +135,7 @@ class External:
             raise SteerbenchError(f"method.lock: {self.lock}: {why}") from error
         return {"lock": done.stdout}
 
-    def settings(self) -> dict[str, str]:
+    def settings(self) -> Texts:
         """What rows show, and a hash of its environment for the key of a run."""
         device, precision = self._about["device"], self._about["precision"]
         if device != "cpu" and not (device.startswith("cuda") and torch.cuda.is_available()):
@@ -290,7 +291,7 @@ class External:
     def _expect(self, holds: bool, expected: str, got: object) -> None:
         self._worker.expect(holds, "render", expected, got)
 
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         """The bytes of its components. Asked last: what it has loaded meanwhile is known now."""
         told, _ = self._worker.ask("sizes", self.frame_s, {})
         sizes: Any = told.get("sizes")

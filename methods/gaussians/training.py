@@ -15,7 +15,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from bench.cameras import place_camera, scale_camera
-from bench.types import Camera, NullProbe, Scene, composite
+from bench.kinds import Numbers
+from bench.types import Camera, NullProbe, Scene, TwoTensors, composite
 from methods.gaussians.kernels.projection import covariances
 from methods.gaussians.kernels.ssim import ssim
 from methods.gaussians.model import Gaussians
@@ -92,7 +93,7 @@ class GaussianTraining(loop.Training):
         groups = [{"params": [parameter], "lr": rate} for parameter, rate in rates]
         return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
-    def advance(self) -> dict[str, float]:
+    def advance(self) -> Numbers:
         options = self.options
         gaussians = self.gaussians
         share = self.step / self.steps
@@ -185,7 +186,7 @@ class GaussianTraining(loop.Training):
 
 def on_surfaces(
     teacher: TrainedField, scene: Scene, count: int, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
+) -> TwoTensors:
     """Choose `count` points where rays of random training pixels end, and their colours: [count, 3]
     each. If the pictures show too little matter, points are taken more than once."""
     field = teacher.field
@@ -207,7 +208,7 @@ def on_surfaces(
     return torch.cat(points)[index], torch.cat(colours)[index].clamp(0, 1)
 
 
-def anywhere(scene: Scene, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def anywhere(scene: Scene, count: int, generator: torch.Generator) -> TwoTensors:
     """Draw `count` points uniformly inside the bounds of `scene`, with random colours."""
     low, high = scene.bounds.to(generator.device)
     unit, colours = torch.rand(2, count, 3, generator=generator, device=generator.device)
@@ -251,7 +252,7 @@ def relocate(
     return len(dead)
 
 
-def shared_between(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
+def shared_between(opacities: Tensor, copies: Tensor) -> TwoTensors:
     """Opacity of each of `copies` [N] Gaussians that replace one of `opacities` [N], and the factor
     on its scales (Eq. 9): 1 - (1 - o_new)^n = o, and the factor keeps the integral of the opacity
     along a ray through the centre."""

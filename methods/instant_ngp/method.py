@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from bench.cameras import place_camera
+from bench.kinds import Sizes
 from bench.study import Study, turned
 from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
@@ -52,5 +53,5 @@ class InstantNgp(OnField):
         render = everywhere(field, occupancy, probe, sampling)
         return render_frame(camera, occupancy, self.background, probe, render).picture()
 
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         return self.trained.sizes()

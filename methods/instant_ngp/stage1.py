@@ -2,10 +2,11 @@
 
 import math
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Self
+from typing import Self
 
 import torch
 
+from bench.kinds import Sizes, Texts, Values
 from bench.provenance import computed_by
 from bench.types import DEVICE, Budget, Log, Scene
 from methods.instant_ngp.field import FieldPrecision, HashField
@@ -59,7 +60,7 @@ class Setup:
         """Random numbers of the seed."""
         return torch.Generator(device).manual_seed(self.seed)
 
-    def settings(self, method: type) -> dict[str, str]:
+    def settings(self, method: type) -> Texts:
         """What a row of `method` shows of how it ran, of one without a 2D network."""
         multiplied = self.precision == "fp32" or multiplies_bf16(self.device.type)
         return {
@@ -113,10 +114,10 @@ class OnField(Checked):
     def reset(self) -> None:
         """Do nothing: every frame stands alone."""
 
-    def settings(self) -> dict[str, str]:
+    def settings(self) -> Texts:
         return self.setup.settings(type(self))
 
-    def decided(self, scene: Scene) -> dict[str, Any]:
+    def decided(self, scene: Scene) -> Values:
         """What settings that are left to the scene become for it, by the names that one types."""
         return {"method.grid.log2_table": self.setup.suited(scene).grid.log2_table}
 
@@ -137,7 +138,7 @@ class TrainedField:
         """Where the field may hold matter."""
         return self.grid.occupancy
 
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         """Bytes of table, networks and occupancy bits."""
         return self.field.sizes() | {"occupancy": self.occupancy.cells.numel() // 8}
 

@@ -9,7 +9,8 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from bench.types import Budget, Rays, Scene, SteerbenchError
+from bench.kinds import Numbers
+from bench.types import Budget, Rays, Scene, SteerbenchError, TwoTensors
 from methods.instant_ngp.field import HashField
 from methods.instant_ngp.pixels import REFRESHED, ErrorMap, PixelBatches
 from methods.kernels.adam import AdamState, hash_adam_
@@ -119,7 +120,7 @@ class PixelTraining(loop.Training, ABC):
         """The learning rate of the next step."""
         return self.options.rate * loop.cosine(self.step / self.steps, self.options.final_rate)
 
-    def advance(self) -> dict[str, float]:
+    def advance(self) -> Numbers:
         numbers, alike = self._numbers()
         rays, colours = self.batches.at(numbers)
         target, background = self._target(colours)
@@ -151,7 +152,7 @@ class PixelTraining(loop.Training, ABC):
         alike = self.batches.choose(self.rays - wrong, self.generator)
         return torch.cat((alike, self.errors.draw(wrong, self.generator))), len(alike)
 
-    def _target(self, colours: Tensor) -> tuple[Tensor, Tensor]:
+    def _target(self, colours: Tensor) -> TwoTensors:
         """Composite colours on a background; also return that background, [3] or [R, 3]."""
         background, generator = self.background, self.generator
         solid = colours.shape[-1] == 3
@@ -197,7 +198,7 @@ class FieldTraining(PixelTraining):
         self.rays = options.rays or self.rays
         self.optimiser = FieldOptimiser(field)
 
-    def advance(self) -> dict[str, float]:
+    def advance(self) -> Numbers:
         if self.step % EVERY == 0:
             times = 4 if self.step < GRID_YOUTH_STEPS else 1
             self.grid.update(self.field, self.generator, times * self.options.grid_samples)

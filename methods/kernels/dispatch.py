@@ -13,13 +13,14 @@ from typing import Any
 import torch
 
 from bench.errors import Unavailable
+from bench.kinds import Texts
 from bench.provenance import sources
 
 BACKENDS = ("reference", "cpu", "gpu")
 
 
 @cache
-def availability() -> dict[str, str]:
+def availability() -> Texts:
     """For each backend, "" if it can be used here, otherwise why not and how to get it."""
     reasons = dict.fromkeys(BACKENDS, "")
     if importlib.util.find_spec("triton") is None:

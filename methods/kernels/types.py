@@ -16,7 +16,7 @@ from scipy.ndimage import distance_transform_cdt
 from torch import Tensor
 from torch.nn import functional
 
-from bench.types import Rays, check_shape, rows
+from bench.types import Rays, ThreeTensors, check_shape, rows
 
 BRICK = 4  # cells along the side of a brick; its 64 cells are one word of `Occupancy.words`
 
@@ -208,7 +208,7 @@ class Pixels:
             column.index_copy_(0, index, new)  # a row at a time; `x[index]` goes number by number
 
     @property
-    def columns(self) -> tuple[Tensor, Tensor, Tensor]:
+    def columns(self) -> ThreeTensors:
         """Values, depth sums and opacities."""
         return self.values, self.depth_sum, self.alpha
 

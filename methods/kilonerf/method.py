@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench.types import Budget, Scene
+from bench.types import Budget, Scene, TwoTensors
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.settings import Count, NotNegative, between
 from methods.kilonerf.field import Grid, KiloField, Pieces, place_networks
@@ -40,7 +40,7 @@ class KiloTraining(StudentTraining):
     def _places(self) -> Tensor:
         return self.pieces.draw(self.options.points_each, self.generator)
 
-    def _learned(self, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    def _learned(self, positions: Tensor, directions: Tensor) -> TwoTensors:
         """As in the base class, with a density that may fall below 0."""
         thickness, geometry = self.field.raw_density(positions)
         encoded = self.field.encode_directions(directions)

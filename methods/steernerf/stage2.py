@@ -7,6 +7,7 @@ import torch
 from torch.nn import functional
 
 from bench.errors import SteerbenchError
+from bench.kinds import Numbers
 from bench.memory import MemoryMeter
 from bench.provenance import digest, libraries
 from bench.types import Budget, Log, Scene
@@ -119,7 +120,7 @@ class JointTraining(loop.Training):
         others = [x for x in parameters if x.dim() != 4]
         return {"adam": torch.optim.Adam(others, lr=rate, fused=True), "muon": Muon(weights, rate)}
 
-    def advance(self) -> dict[str, float]:
+    def advance(self) -> Numbers:
         """Take one step; return the error of the pictures. The density grid follows the field."""
         if self.trained and self.options.grid_samples and self.step % EVERY == 0:
             grid = self.trained.grid

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.types import Budget, Log, Probe, Rays, Scene
+from bench.kinds import Numbers, Sizes
+from bench.types import Budget, Log, Probe, Rays, Scene, TwoTensors
 from methods.instant_ngp.stage1 import TrainedField
 from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.settings import Share, SomeShare
@@ -55,7 +56,7 @@ class StudentField(nn.Module, Field):
         return next(self.parameters()).device
 
     @abstractmethod
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         """Bytes by component."""
 
 
@@ -94,7 +95,7 @@ class FieldStudent(Student):
     def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
         return self.occupancy, everywhere(self.field, self.occupancy, probe, self.how)
 
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         return self.field.sizes() | {"occupancy": self.occupancy.cells.numel() // 8}
 
 
@@ -116,7 +117,7 @@ class StudentTraining(PixelTraining):
         parameters = self.field.parameters()
         self.optimiser = torch.optim.Adam(parameters, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
-    def advance(self) -> dict[str, float]:
+    def advance(self) -> Numbers:
         """Take one step; return its mean squared error, of opacities and colours or of pixels."""
         if self.step >= self.points_until:
             return super().advance()
@@ -146,7 +147,7 @@ class StudentTraining(PixelTraining):
         apart = (colour - shown).square().sum(dim=1)
         return functional.mse_loss(opacity, wanted) + (wanted * apart).mean()
 
-    def _learned(self, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    def _learned(self, positions: Tensor, directions: Tensor) -> TwoTensors:
         """The opacity [S] over `REACH` and colour [S, 3] that are compared with the teacher's."""
         return _seen(self.field, positions, directions)
 
@@ -172,7 +173,7 @@ class StudentTraining(PixelTraining):
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
 
 
-def _seen(field: Field, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+def _seen(field: Field, positions: Tensor, directions: Tensor) -> TwoTensors:
     """Opacity [S] over `REACH` and colour [S, 3] of points."""
     sigma, geometry = field.density(positions)
     colour = field.features(geometry, field.encode_directions(directions))[:, :3]

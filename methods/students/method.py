@@ -1,7 +1,6 @@
 """A method whose model starts from a trained field, then learns from the photos."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import ClassVar
@@ -10,6 +9,7 @@ import torch
 
 from bench.cameras import place_camera
 from bench.errors import unexpected
+from bench.kinds import Labels, Sizes, Texts
 from bench.provenance import computed_by
 from bench.study import Study, turned
 from bench.threads import torch_threads
@@ -40,7 +40,7 @@ class Student(Checked, ABC):
     memory, train_s = 0, 0.0
     kind: ClassVar[str]  # name of its trained stage, for example "nerf"
     model: ClassVar[tuple[str, ...]] = ()  # its settings that its training depends on
-    computed: ClassVar[Mapping[str, str]] = {}  # what rows say of it but not of its teacher
+    computed: ClassVar[Labels] = {}  # what rows say of it but not of its teacher
     contracts: ClassVar[bool] = True  # whether it can be trained in contracted space
     study = Study(
         knobs={"stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3"))},
@@ -62,7 +62,7 @@ class Student(Checked, ABC):
         """The cells that may show anything, and what renders the pixels that may see them."""
 
     @abstractmethod
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         """Bytes of what is rendered, by component."""
 
     @torch.no_grad()
@@ -101,5 +101,5 @@ class Student(Checked, ABC):
     def reset(self) -> None:
         """Do nothing: every frame stands alone."""
 
-    def settings(self) -> dict[str, str]:
+    def settings(self) -> Texts:
         return {**self.teacher.settings(type(self)), **self.computed}

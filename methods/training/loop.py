@@ -10,10 +10,11 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor
 
+from bench.kinds import Numbers
 from bench.memory import MemoryMeter
 from bench.provenance import digest
 from bench.sharing import missing
-from bench.types import Log, SteerbenchError
+from bench.types import Log, SteerbenchError, TwoTensors
 from methods.training import checkpoint
 
 LOOK_EVERY = 10
@@ -21,7 +22,7 @@ LOOK_EVERY = 10
 
 CHECKPOINT_S = 20.0  # seconds between checkpoints: the most that a killed training loses
 
-Asked = Callable[[], dict[str, float]]
+Asked = Callable[[], Numbers]
 """Tells the errors of a step, by label; the host waits if they have not arrived yet."""
 
 
@@ -107,7 +108,7 @@ def _drive(training: Training, finished: Path, label: str, log: Log) -> None:
         log.info(f"going on from step {training.step} of {unfinished}")
     saved = time.monotonic()
     began = saved - training.seconds
-    means: dict[str, float] = {}
+    means: Numbers = {}
     with log.progress(label, training.steps) as progress:
         progress.advance(training.step)
         while training.step < training.steps:
@@ -153,7 +154,7 @@ def load(training: Training, path: Path, done: bool = False) -> None:
 
 def look(
     training: Training, errors: Callable[[], checkpoint.Tensors], tensors: checkpoint.Tensors
-) -> dict[str, float]:
+) -> Numbers:
     """Return the `errors` of a step as numbers; raise `SteerbenchError` if one is not finite, with
     the names of the `tensors` that are not. On a GPU this happens every `LOOK_EVERY` steps, with
     the errors that were requested the time before, which have arrived meanwhile; in all other steps
@@ -180,7 +181,7 @@ def _ask(errors: checkpoint.Tensors) -> Asked:
     if together.device.type == "cuda":
         arrived = torch.cuda.current_stream(together.device).record_event()
 
-    def tell() -> dict[str, float]:
+    def tell() -> Numbers:
         if arrived is not None:
             arrived.synchronize()
         return dict(zip(labels, values.tolist(), strict=True))
@@ -199,7 +200,7 @@ def check_finite(training: Training, more: checkpoint.Tensors | None = None) -> 
         )
 
 
-def as_known(picture: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+def as_known(picture: Tensor, truth: Tensor) -> TwoTensors:
     """Both, alike and without a gradient where the truth is NaN: there, pixels do not count."""
     unknown, shown = truth.isnan(), picture.detach()
     return shown.where(unknown, picture), shown.where(unknown, truth)

@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -18,6 +17,7 @@ from bench.case import failed, run_cases, timed_rows
 from bench.console import ConsoleLog
 from bench.convergence import experiment_rows
 from bench.errors import SteerbenchError
+from bench.kinds import Values
 from methods import checks
 from methods.kernels import compiled
 from methods.trial import tried_again
@@ -39,7 +39,7 @@ NEAREST = 5  # cases of `stress` that are also shown by themselves
 
 EXPERIMENTS = ("computed", "knob", "setting", "largest error ↓", "ms ↓", "observed order")
 
-Row = dict[str, Any]
+Row = Values
 
 
 def main(options: argparse.Namespace) -> int:

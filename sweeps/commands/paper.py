@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from bench.errors import SteerbenchError, some
+from bench.kinds import Words
 from bench.results import Store, existing_store
 from reports import export
 from reports.paper_page import write_paper_page
@@ -55,7 +56,7 @@ def main(options: argparse.Namespace) -> int:
     return int(any(each.failed for each in ended))
 
 
-def data_set(words: Sequence[str]) -> tuple[list[str], DataSet | None]:
+def data_set(words: Words) -> tuple[list[str], DataSet | None]:
     """The settings among `words`, and the data set if one of them names it (data=DIR).
 
     SteerbenchError if another word names a scene, or the data set has no scenes.

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from bench.case import U32, Bound, Case, Given, Operation, Property, Random, on_backends
+from bench.types import TwoTensors
 from methods.kernels.adam import BETAS, AdamState, hash_adam_, sparse_adam_
 from methods.kernels.dispatch import served
 from methods.kernels.encode import HashGrid, SampleGradients, encode, pack
@@ -117,7 +118,7 @@ def _hashed(samples: int, features: int) -> Given:
 
 def _hash_steps(
     table: Tensor,
-    steps: Sequence[tuple[Tensor, Tensor]],
+    steps: Sequence[TwoTensors],
     grid: HashGrid,
     most: float,
     backend: str,
