@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from bench.clock import times_ms
-from bench.kinds import Named, Names, Row
-from bench.types import Log, Unavailable
+from bench.kinds import Named, Names, Row, Rows
+from bench.types import Log, SomeTensors, Unavailable
 
 Cell = tuple[str, str]  # a backend or an engine, and a precision
 Computation = Callable[[str], tuple[Tensor, ...]]  # computes the outputs with a backend
@@ -118,6 +118,9 @@ class Case:
         }
 
 
+Cases = list[Case]
+
+
 @dataclass(frozen=True)
 class Property:
     """A property that several cases check, with the same tolerances; see `Case`."""
@@ -177,7 +180,7 @@ class Operation:
         *settings: object,
         precision: str = "fp32",
         items: int = 0,
-    ) -> list[Case]:
+    ) -> Cases:
         """The cases with the inputs that `make` makes of `settings` on the CPU: one of the outputs
         and, if there are gradients, one of outputs and gradients. They are timed if `items`, the
         number that a call processes, is at least `LEAST_TIMED`."""
@@ -248,7 +251,7 @@ class Operation:
         return [bound.of(given) for bound in bounds]
 
 
-def _several(value: Tensor | Sequence[Tensor]) -> Sequence[Tensor]:
+def _several(value: Tensor | SomeTensors) -> SomeTensors:
     return [value] if isinstance(value, Tensor) else value
 
 
@@ -280,7 +283,7 @@ def on_backends(
 
 
 def nearest(
-    results: Sequence[Tensor], reference: Sequence[Tensor], tolerances: Sequence[Tolerance]
+    results: SomeTensors, reference: SomeTensors, tolerances: Sequence[Tolerance]
 ) -> Deviation:
     """The error of that number of all results which is nearest to its tolerance, or exceeds it by
     the largest factor; inf if shapes or non-finite values differ."""
@@ -298,7 +301,7 @@ def nearest(
     return worst
 
 
-def largest_error(results: Sequence[Tensor], reference: Sequence[Tensor]) -> float:
+def largest_error(results: SomeTensors, reference: SomeTensors) -> float:
     """Largest |result - reference| over all outputs; inf if shapes or non-finite values differ."""
     return nearest(results, reference, [1.0] * len(results)).error
 
@@ -331,7 +334,7 @@ def failed(row: Named) -> bool:
 
 def timed_rows(
     cases: Sequence[Case], device: str, backends: Collection[str], repeats: int, log: Log
-) -> list[Row]:
+) -> Rows:
     """Check the cases and time the correct ones; one row per timed case and supported backend.
 
     A backend that fails any case of a kernel, timed or not, is not timed; its status names these
@@ -340,7 +343,7 @@ def timed_rows(
     """
     subjects = {case.subject for case in cases if case.timed}
     checked = [case for case in cases if case.subject in subjects and not case.slow]
-    results: list[tuple[Case, Difference, list[Row]]] = []
+    results: list[tuple[Case, Difference, Rows]] = []
     wrong: dict[tuple[str, str], list[str]] = {}
     with log.progress("kernels", len(checked) + sum(bool(c.timed) for c in checked)) as progress:
         for case in checked:

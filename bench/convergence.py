@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bench.clock import times_ms
-from bench.kinds import Row
+from bench.kinds import Rows
 from bench.types import Log
 
 
@@ -33,7 +33,7 @@ class Experiment:
 
 
 @torch.no_grad()
-def experiment_rows(experiments: Sequence[Experiment], repeats: int, log: Log) -> list[Row]:
+def experiment_rows(experiments: Sequence[Experiment], repeats: int, log: Log) -> Rows:
     """Run the experiments; one row for each trial: its largest absolute error, median and extremes
     of `repeats` times, and the observed order, fitted on the `smooth` settings."""
     rows = []

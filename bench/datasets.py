@@ -6,14 +6,13 @@
 import tempfile
 import tomllib
 import zipfile
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 from bench.download import fetch
 from bench.errors import unexpected
-from bench.kinds import Labels, Texts
+from bench.kinds import AnyPath, Labels, Names, Texts
 from bench.scenes.files import data_folder
 from bench.sharing import file_sha256, locked
 from bench.threads import in_parallel
@@ -100,10 +99,10 @@ def _wrong(folder: Path, wanted: Labels) -> list[str]:
 class VerifyReport:
     """A copy of a data set, compared with its registry: files by their path in the release."""
 
-    ok: Sequence[str]
-    wrong: Sequence[str]  # of other content, or cannot be read
-    missing: Sequence[str]
-    extra: Sequence[str]  # not on the list
+    ok: Names
+    wrong: Names  # of other content, or cannot be read
+    missing: Names
+    extra: Names  # not on the list
 
     @property
     def passed(self) -> bool:
@@ -114,7 +113,7 @@ class VerifyReport:
         return ", ".join(f"{len(names)} {kind}" for kind, names in vars(self).items())
 
 
-def verify(path: str | Path, log: Log) -> VerifyReport:
+def verify(path: AnyPath, log: Log) -> VerifyReport:
     """Check the whole release, or one scene of it, by its name; raises if `path` is neither."""
     root = data_folder(path)
     base, expected = _expected(root)

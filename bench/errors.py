@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from bench.kinds import Names
+from bench.kinds import AnyPath, Names
 
 NAMED = 5  # an error names at most this many things and gives the number of the rest
 
@@ -24,7 +24,7 @@ class Unavailable(SteerbenchError):
     """Something asked for by name cannot be used here; the message says why and how to get it."""
 
 
-def unexpected(where: str | Path, expected: str, got: object) -> SteerbenchError:
+def unexpected(where: AnyPath, expected: str, got: object) -> SteerbenchError:
     """The error that says what was expected at `where` (an option; a file and its field)."""
     return SteerbenchError(f"{where}: expected {expected}, got {got}")
 
@@ -68,6 +68,11 @@ def some(names: Names) -> str:
     """The first of `names`, and how many more there are."""
     further = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return ", ".join(names[:NAMED]) + further
+
+
+def reason(error: BaseException) -> str:
+    """The message of `error` in one line."""
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 def install_command(extra: str) -> str:

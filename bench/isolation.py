@@ -17,6 +17,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ import numpy as np
 import torch
 from PIL import ImageFile
 
-from bench.kinds import Say, Texts, Values
+from bench.kinds import Json, Say, Texts, Values
 from bench.provenance import is_edited
 from bench.threads import in_parallel
 from bench.types import Budget, Camera, Log, Method, Scene, SteerbenchError
@@ -189,14 +190,6 @@ def _set_autocast(kinds: list[bool]) -> None:
         torch.set_autocast_enabled(kind, enabled)
 
 
-def _set_onednn(enabled: bool) -> None:
-    torch.backends.mkldnn.enabled = enabled  # type: ignore[assignment]
-
-
-def _set_truncated(allowed: bool) -> None:
-    ImageFile.LOAD_TRUNCATED_IMAGES = allowed
-
-
 def _set_collection(enabled: bool) -> None:
     (gc.enable if enabled else gc.disable)()
 
@@ -204,10 +197,6 @@ def _set_collection(enabled: bool) -> None:
 def _set_cudnn(values: list[Any]) -> None:
     for name, value in zip(CUDNN, values, strict=True):
         setattr(torch.backends.cudnn, name, value)
-
-
-def _set_cores(cores: set[int]) -> None:
-    os.sched_setaffinity(0, cores)
 
 
 SETTERS: Mapping[str, Callable[[Any], object]] = {
@@ -218,8 +207,8 @@ SETTERS: Mapping[str, Callable[[Any], object]] = {
     "torch's precision of products": torch.set_float32_matmul_precision,
     "torch's deterministic mode": torch.set_deterministic_debug_mode,
     "torch's autocast": _set_autocast,
-    "torch's use of oneDNN": _set_onednn,
-    "Pillow's reading of truncated files": _set_truncated,
+    "torch's use of oneDNN": partial(setattr, torch.backends.mkldnn, "enabled"),
+    "Pillow's reading of truncated files": partial(setattr, ImageFile, "LOAD_TRUNCATED_IMAGES"),
     "collection of garbage": _set_collection,
     "the interval of switching threads": sys.setswitchinterval,
     "cuDNN's options": _set_cudnn,
@@ -230,11 +219,11 @@ SETTERS: Mapping[str, Callable[[Any], object]] = {
     "sys.argv": _set_words,
     "handlers of signals": _set_handlers,
     "filters of warnings": _set_warnings,
-    "the cores of this process": _set_cores,
+    "the cores of this process": partial(os.sched_setaffinity, 0),
 }
 """What sets each part of `_state` again."""
 
-USUAL: Mapping[str, object] = {
+USUAL: Json = {
     "torch's default type": torch.float32,
     "torch's default device": None,
     "torch's recording of gradients": True,

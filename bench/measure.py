@@ -21,7 +21,7 @@ from torch import Tensor
 from bench.clock import FrameRecord, StageClock, counted
 from bench.errors import unexpected
 from bench.isolation import Guard, Isolated, check_originals, fit, lent, moved, sees_scored
-from bench.kinds import Labels, Names, Numbers, Row, Values
+from bench.kinds import Labels, Names, Numbers, Rows, Values
 from bench.memory import MemoryMeter, give_back
 from bench.metrics import Lpips, psnr_of_mse
 from bench.neighbours import Neighbours, Watch
@@ -149,7 +149,7 @@ class _Take:
             _shown(task),
             task.scene.surface,
         )
-        self.rows: list[Row] = []  # of the first round
+        self.rows: Rows = []  # of the first round
         # Of its steady frames with a ground truth, how far they are from the first method's: MSE,
         # and largest difference of any channel.
         self.apart: list[tuple[float, float]] = []
@@ -232,17 +232,13 @@ def _measurement(
     take: _Take, task: Task, missing: Labels, neighbours: Neighbours, in_turns: int
 ) -> Measurement:
     """What was measured of one of `in_turns` methods."""
-    scene = task.scene
-    trajectory = task.trajectory
-    protocol = task.protocol
-    budget = task.budget
-    method = take.method
-    scoring = take.scoring
+    scene, trajectory, protocol = task.scene, task.trajectory, task.protocol
+    method, scoring = take.method, take.scoring
     peak_bytes, source = take.peak(in_turns)
     records, means = take.timed(len(take.clock.frames) - protocol.rounds * len(take.rows))
     rows_of_frames = [row | _costs(timed) for row, timed in zip(take.rows, records, strict=True)]
     frames = _frame_table(rows_of_frames, scoring.names)
-    summary: list[Row] = []
+    summary: Rows = []
     for phase in (STEADY, COLD):
         of_phase = frames[frames["phase"] == phase]
         if len(of_phase):
@@ -268,14 +264,14 @@ def _measurement(
         trajectory=trajectory.name,
         resolution=trajectory.resolution,
         protocol=protocol.name,
-        budget=budget.name,
+        budget=task.budget.name,
         seed=task.seed,
         **facts,
     )
     known = [row["metric"] for row in summary if row["n"]]
     record: Values = {
         "protocol": asdict(protocol),
-        "budget": asdict(budget),
+        "budget": asdict(task.budget),
         "scene": {"name": scene.name, "digest": scene.digest, "unit_length": scene.unit_length},
         "parts": dict(study_of(method).parts),
         "missing": {**missing, **scoring.missing(known)},
@@ -291,24 +287,23 @@ def _measurement(
 
 def _sizes(method: Method) -> Numbers:
     """The bytes of each component of `method`, and of all; none if it tells none."""
-    sizes = method.sizes()
-    found: Numbers = {}
-    for part, size in sizes.items():
-        found[f"size_bytes.{part}"] = counted(f"{method.name}: size of {part}", size)
+    found: Numbers = {
+        f"size_bytes.{part}": counted(f"{method.name}: size of {part}", size)
+        for part, size in method.sizes().items()
+    }
     return found | {"size_bytes.total": sum(found.values())} if found else {}
 
 
 def _costs_of_training(method: Method) -> Numbers:
     """Seconds and peak memory of the training, and the seconds of compiling if that was needed."""
-    found: Numbers = {}
-    found["train_s"] = method.train_s
-    found["train_peak_bytes"] = getattr(method, "train_peak_bytes", math.nan)
-    seconds = getattr(method, "compile_s", 0.0)
-    if seconds:
+    found: Numbers = {
+        "train_s": method.train_s,
+        "train_peak_bytes": getattr(method, "train_peak_bytes", math.nan),
+    }
+    if seconds := getattr(method, "compile_s", 0.0):
         found["compile_s"] = seconds
     for name, value in found.items():
-        known = not math.isnan(value)
-        if known and not 0 <= value < math.inf:
+        if value < 0 or value == math.inf:
             raise unexpected(f"{method.name}: {name}", "0 or more, or NaN: not known", value)
     return found
 
@@ -332,7 +327,7 @@ def _doubted_times(records: Sequence[FrameRecord]) -> str:
     )
 
 
-def _waits(of_frames: Sequence[Counter[CodeLine]]) -> list[Row]:
+def _waits(of_frames: Sequence[Counter[CodeLine]]) -> Rows:
     """Where the host waits for the GPU in a steady frame, the most frequent first."""
     return [
         {"waits": count / len(of_frames), "line": line.place, "source": line.source}
@@ -482,7 +477,7 @@ def _costs(record: FrameRecord) -> Numbers:
     }
 
 
-def _frame_table(table: list[Row], scores: Names) -> pd.DataFrame:
+def _frame_table(table: Rows, scores: Names) -> pd.DataFrame:
     """One row per frame; missing stages and counters are 0, missing scores NaN."""
     frames = pd.DataFrame(table)
     touched = [name for name in map(str, frames) if name.startswith(("stage_ms.", "work."))]

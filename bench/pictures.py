@@ -5,7 +5,7 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from glob import glob
 from pathlib import Path
@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from bench.errors import not_there, some, unexpected
-from bench.kinds import Named, Names, Row
+from bench.kinds import Named, Names, Rows, Size
 from bench.metrics import Lpips, check_size
 from bench.protocol import EvaluationProtocol
 from bench.results import STEADY, Measurement, read_table
@@ -26,7 +26,7 @@ from bench.scenes.images import contents, decode_bytes
 from bench.scenes.lookup import natural
 from bench.scoring import PICTURES, Scoring
 from bench.trajectories import resolution, spread
-from bench.types import BACKGROUNDS, Camera, Log, Split, SteerbenchError, composite
+from bench.types import BACKGROUNDS, ByCamera, Camera, Log, Split, SteerbenchError, composite
 
 SUFFIXES = (
     ".png", ".jpg", ".jpeg", ".webp", ".avif", ".bmp", ".gif", ".jp2", ".ppm", ".tif", ".tiff",
@@ -171,7 +171,7 @@ def score(
     *,
     sequence: bool = False,
     kept: int = PICTURES,
-    surface: Callable[[Camera], Tensor] | None = None,
+    surface: ByCamera | None = None,
     times: Sequence[float] = (),
 ) -> Measurement:
     """Score pictures under a protocol, on whose background any alpha is composited.
@@ -183,8 +183,8 @@ def score(
     """
     background = torch.full((3,), BACKGROUNDS[protocol.background])
     scoring = Scoring(protocol, lpips, background, spread(len(pairs), kept), surface)
-    frames: list[Row] = []
-    sizes: list[tuple[int, int]] = []
+    frames: Rows = []
+    sizes: list[Size] = []
     alphas = 0
     seen, truths = hashlib.sha256(), hashlib.sha256()
     with log.progress("scoring", len(pairs)) as progress:

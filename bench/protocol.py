@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bench import metrics, video_metrics
 from bench.errors import unexpected
-from bench.kinds import Numbers, Texts
+from bench.kinds import Names, Numbers, Texts
 from bench.provenance import sha256
 from bench.trajectories import Trajectory
 from bench.types import BACKGROUNDS, Log, Scene, SteerbenchError, Unavailable
@@ -63,7 +63,7 @@ class EvaluationProtocol:
             raise unexpected("protocol.columns", f"some of {', '.join(COLUMNS)}", [*self.columns])
 
     @property
-    def metric_names(self) -> tuple[str, ...]:
+    def metric_names(self) -> Names:
         """Names of the metrics that `score` returns, in the order of the table."""
         plain = ("psnr", "ssim", *(f"lpips_{net}" for net in self.lpips))
         corrected = [f"cc_{name}" for name in plain if self.colour_correction != "none"]

@@ -25,7 +25,10 @@ from types import CodeType, FunctionType, ModuleType
 from typing import Any, NamedTuple
 
 from bench.errors import SteerbenchError, unexpected
-from bench.kinds import Named, Texts
+from bench.kinds import Json, Named, Names, Texts
+from bench.records import without
+
+Stamp = tuple[int, ...]  # of a file, see `stamp`
 
 ROOT = Path(__file__).resolve().parent.parent
 OURS = ("bench", "methods")
@@ -79,7 +82,7 @@ def _commit_of(file: Path) -> str | None:
         return None
 
 
-def machine() -> dict[str, object]:
+def machine() -> Json:
     """The machine and its system, for the record of a run."""
     import torch  # imported here, because reading the store needs no torch
 
@@ -99,7 +102,7 @@ def machine() -> dict[str, object]:
     }
 
 
-def computed_by(*things: Any) -> dict[str, object]:
+def computed_by(*things: Any) -> Json:
     """What decides the results of `things` (classes or functions) beside their inputs, for keys."""
     record = machine()
     return {
@@ -107,7 +110,7 @@ def computed_by(*things: Any) -> dict[str, object]:
         "libraries": libraries(*things),
         "machine": {name: record[name] for name in ("cpu", "instructions", "gpus", "python")},
         "threads": record["threads"],
-        "environment": {name: of for name, of in _tuning().items() if name not in OF_TIMES},
+        "environment": without(_tuning(), OF_TIMES),
     }
 
 
@@ -173,14 +176,14 @@ def sums_of(places: Iterable[Path], where: str) -> list[str]:
     return sorted(code_sha256(file) for file in found)
 
 
-def stamp(path: Path) -> tuple[int, ...]:
+def stamp(path: Path) -> Stamp:
     """Times, size and number of a file: they change whenever its content does."""
     now = path.stat()
     return now.st_mtime_ns, now.st_ctime_ns, now.st_size, now.st_ino
 
 
 @cache
-def _sha256(path: Path, stamp: tuple[int, ...]) -> str:
+def _sha256(path: Path, stamp: Stamp) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -189,13 +192,13 @@ class _Module(NamedTuple):
     """What is known of a file of Python: the modules, and names from modules, that it imports
     anywhere in its code; SHA-256 of its syntax tree; whether it reads docstrings."""
 
-    imports: tuple[str, ...]
+    imports: Names
     sha256: str
     documented: bool = False
 
 
 @cache
-def _module(path: Path, stamp: tuple[int, ...]) -> _Module:
+def _module(path: Path, stamp: Stamp) -> _Module:
     content = path.read_bytes()
     in_bytes = hashlib.sha256(content).hexdigest()
     try:
@@ -363,7 +366,7 @@ def is_as_loaded(path: Path) -> bool:
 
 
 @cache
-def _is_compiled(path: Path, compiled: Path, *stamps: tuple[int, ...]) -> bool:
+def _is_compiled(path: Path, compiled: Path, *stamps: Stamp) -> bool:
     """Whether what Python has `compiled` of a file is what the file holds."""
     content = compiled.read_bytes()
     flags, time, size = struct.unpack("<4xIII", content[:16])
@@ -458,7 +461,7 @@ def _ours(name: str) -> list[Path]:
     return []
 
 
-def _imports(path: Path) -> tuple[str, ...]:
+def _imports(path: Path) -> Names:
     return _module(path, stamp(path)).imports if path.suffix == ".py" else ()
 
 

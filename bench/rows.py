@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from scipy import fft, special
 
-from bench.kinds import Names, Row
+from bench.kinds import Names, Row, Rows
 from bench.results import WHOLE
 
 CONFIDENCE = 0.95
@@ -28,7 +28,7 @@ def row_table(rows: Sequence[Row], **facts: Any) -> pd.DataFrame:
     return pd.DataFrame(rows).assign(unit=units, **facts)
 
 
-def phase_rows(frames: pd.DataFrame) -> list[Row]:
+def phase_rows(frames: pd.DataFrame) -> Rows:
     """Mean and interval of every column, quantiles of the frame time, frames per second.
 
     `frames` are at least one, in path order, with columns `frame`, `name` and `phase`, scores,
@@ -49,7 +49,7 @@ def phase_rows(frames: pd.DataFrame) -> list[Row]:
     ]
 
 
-def score_rows(frames: pd.DataFrame, scores: Names) -> list[Row]:
+def score_rows(frames: pd.DataFrame, scores: Names) -> Rows:
     """Mean and interval of each of `scores`; of the flicker only where a frame has one."""
     named = [name for name in scores if name != "flicker" or frames[name].notna().any()]
     return [mean_row(name, frames[name]) for name in named]

@@ -1,7 +1,7 @@
 """Scores of rendered frames by a protocol, one after the other, with pictures of some of them."""
 
 from collections import deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +12,7 @@ from bench import metrics, video_metrics
 from bench.errors import unexpected
 from bench.kinds import Numbers, Texts
 from bench.protocol import EvaluationProtocol
-from bench.types import Camera, Frame, SteerbenchError, composite
+from bench.types import ByCamera, Camera, Frame, SteerbenchError, composite
 
 PICTURES = 3  # default number of scored frames whose pictures are kept
 ERROR_RANGE = 0.1  # mean absolute error of the brightest colour of an error map
@@ -100,7 +100,7 @@ class Scoring:
         lpips: Mapping[str, metrics.Lpips],
         background: Tensor,
         shown: Collection[int],
-        surface: Callable[[Camera], Tensor] | None = None,
+        surface: ByCamera | None = None,
     ) -> None:
         self.images: dict[str, np.ndarray] = {}
         self._protocol, self._lpips, self._scored = protocol, lpips, 0

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from bench.kinds import Labels
+from bench.kinds import Labels, Names
 
 
 @dataclass(frozen=True)
@@ -12,7 +12,7 @@ class Variant:
     """A variant of a run: its `name`, and the `settings` of `steerbench run` that make it."""
 
     name: str
-    settings: tuple[str, ...] = ()
+    settings: Names = ()
 
 
 def turned(label: str, setting: str, values: Iterable[object], *more: str) -> list[Variant]:
@@ -44,7 +44,7 @@ class Study:
     # and those that need a training of their own.
     knobs: Mapping[str, Sequence[Variant]] = field(default_factory=dict)
     trained: Mapping[str, Sequence[Variant]] = field(default_factory=dict)
-    exact: tuple[str, ...] = ()  # settings that give up no accuracy of the trained model for speed
+    exact: Names = ()  # settings that give up no accuracy of the trained model for speed
     # By what is skipped, the setting that switches this skipping off with `false`; further savings,
     # each on top of all skips.
     skips: Labels = field(default_factory=dict)
@@ -53,7 +53,7 @@ class Study:
     # By stage, the part of a frame that it counts towards, with all stages nested in it; "network"
     # is the part that an engine computes. Other stages are parts of their own.
     parts: Labels = field(default_factory=dict)
-    chosen: tuple[str, ...] = ()  # the method's own settings that no training depends on
+    chosen: Names = ()  # the method's own settings that no training depends on
 
 
 def part_of(stage: str, parts: Labels) -> str:

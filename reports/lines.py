@@ -8,9 +8,18 @@ from typing import Any
 
 import pandas as pd
 
-from bench.kinds import Names, Say, Texts
+from bench.kinds import Choices, Names, Say, Texts
 from bench.results import COLUMNS, Store, content_key
-from reports.runs import Repeated, Run, grouped, over_common_frames, readable, unseeded
+from reports.runs import (
+    Repeated,
+    Run,
+    Runs,
+    TableLines,
+    grouped,
+    over_common_frames,
+    readable,
+    unseeded,
+)
 from reports.tables import QUALITY
 
 METHOD = "method"  # the first column
@@ -40,7 +49,7 @@ class Lines:
     with the value of each line.
     """
 
-    lines: Sequence[Repeated]
+    lines: TableLines
     settings: Settings
 
     @property
@@ -59,7 +68,7 @@ class Lines:
         return pd.DataFrame(figures)
 
 
-def as_lines(runs: Sequence[Run]) -> Lines:
+def as_lines(runs: Runs) -> Lines:
     """The lines of `runs`, over the frames that are steady in all of them.
 
     The label of a run is shown as its method.
@@ -84,7 +93,7 @@ def as_lines(runs: Sequence[Run]) -> Lines:
     return Lines(lines, settings)
 
 
-def differing(runs: Sequence[Run]) -> dict[str, list[str]]:
+def differing(runs: Runs) -> Choices:
     """What `varied` finds, under short names: the symbol of the paper, or the last part."""
     columns = varied(runs)
     symbols = {name: of for run in runs for name, of in run.record.get("axes", {}).items()}
@@ -100,7 +109,7 @@ def shortened(names: Names) -> Texts:
     }
 
 
-def varied(runs: Sequence[Run]) -> dict[str, list[str]]:
+def varied(runs: Runs) -> Choices:
     """The facts and the settings beside method and seed that differ between `runs`, with their
     values.
 

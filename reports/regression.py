@@ -33,7 +33,9 @@ class Limit:
         return f"{100 * self.relative:.4g} %" if self.relative else f"{self.absolute:.4g}"
 
 
-LIMITS: Mapping[str, Limit] = {
+Limits = Mapping[str, Limit]  # by metric
+
+LIMITS: Limits = {
     "psnr": Limit(1, absolute=0.1, unit="dB"),
     "ssim": Limit(1, absolute=0.002),
     **{f"lpips_{net}": Limit(-1, absolute=0.003) for net in NETS},
@@ -47,7 +49,7 @@ LIMITS: Mapping[str, Limit] = {
 """The metrics that are compared, unless a baseline has limits of its own."""
 
 
-def limited(words: Words, limits: Mapping[str, Limit] = LIMITS) -> dict[str, Limit]:
+def limited(words: Words, limits: Limits = LIMITS) -> dict[str, Limit]:
     """`limits` with those of `words` (psnr=0.2, frame_ms=10%); SteerbenchError if one is wrong."""
     directions = {metric: {"↑": 1, "↓": -1}.get(of.better) for metric, of in QUALITY.items()}
     known = {**{name: Limit(better) for name, better in directions.items() if better}, **LIMITS}
@@ -81,7 +83,7 @@ class Figures:
     views: str
 
     @classmethod
-    def of(cls, run: Run, limits: Mapping[str, Limit] = LIMITS) -> Figures:
+    def of(cls, run: Run, limits: Limits = LIMITS) -> Figures:
         values = {x: of for x, of in run.values.items() if x in limits and not math.isnan(of)}
         steady, frames = run.steady, {}
         for metric in values:
@@ -126,7 +128,7 @@ class Assertion:
 
 
 def changes(
-    old: Sequence[Figures], new: Sequence[Figures], limits: Mapping[str, Limit] = LIMITS
+    old: Sequence[Figures], new: Sequence[Figures], limits: Limits = LIMITS
 ) -> Iterator[Assertion]:
     """The change of every metric of `old` that has a limit, over runs with the same seeds.
 

@@ -16,7 +16,7 @@ import torch
 
 from bench.clock import OTHER
 from bench.errors import SteerbenchError
-from bench.kinds import Labels, Named, Numbers, Say, Texts, Values
+from bench.kinds import Labels, Named, Names, Numbers, Say, Texts, Values
 from bench.metrics import psnr
 from bench.neighbours import Neighbours
 from bench.records import Record
@@ -192,6 +192,9 @@ class Run:
         return dict(pair for pair in named if "._" not in pair[0])  # Hydra's own, as `_target_`
 
 
+Runs = Sequence[Run]
+
+
 @dataclass(frozen=True)
 class Repeated:
     """A table line with the `label`: runs that differ only in their seed. Figures are their means.
@@ -202,13 +205,13 @@ class Repeated:
     """
 
     label: str
-    runs: Sequence[Run]
+    runs: Runs
     gaps: Sequence[str] = ()
-    by_scene: Mapping[str, Sequence[Run]] = field(default_factory=dict)
-    of_scenes: Sequence[Run] = ()
+    by_scene: Mapping[str, Runs] = field(default_factory=dict)
+    of_scenes: Runs = ()
 
     @property
-    def averaged(self) -> Sequence[Run]:
+    def averaged(self) -> Runs:
         """The stored runs that its means are made of, each of a single scene."""
         return self.of_scenes or self.runs
 
@@ -243,6 +246,9 @@ class Repeated:
     def _figures(self, metric: str) -> list[float]:
         figures = (run.figure(metric) for run in self.runs)
         return [figure for figure in figures if figure is not None]
+
+
+TableLines = Sequence[Repeated]
 
 
 def readable(
@@ -316,13 +322,13 @@ def unseeded(config: Named) -> Iterator[tuple[str, Any]]:
             yield name, value
 
 
-def missing_figures(runs: Sequence[Run]) -> list[str]:
+def missing_figures(runs: Runs) -> list[str]:
     """Notes about every metric that could not be measured."""
     notes = (f"{name}: n/a. {why}" for run in runs for name, why in run.record["missing"].items())
     return list(dict.fromkeys(notes))
 
 
-def over_common_frames(runs: Sequence[Run]) -> list[Run]:
+def over_common_frames(runs: Runs) -> list[Run]:
     """The same runs, with steady figures recomputed over the frames that are steady in all of them.
 
     "All" are those of the same views. A method with memory has fewer steady frames, and the first
@@ -352,7 +358,7 @@ def _over(run: Run, kept: Collection[int]) -> Run:
     return replace(run, rows=rows)
 
 
-def over_scenes(runs: Sequence[Run]) -> Run:
+def over_scenes(runs: Runs) -> Run:
     """Average runs of one seed and different scenes into one run.
 
     Its rows are means of their headline rows, for the metrics that all of them have; its frames are
@@ -369,8 +375,7 @@ def over_scenes(runs: Sequence[Run]) -> Run:
         value=("value", lambda values: values.sum(skipna=False) / len(runs)),
         n=("n", "sum"),
     )
-    names = map(str, runs[0].facts.index)
-    facts: Values = {name: joined(run.facts[name] for run in runs) for name in names}
+    facts: Values = {**conditions(runs, list(map(str, runs[0].facts.index)))}
     facts["scene"] = f"mean of {', '.join(str(run.facts['scene']) for run in runs)}"
     facts["seed"] = runs[0].facts["seed"]
     key = facts["run"] = content_key({"mean of": [run.key for run in runs]})[:16]
@@ -381,7 +386,7 @@ def over_scenes(runs: Sequence[Run]) -> Run:
     return Run(key, runs[0].label, rows, frames, _record(runs), runs[0].pictures)
 
 
-def _record(runs: Sequence[Run]) -> Values:
+def _record(runs: Runs) -> Values:
     """The record of the first run, with the scenes, machines and missing figures of all."""
     records = [run.record for run in runs]
     machines = [record["machine"] for record in records]
@@ -405,6 +410,11 @@ def read_picture(path: Path) -> np.ndarray:
 def joined(values: Iterable[object]) -> str:
     """All different `values`, as text."""
     return " / ".join(dict.fromkeys(map(str, values)))
+
+
+def conditions(runs: Runs, names: Names) -> Texts:
+    """The facts `names` of `runs`, each with all of its values."""
+    return {name: joined(run.facts[name] for run in runs) for name in names}
 
 
 def listed(values: Named) -> str:

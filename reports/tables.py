@@ -12,7 +12,7 @@ from functools import partial
 
 import pandas as pd
 
-from bench.kinds import Numbers
+from bench.kinds import Names, Numbers
 from bench.results import COLD, STEADY
 
 NOT_AVAILABLE = "n/a"
@@ -39,15 +39,18 @@ class Metric:
         return f"{self.name} {self.better}".rstrip()
 
 
+Rows = Sequence[Sequence[str]]  # cells, line by line
+
+
 @dataclass(frozen=True)
 class Table:
     """Lines under columns, in Markdown: a label, then figures or text. `sources` has the keys of
     the runs behind each line, or is empty."""
 
     title: str
-    columns: Sequence[str]
-    lines: Sequence[Sequence[str]]
-    sources: Sequence[Sequence[str]] = ()
+    columns: Names
+    lines: Rows
+    sources: Rows = ()
 
     def right(self, column: int) -> bool:
         """Whether the column is aligned right: at least half of what is in it are figures."""

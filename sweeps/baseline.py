@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from bench.errors import SteerbenchError, explained, unexpected
-from bench.kinds import Labels, Named, Say, Values, Words
+from bench.kinds import Named, Names, Say, Values, Words
 from bench.records import made, read_record
 from bench.results import Store, existing_store
 from bench.sharing import whole
-from reports.regression import LIMITS, Assertion, Figures, Limit, changes, limited
+from reports.regression import LIMITS, Assertion, Figures, Limit, Limits, changes, limited
 from reports.runs import Run, unseeded
 from sweeps.measurement import PLACES, Failure, failures, own_words, portable
 from sweeps.versions import is_present, standing
@@ -27,6 +27,9 @@ NOTHING = Assertion("every metric", math.nan, math.nan, math.nan, None, Limit(1)
 TYPED = re.compile(r"[+~]*([\w.@/]+)=")  # a setting among the words of a command
 
 
+Checks = list[list[Assertion]]  # of the metrics of each run
+
+
 @dataclass(frozen=True)
 class Entry:
     """Runs by seed that are equal in all else: what `SUBJECT` names, and the flat `settings`.
@@ -34,7 +37,7 @@ class Entry:
 
     subject: Sequence[str]
     command: str
-    settings: Labels
+    settings: Mapping[str, str]
     seeds: Values  # the Run of each in a store, the Figures of each in a baseline
 
     def differences(self, other: Entry) -> list[str]:
@@ -51,7 +54,7 @@ class Entry:
             return all(self._equal_below(word, other, apart) for word in words)
         return self.subject == other.subject
 
-    def _equal_below(self, word: str, other: Entry, apart: Sequence[str]) -> bool:
+    def _equal_below(self, word: str, other: Entry, apart: Names) -> bool:
         """Whether no setting that a typed `word` is about is `apart`; of a choice that is about
         none, such as an experiment, nothing is known."""
         typed = TYPED.match(word)
@@ -104,7 +107,7 @@ def _places(run: Run) -> str:
     return " ".join(word for word in words if word.partition("=")[0] not in PLACES)
 
 
-def read(path: Path) -> tuple[Mapping[str, Limit], list[Entry]]:
+def read(path: Path) -> tuple[Limits, list[Entry]]:
     """The limits by metric and the runs of a baseline; SteerbenchError if it cannot be read, or
     holds nothing that could be compared."""
     try:
@@ -138,7 +141,7 @@ def _limits(held: Named, where: str) -> dict[str, Limit]:
     return limits
 
 
-def _entry(held: Any, limits: Mapping[str, Limit], where: str) -> Entry:
+def _entry(held: Any, limits: Limits, where: str) -> Entry:
     """One entry of a baseline, with figures."""
     entry = made(Entry, held, where)
     if len(entry.subject) != len(SUBJECT) or not entry.seeds:
@@ -148,7 +151,7 @@ def _entry(held: Any, limits: Mapping[str, Limit], where: str) -> Entry:
     return entry
 
 
-def _figures(held: Any, limits: Mapping[str, Limit], where: str) -> Figures:
+def _figures(held: Any, limits: Limits, where: str) -> Figures:
     """The figures of one run in a baseline; those that are compared are numbers."""
     figures = made(Figures, held, where)
     compared = {x: value for x, value in figures.values.items() if x in limits}
@@ -193,7 +196,7 @@ def record(path: Path, outputs: Path, words: Words, say: Say) -> None:
     store.rows(report=say)  # on those that cannot be read
 
 
-def _say_left_out(runs: Sequence[Entry], limits: Mapping[str, Limit], say: Say) -> None:
+def _say_left_out(runs: Sequence[Entry], limits: Limits, say: Say) -> None:
     metrics = {
         metric
         for each in runs
@@ -205,7 +208,7 @@ def _say_left_out(runs: Sequence[Entry], limits: Mapping[str, Limit], say: Say) 
     say(f"left out: metrics without a limit: {', '.join(families)}")
 
 
-def checked(path: Path, outputs: Path, say: Say = lambda line: None) -> list[list[Assertion]]:
+def checked(path: Path, outputs: Path, say: Say = lambda line: None) -> Checks:
     """Whether every metric of each run of the baseline `path` is as good in the store; `say` gets
     a line on which of several versions of a run were taken."""
     limits, entries = read(path)
@@ -228,7 +231,7 @@ def checked(path: Path, outputs: Path, say: Say = lambda line: None) -> list[lis
 
 
 def _compared(
-    old: Entry, new: Entry | None, limits: Mapping[str, Limit], outputs: Path
+    old: Entry, new: Entry | None, limits: Limits, outputs: Path
 ) -> tuple[list[Assertion], str]:
     """What became of the metrics of `old` in its runs `new`, and what else to know of these; raises
     SteerbenchError if some are missing, or of other frames."""

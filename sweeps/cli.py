@@ -24,6 +24,7 @@ from typing import NoReturn
 
 from bench.errors import SteerbenchError, unknown
 from bench.kinds import Named, Texts, Values, Words
+from bench.records import without
 from sweeps.processes import set_up
 
 COMMANDS: dict[str, Values] = tomllib.loads(
@@ -174,7 +175,7 @@ def _arguments(about: Named) -> Iterator[tuple[list[str], Values]]:
     for group in (about.get("arguments", {}), *(_SHARED[name] for name in include)):
         for name, options in group.items():
             kind = TYPES[options["type"]] if "type" in options else {}
-            own = {key: of for key, of in options.items() if key not in ("type", "also")}
+            own = without(options, ("type", "also"))
             more = "; may be repeated" if kind.get("action") == "append" else ""
             more += f" (default {own['default']})" if own.get("default") else ""
             names = filter(None, (name, options.get("also")))

@@ -25,7 +25,7 @@ from bench.errors import SteerbenchError, Unavailable, unexpected, unknown
 from bench.isolation import as_begun, fit
 from bench.kinds import Named, Values
 from bench.protocol import EvaluationProtocol
-from bench.provenance import stamp
+from bench.provenance import Stamp, stamp
 from bench.records import coerced, fits
 from bench.scenes.assemble import hold_out
 from bench.trajectories import Trajectory
@@ -181,7 +181,7 @@ class _Read(NamedTuple):
 
     value: Any  # a Scene, or its digest
     files: Sequence[Path]
-    stamps: Mapping[str, tuple[int, ...]]
+    stamps: Mapping[str, Stamp]
 
 
 @cache
@@ -213,7 +213,7 @@ def _current(read: Any, config: DictConfig) -> Any:
     return found.value
 
 
-def _stamps(files: Iterable[Path]) -> dict[str, tuple[int, ...]]:
+def _stamps(files: Iterable[Path]) -> dict[str, Stamp]:
     """The `stamp` of each file, and of all files beside it: pictures may be added, lists of names
     changed."""
     folders = {file.parent for file in files}

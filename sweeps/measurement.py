@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.console import ConsoleLog
-from bench.errors import SteerbenchError, Unavailable, explained, unexpected
+from bench.errors import SteerbenchError, Unavailable, explained, reason, unexpected
 from bench.isolation import Guard, as_begun, put_back
 from bench.kinds import Named, Values, Words
 from bench.measure import MethodFailed, Task, measure, train
@@ -71,7 +71,7 @@ def described(config: DictConfig) -> Values:
     try:
         plain: Any = OmegaConf.to_container(config, resolve=True)
     except OmegaConfBaseException as error:  # a setting that others use was removed
-        raise SteerbenchError(" ".join(str(error).split())) from error
+        raise SteerbenchError(reason(error)) from error
     unused = ["exclusive"] if plain.get("exclusive") is True else []
     unused += [] if "engine" in plain["method"] else ["engine", "precision"]
     left_out = ("split", "tables", "in_turns", *PLACES, *unused)
@@ -96,11 +96,6 @@ def turns_of(name: str, config: DictConfig) -> str:
     """The `turns` of jobs of the sweep `name` that share scene and seed."""
     scene = Path(config.scene.get("path") or config.scene.get("name", "")).name
     return f"{name}, {config.seed}, {scene}"
-
-
-def reason(error: BaseException) -> str:
-    """The message of `error` in one line."""
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 def own_words(command: str) -> list[str]:
@@ -166,6 +161,9 @@ class Job:
                 file.unlink(missing_ok=True)
 
 
+Jobs = Sequence[Job]
+
+
 @dataclass(frozen=True)
 class Failure:
     """Why the last attempt of a job failed, which the `command` makes alone."""
@@ -194,7 +192,7 @@ class NotStored(SteerbenchError):
     """A run that is not in the store, where nothing may be measured (store=only)."""
 
 
-def obtain(jobs: Sequence[Job]) -> tuple[list[str], bool]:
+def obtain(jobs: Jobs) -> tuple[list[str], bool]:
     """The keys of the runs of `jobs`, whose `turns` are equal, and whether they are measured now.
 
     They are measured unless the store has all of them: figures that are compared come from the same
@@ -213,7 +211,7 @@ def obtain(jobs: Sequence[Job]) -> tuple[list[str], bool]:
         raise
 
 
-def _keep_failure(jobs: Sequence[Job], error: Exception) -> None:
+def _keep_failure(jobs: Jobs, error: Exception) -> None:
     failed, cause = jobs, error
     if isinstance(error, JobFailed) and isinstance(error.__cause__, Exception):
         failed, cause = [error.job], error.__cause__
@@ -222,7 +220,7 @@ def _keep_failure(jobs: Sequence[Job], error: Exception) -> None:
             job.keep_failure(cause)
 
 
-def _obtained(jobs: Sequence[Job], log: ConsoleLog) -> tuple[list[str], bool]:
+def _obtained(jobs: Jobs, log: ConsoleLog) -> tuple[list[str], bool]:
     ready, policy = _ready(jobs, log), jobs[0].config.get("store")
     measured = policy == "always" or not _stored(ready)
     if measured and policy == "only":
@@ -241,7 +239,7 @@ def _obtained(jobs: Sequence[Job], log: ConsoleLog) -> tuple[list[str], bool]:
     return _told(ready, measured, log), measured
 
 
-def stored(jobs: Sequence[Job]) -> dict[str, Job]:
+def stored(jobs: Jobs) -> dict[str, Job]:
     """Those of `jobs` that can be used here, by the keys that `obtain` would find in the store, if
     it has all of them and they need not be measured again; otherwise none."""
     log, left = ConsoleLog(jobs[0].outputs), list(jobs)
@@ -280,7 +278,7 @@ class _Ready:
         return self.job.store.key(self.parts)
 
 
-def _ready(jobs: Sequence[Job], log: Log) -> list[_Ready]:
+def _ready(jobs: Jobs, log: Log) -> list[_Ready]:
     """The `jobs`, ready to be measured.
 
     With `turns`, each key includes the keys of all of them: if one job changes, all are measured
@@ -305,7 +303,7 @@ def _ready(jobs: Sequence[Job], log: Log) -> list[_Ready]:
     return [replace(each, parts={**each.parts, **shared}) for each in ready]
 
 
-def _needed(job: Job, jobs: Sequence[Job]) -> bool:
+def _needed(job: Job, jobs: Jobs) -> bool:
     """Whether the pictures of all `jobs` are compared with those of `job`."""
     return job is jobs[0] and bool(job.config.protocol.get("compared"))
 

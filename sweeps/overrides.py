@@ -26,8 +26,8 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf, open_dict
 from yaml import YAMLError
 
-from bench.errors import SteerbenchError, unexpected, unknown
-from bench.kinds import Named, Texts, Values, Words
+from bench.errors import SteerbenchError, reason, unexpected, unknown
+from bench.kinds import Choices, Named, Texts, Values, Words
 
 CONFIGS = Path(__file__).parent / "configs"
 FLAGS = ("--config-dir", "-cd")
@@ -85,14 +85,14 @@ def settled(config: DictConfig, folders: Sequence[Path]) -> DictConfig:
     return config
 
 
-def variants(words: Words) -> Callable[[Sequence[str]], DictConfig]:
+def variants(words: Words) -> Callable[[Words], DictConfig]:
     """A function that makes the configuration of `words` with further settings.
 
     Each set of choices is composed once; values are set afterwards as Hydra would, which is faster.
     """
     with_choices = cache(lambda *chosen: composed([*words, *chosen]))
 
-    def varied(settings: Sequence[str]) -> DictConfig:
+    def varied(settings: Words) -> DictConfig:
         chosen = [x for x in settings if x[0] == "+" or choices(x.partition("=")[0], words)]
         values = [word for word in settings if word not in chosen]
         config = with_choices(*chosen).copy()
@@ -103,7 +103,7 @@ def variants(words: Words) -> Callable[[Sequence[str]], DictConfig]:
     return varied
 
 
-def swept(words: Words) -> dict[str, list[str]]:
+def swept(words: Words) -> Choices:
     """The values of every setting with several values (seed=0,1,2); the last word for it counts.
 
     SteerbenchError if a word cannot be read.
@@ -284,7 +284,7 @@ def loaded(path: Path) -> Any:
     try:
         return OmegaConf.to_container(OmegaConf.load(path))
     except (OSError, ValueError, YAMLError) as error:
-        raise unexpected(path, "a YAML file of settings", " ".join(str(error).split())) from error
+        raise unexpected(path, "a YAML file of settings", reason(error)) from error
 
 
 def target_of(node: Named | DictConfig) -> Any:

@@ -11,6 +11,7 @@ from typing import Any
 
 from bench.errors import SteerbenchError, unexpected, unknown
 from bench.kinds import Named, Names, Numbers, Values, Words
+from bench.records import without
 from reports.claims import Claim, by_ratio
 from reports.comparison import shown_as
 from reports.paper_tables import METHOD, Line, PaperTable
@@ -126,7 +127,7 @@ def _figures(published: Sequence[float | None], metrics: Names, where: str) -> N
 
 def _claim(declared: Named, lines: Mapping[str, Line], where: str) -> Claim:
     """A claim about lines that an experiment declares as `rising` or as `alike`."""
-    own = {name: of for name, of in declared.items() if name not in ("rising", "alike")}
+    own = without(declared, ("rising", "alike"))
     check_settings(Claim, own, where, ("lines", "alike"))
     shown_as(own["metric"])
     if by_ratio(own["metric"]) and float(own["margin"]) < 1:

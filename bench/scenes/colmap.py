@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from bench.errors import optional, unexpected
-from bench.kinds import Names
+from bench.kinds import AnyPath, Names
 from bench.scenes.assemble import (
     Box,
     assemble,
@@ -37,7 +37,7 @@ STRAY = 0.01  # share of the points, at either end of an axis, that the box may 
 
 
 def load(
-    path: str | Path,
+    path: AnyPath,
     *,
     images: str = "images",
     model: str | None = None,

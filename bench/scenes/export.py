@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from bench.cameras import move_camera
-from bench.kinds import Labels, Numbers
+from bench.kinds import Json, Labels, Numbers
 from bench.scenes.blender import camera_file
 from bench.scenes.files import opengl_to_opencv
 from bench.threads import in_parallel
@@ -54,7 +54,7 @@ def write_blender(scene: Scene, folder: Path, files: Labels, log: Log) -> None:
         (folder / camera_file(name)).write_text(json.dumps(record, indent=1) + "\n")
 
 
-def _transforms(cameras: list[Camera], split: str) -> dict[str, object]:
+def _transforms(cameras: list[Camera], split: str) -> Json:
     lenses = [_lens(camera) for camera in cameras]
     alike = all(lens == lenses[0] for lens in lenses)
     frames = []

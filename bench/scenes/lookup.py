@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from unicodedata import normalize
 
 from bench.errors import unexpected
-from bench.kinds import Names
+from bench.kinds import AnyPath, Names
 from bench.types import Log
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -45,9 +45,7 @@ def in_any_case(path: Path, there: There = os.path.isfile) -> Path | None:
     return next(filter(there, like), None)
 
 
-def found(
-    root: Path, name: str, where: str | Path, kind: str, there: There = os.path.isfile
-) -> Path:
+def found(root: Path, name: str, where: AnyPath, kind: str, there: There = os.path.isfile) -> Path:
     """What is called `name` in `root`, in any case of letters; raises if that is not `there`."""
     path = in_any_case(root / tidy(name), there)
     if path is None:

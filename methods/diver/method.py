@@ -18,7 +18,7 @@ from methods.kernels.corner_gather import CORNERS
 from methods.kernels.settings import Fraction, multiple
 from methods.kernels.types import Occupancy, Pixels
 from methods.rendering.compaction import to_host
-from methods.rendering.frame import Render
+from methods.rendering.frame import Renderer
 from methods.students.method import IN_FP32, Student
 from methods.students.networks import encode_directions
 from methods.training.checkpoint import Tensors
@@ -120,7 +120,7 @@ class Diver(Student):
         model.restore(tensors)
         self.baked = Baked(model, self.stored)
 
-    def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
+    def renderer(self, probe: Probe) -> Renderer:
         def render(_: Tensor, rays: Rays) -> Pixels:
             return self.baked.render_rays(rays, probe, self.stop, self.faint)
 

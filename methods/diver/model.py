@@ -16,6 +16,7 @@ from methods.kernels.voxel_walk import Crossings, Voxels
 from methods.students.networks import DIRECTION_CHANNELS, Dense
 from methods.students.voxels import corners_of, occupied_voxels
 from methods.training import checkpoint
+from methods.training.checkpoint import Tensors
 
 CHANNELS = 32  # features of a corner, and width of every layer between input and output
 
@@ -105,12 +106,12 @@ class CornerModel(nn.Module):
             self.table, self.corners, voxel, weights, grad_buffer=grad_buffer, backend=self.backend
         )
 
-    def tensors(self) -> checkpoint.Tensors:
+    def tensors(self) -> Tensors:
         """Everything that was trained."""
         own = {"coordinates": self.voxels.coordinates, "table": self.table.detach()}
         return self.decoder.state_dict(prefix="decoder.") | own
 
-    def restore(self, tensors: checkpoint.Tensors) -> None:
+    def restore(self, tensors: Tensors) -> None:
         """Restore what `tensors` returned."""
         self.decoder.load_state_dict(checkpoint.part(tensors, "decoder."))
         device = self.table.device

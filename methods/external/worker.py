@@ -6,14 +6,14 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 
 import numpy as np
 import torch
 
 from bench.errors import SteerbenchError, Unavailable
-from bench.kinds import Labels, Values, Words
+from bench.kinds import Json, Labels, Values, Words
 from steerbench_worker import VARIABLE, VERSION, Channel
 
 Header = Values
@@ -65,7 +65,7 @@ class Worker:
         self,
         message: str,
         limit_s: float,
-        fields: Mapping[str, object] | None = None,
+        fields: Json | None = None,
         progress: Callable[[Header], object] | None = None,
     ) -> tuple[Header, dict[str, np.ndarray]]:
         """Send a message, unless `fields` are None; the header and the arrays of its answer. Before

@@ -26,7 +26,8 @@ from methods.kernels.composite import STOP
 from methods.kernels.march.contraction import HALF
 from methods.kernels.settings import Checked, Count, Only, Positive
 from methods.rendering.frame import render_rays
-from methods.training import checkpoint, loop
+from methods.training import loop
+from methods.training.checkpoint import Optimisers, Tensors
 
 SOLID = 0.5  # opacity above which a ray counts as ending at a surface
 
@@ -119,7 +120,7 @@ class GaussianTraining(loop.Training):
         costs = costs + options.scale_cost * scales.mean()
         (loss + costs).backward()
 
-        def error() -> checkpoint.Tensors:
+        def error() -> Tensors:
             return {"": functional.mse_loss(picture, target)}
 
         errors = loop.look(self, error, {"picture": picture})
@@ -164,22 +165,22 @@ class GaussianTraining(loop.Training):
             picture = shrunk[0].movedim(0, -1).contiguous()
         return place_camera(camera, device), picture
 
-    def optimisers(self) -> checkpoint.Optimisers:
+    def optimisers(self) -> Optimisers:
         return {"adam": self.optimiser}
 
-    def watched(self) -> checkpoint.Tensors:
+    def watched(self) -> Tensors:
         return dict(self.gaussians.named_parameters())
 
-    def result(self) -> checkpoint.Tensors:
+    def result(self) -> Tensors:
         return {name: value.detach() for name, value in self.gaussians.named_parameters()}
 
-    def restore_result(self, tensors: checkpoint.Tensors) -> None:
+    def restore_result(self, tensors: Tensors) -> None:
         self.gaussians.load_state_dict({name: tensors[name] for name in self.result()})
 
-    def state(self) -> checkpoint.Tensors:
+    def state(self) -> Tensors:
         return super().state() | {"views": torch.tensor(self.views, dtype=torch.int64)}
 
-    def restore(self, tensors: checkpoint.Tensors) -> None:
+    def restore(self, tensors: Tensors) -> None:
         super().restore(tensors)
         self.views = tensors["views"].tolist()
 

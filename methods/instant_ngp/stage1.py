@@ -6,8 +6,9 @@ from typing import Self
 
 import torch
 
-from bench.kinds import Sizes, Texts, Values
+from bench.kinds import Json, Sizes, Texts, Values
 from bench.provenance import computed_by
+from bench.study import Study, turned
 from bench.types import DEVICE, Budget, Log, Scene
 from methods.instant_ngp.field import FieldPrecision, HashField
 from methods.instant_ngp.table import SuitedGrid
@@ -20,6 +21,14 @@ from methods.kernels.types import Occupancy
 from methods.rendering.occupancy import STEP, DensityGrid
 from methods.rendering.sampling import Sampling
 from methods.training import checkpoint, loop
+
+MARCHED = Study(
+    knobs={"stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3"))},
+    exact=("method.stop=1e-4",),
+    parts=dict.fromkeys(("rays", "march", "composite"), "field"),
+    chosen=("stop",),
+)
+"""The study of a field that rays are marched through."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +85,7 @@ class Setup:
         grid = self.grid.of(scene) if isinstance(self.grid, SuitedGrid) else self.grid
         return replace(self, grid=grid)
 
-    def key(self, scene: Scene, budget: Budget) -> dict[str, object]:
+    def key(self, scene: Scene, budget: Budget) -> Json:
         """Everything the trained field depends on."""
         march_step = self.training.sampling(budget).step / STEP
         return {

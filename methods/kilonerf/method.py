@@ -15,6 +15,7 @@ from methods.kilonerf.field import Grid, KiloField, Pieces, place_networks
 from methods.students.fields import FieldLessons, FieldStudent, StudentTraining
 from methods.students.method import IN_FP32
 from methods.training import checkpoint
+from methods.training.checkpoint import Tensors
 
 MOST = 32  # maximum number of networks along an axis: they are numbered in int16
 
@@ -86,7 +87,7 @@ class KiloNerf(FieldStudent):
         training.pieces = pieces
         return training
 
-    def restore(self, tensors: checkpoint.Tensors) -> None:
+    def restore(self, tensors: Tensors) -> None:
         parts = checkpoint.part(tensors, "field.")
         self.grid = Grid(parts["networks"], parts["corner"], parts["side"])
         super().restore(tensors)

@@ -29,6 +29,9 @@ samples for each visible one in 6 rounds; from 2 on 1.47, from 4 1.52."""
 Render = Callable[[Tensor, Rays], Pixels]
 """Renders some pixels of a frame, given their row-major indices [P] and their rays."""
 
+Renderer = tuple[Occupancy, Render]
+"""The cells that may show anything, and what renders the pixels that may see them."""
+
 
 @dataclass(frozen=True)
 class FeatureFrame:

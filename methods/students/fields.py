@@ -16,14 +16,15 @@ from bench.types import Budget, Log, Probe, Rays, Scene, TwoTensors
 from methods.instant_ngp.stage1 import TrainedField
 from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.settings import Share, SomeShare
-from methods.kernels.types import Occupancy, Pixels
+from methods.kernels.types import Composited, Occupancy
 from methods.rendering.batch import render_batch
 from methods.rendering.field import ROUND_SAMPLES, Field
-from methods.rendering.frame import Render, everywhere
+from methods.rendering.frame import Renderer, everywhere
 from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import Sampling
 from methods.students.method import Student
 from methods.training import checkpoint, loop
+from methods.training.checkpoint import Optimisers, Tensors
 
 REACH = 5 * STEP
 """Length over which densities become the opacities that are compared: about the 0.0211 of KiloNeRF,
@@ -82,7 +83,7 @@ class FieldStudent(Student):
         self.occupancy = self.occupied(teacher)
         return StudentTraining(self, teacher, scene, budget)
 
-    def restore(self, tensors: checkpoint.Tensors) -> None:
+    def restore(self, tensors: Tensors) -> None:
         self.occupancy = Occupancy(tensors["cells"].to(self.teacher.device), self.contracted)
         self.field = self.new_field()
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
@@ -92,7 +93,7 @@ class FieldStudent(Student):
         super().fit(scene, budget, log)
         self.how = replace(self.sampling(budget), stop=self.stop)
 
-    def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
+    def renderer(self, probe: Probe) -> Renderer:
         return self.occupancy, everywhere(self.field, self.occupancy, probe, self.how)
 
     def sizes(self) -> Sizes:
@@ -151,25 +152,25 @@ class StudentTraining(PixelTraining):
         """The opacity [S] over `REACH` and colour [S, 3] that are compared with the teacher's."""
         return _seen(self.field, positions, directions)
 
-    def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
+    def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> Composited:
         field, cells, how, teacher = self.field, self.occupancy, self.sampling, self.teacher
         return render_batch(
             field, rays, cells, how, jitter=jitter, background=background, teacher=teacher
         )
 
-    def optimisers(self) -> checkpoint.Optimisers:
+    def optimisers(self) -> Optimisers:
         return {"adam": self.optimiser}
 
     def _update(self) -> None:
         loop.step_at(self.optimiser, self.learning_rate())
 
-    def watched(self) -> checkpoint.Tensors:
+    def watched(self) -> Tensors:
         return dict(self.field.named_parameters())
 
-    def result(self) -> checkpoint.Tensors:
+    def result(self) -> Tensors:
         return self.field.state_dict(prefix="field.") | {"cells": self.occupancy.cells}
 
-    def restore_result(self, tensors: checkpoint.Tensors) -> None:
+    def restore_result(self, tensors: Tensors) -> None:
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
 
 

@@ -12,6 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from bench.errors import reason
 from bench.kinds import Numbers
 from bench.sharing import whole
 from bench.types import SteerbenchError
@@ -69,7 +70,7 @@ def restoring(path: Path) -> Iterator[None]:
     except (KeyError, RuntimeError) as error:
         raise SteerbenchError(
             f"{path}: expected the file of this training, its content does not fit "
-            f"({' '.join(str(error).split())}); remove it to train again"
+            f"({reason(error)}); remove it to train again"
         ) from error
 
 

@@ -16,6 +16,7 @@ from bench.provenance import digest
 from bench.sharing import missing
 from bench.types import Log, SteerbenchError, TwoTensors
 from methods.training import checkpoint
+from methods.training.checkpoint import Optimisers, Tensors
 
 LOOK_EVERY = 10
 """On a GPU, errors are read back only every so many steps, because reading takes time."""
@@ -42,24 +43,24 @@ class Training(Protocol):
         """Take one step; return what `look` returns, the mean squared errors to show by label (""
         for the main one)."""
 
-    def optimisers(self) -> checkpoint.Optimisers:
+    def optimisers(self) -> Optimisers:
         """The optimisers, which a checkpoint keeps."""
 
-    def watched(self) -> checkpoint.Tensors:
+    def watched(self) -> Tensors:
         """The tensors that must be finite in a good state, by name."""
 
-    def result(self) -> checkpoint.Tensors:
+    def result(self) -> Tensors:
         """The tensors that the training is for."""
 
-    def restore_result(self, tensors: checkpoint.Tensors) -> None:
+    def restore_result(self, tensors: Tensors) -> None:
         """Restore what `result` returned."""
 
-    def state(self) -> checkpoint.Tensors:
+    def state(self) -> Tensors:
         """What a checkpoint must hold, besides the result, to go on as if never stopped."""
         tensors = checkpoint.of_optimisers(self.optimisers())
         return tensors | {"generator": self.generator.get_state()}
 
-    def restore(self, tensors: checkpoint.Tensors) -> None:
+    def restore(self, tensors: Tensors) -> None:
         """Restore result and state."""
         self.restore_result(tensors)
         checkpoint.restore_optimisers(self.optimisers(), tensors)
@@ -68,7 +69,7 @@ class Training(Protocol):
 
 def trained(
     begin: Callable[[], Training], finished: Path, label: str, device: torch.device, log: Log
-) -> tuple[checkpoint.Tensors, float, float]:
+) -> tuple[Tensors, float, float]:
     """The result of the training on `device` that `begin` makes, seconds and peak memory, of making
     it and of all its steps: read from `finished`, after a `train` if that is missing."""
     if finished.exists():
@@ -152,9 +153,7 @@ def load(training: Training, path: Path, done: bool = False) -> None:
         training.peak_bytes = figures["peak_bytes"]
 
 
-def look(
-    training: Training, errors: Callable[[], checkpoint.Tensors], tensors: checkpoint.Tensors
-) -> Numbers:
+def look(training: Training, errors: Callable[[], Tensors], tensors: Tensors) -> Numbers:
     """Return the `errors` of a step as numbers; raise `SteerbenchError` if one is not finite, with
     the names of the `tensors` that are not. On a GPU this happens every `LOOK_EVERY` steps, with
     the errors that were requested the time before, which have arrived meanwhile; in all other steps
@@ -172,7 +171,7 @@ def look(
     return told
 
 
-def _ask(errors: checkpoint.Tensors) -> Asked:
+def _ask(errors: Tensors) -> Asked:
     """Send the errors to the host, which does not wait for them."""
     together = torch.stack([error.detach() for error in errors.values()])
     labels = list(errors)
@@ -189,7 +188,7 @@ def _ask(errors: checkpoint.Tensors) -> Asked:
     return tell
 
 
-def check_finite(training: Training, more: checkpoint.Tensors | None = None) -> None:
+def check_finite(training: Training, more: Tensors | None = None) -> None:
     """Raise `SteerbenchError` naming the step and the tensors that are not finite, if any are."""
     tensors = {**training.watched(), **(more or {})}
     bad = [name for name, tensor in tensors.items() if not tensor.isfinite().all()]

@@ -28,7 +28,7 @@ from bench.kinds import Texts, Values
 from bench.sharing import whole
 from reports.comparison import COST, shown_as, written
 from reports.images import ZOOM, ComparedFrame, Part, Picture, still_images
-from reports.runs import Repeated, Run
+from reports.runs import Repeated, Run, Runs
 from reports.tables import QUALITY, Table
 
 PICTURE = re.compile(r".+-[0-9a-f]{12}\.png")
@@ -47,7 +47,7 @@ PARSER = MarkdownIt("commonmark", {"html": False}).disable("image")
 TEMPLATES.filters["inline"] = PARSER.renderInline
 
 
-def publish(parts: Sequence[Part], folder: Path, runs: Sequence[Run] = ()) -> Path:
+def publish(parts: Sequence[Part], folder: Path, runs: Runs = ()) -> Path:
     """Write `parts` as `report.md` and `report.html`, each atomically; return the former.
 
     The first part begins with the title of the page as a heading. `runs` are those behind the
@@ -99,7 +99,7 @@ def _drawn(picture: Picture, form: str) -> bytes:
         return drawn.read_bytes()
 
 
-def html_page(parts: Sequence[Part], runs: Sequence[Run]) -> str:
+def html_page(parts: Sequence[Part], runs: Runs) -> str:
     """The page of `parts` as HTML; the first begins with the title as a heading.
 
     `runs` are those whose keys occur in tables and marks.

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
+from bench.errors import reason
 from bench.kinds import Labels, Texts, Words
 from sweeps.hydra_runs import run_hydra
 
 if TYPE_CHECKING:
-    from reports.runs import Run
+    from reports.runs import Runs
     from sweeps.execute import Ended
     from sweeps.measurement import Job
 
@@ -56,7 +57,6 @@ def _alone(config: DictConfig, command: Words, form: str | None) -> None:
 def _finish(ended: Sequence[tuple[Job, Ended]], form: str | None) -> None:
     """Print one table of all jobs that have ended, and write the pages that they requested."""
     from reports.runs import grouped, load_runs
-    from sweeps.measurement import reason
     from sweeps.terminal import say_missing, write_page
 
     def of(jobs: Sequence[tuple[Job, Ended]]) -> tuple[list[str], Texts]:
@@ -73,7 +73,7 @@ def _finish(ended: Sequence[tuple[Job, Ended]], form: str | None) -> None:
         write_page(report, store, *of(some))
 
 
-def _show(runs: Sequence[Run], failed: Labels, form: str | None) -> None:
+def _show(runs: Runs, failed: Labels, form: str | None) -> None:
     from reports.comparison import columns_of, comparison
     from reports.lines import as_lines
     from sweeps.terminal import show

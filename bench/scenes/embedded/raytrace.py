@@ -42,6 +42,11 @@ class Band:
     x: Tensor  # [1, W, S] on the image plane
     y: Tensor  # [rows, 1, S]
 
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of a number for each ray."""
+        return self.y.shape[0], *self.x.shape[1:]
+
     def directions(self, frame: Tensor, columns: slice) -> ThreeTensors:
         """Directions of the rays in `columns`, as components along the axes of `frame` [3, 3]."""
         matrix = (frame.T @ self.rotation).tolist()
@@ -148,7 +153,7 @@ class Solids:
 
     def trace(self, band: Band, spans: Sequence[Span]) -> ThreeTensors:
         """Find the nearest surface over all parts, then shade only that."""
-        shape = (band.y.shape[0], *band.x.shape[1:])
+        shape = band.shape
         depth = band.x.new_full(shape, math.inf)
         owner = torch.full(shape, -1, dtype=torch.int16)
         # From front to back, so that a part whose box lies behind all that was met can be left out.
@@ -263,7 +268,7 @@ class Media:
 
     def trace(self, band: Band, spans: Sequence[Span]) -> ThreeTensors:
         """Integrate all balls in `spans` together, for the rays that hit any of them."""
-        shape = (band.y.shape[0], *band.x.shape[1:])
+        shape = band.shape
         balls = [self.balls[number] for number, _, _ in spans]
         directions = band.directions(torch.eye(3), slice(None))
         enter, leave = band.x.new_zeros(2, len(balls), *shape)

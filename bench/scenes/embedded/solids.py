@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from bench.types import ThreeTensors, TwoTensors
+from bench.types import SomeTensors, ThreeTensors, TwoTensors
 
 Triple = tuple[float, float, float]
 Origin = tuple[Any, Any, Any]  # floats or tensors
@@ -244,7 +244,7 @@ class Carved(Shape):
         return normal
 
 
-def ball_interval(origin: Sequence, directions: Sequence[Tensor], radius: float) -> Interval:
+def ball_interval(origin: Sequence, directions: SomeTensors, radius: float) -> Interval:
     """Where rays are within `radius` of 0, in as many dimensions as there are components.
 
     Computed from the ray's nearest point to 0: with the textbook's b^2 - 4 a c, rounding loses a

@@ -11,7 +11,7 @@ from torch.nn.functional import pad
 from bench.case import (
     U32,
     Bound,
-    Case,
+    Cases,
     Given,
     Operation,
     Property,
@@ -137,7 +137,7 @@ WEIGHTS = Operation(
 )
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """Agreements; one extreme sample among ordinary ones; sums of weights on long rays."""
     pixels = Property(
         "composite",

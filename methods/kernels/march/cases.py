@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from bench.case import U32, Bound, Case, Operation, Property, Random, placed
+from bench.case import U32, Bound, Case, Cases, Operation, Property, Random, placed
 from bench.kinds import Values
 from bench.types import Rays
 from methods.kernels.dispatch import served
@@ -137,12 +137,12 @@ EQUAL = Bound("the same operations in the same order: 0", 0.0)
 MARCH = Operation("march", served(__package__), _march, dict.fromkeys(OUTPUTS, EQUAL))
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """Every kind of ray, grid, window, phase and limit."""
     return [*_agreements(), *_ways()]
 
 
-def _agreements() -> list[Case]:
+def _agreements() -> Cases:
     """Rays from inside and outside through a grid of scattered cells; with windows and limits."""
     random = Random(4)
     near = random.share(129)

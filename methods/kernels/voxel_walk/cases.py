@@ -7,7 +7,7 @@ from functools import partial
 
 import torch
 
-from bench.case import Bound, Case, Given, Operation, Property, Random, on_backends, placed
+from bench.case import Bound, Case, Cases, Given, Operation, Property, Random, on_backends, placed
 from bench.kinds import Values
 from bench.types import Rays
 from methods.kernels.dispatch import served
@@ -22,7 +22,7 @@ SAME = Bound("t of planes by the same operations, cells by comparing them: 0", 0
 WALK = Operation("voxel_walk", served(__package__), walk, dict.fromkeys(RESULTS, SAME))
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """Every kind of grid and ray."""
     return [*_agreements(), *_lengths()]
 

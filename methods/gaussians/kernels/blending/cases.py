@@ -9,7 +9,7 @@ from bench.cameras import pixel_grid
 from bench.case import (
     U32,
     Bound,
-    Case,
+    Cases,
     Given,
     Operation,
     Property,
@@ -72,7 +72,7 @@ SIZES = {
 """Number of Gaussians, width and height of the picture, factor on the size of the Gaussians."""
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """No, some and crowded Gaussians; a plain loop; stop."""
     found = BLEND.cases("crowded, to a stop", draw, *SIZES["crowded"], STOP)
     for name, size in SIZES.items():

@@ -11,7 +11,7 @@ from bench.cameras import project
 from bench.case import (
     U32,
     Bound,
-    Case,
+    Cases,
     Given,
     Operation,
     Property,
@@ -62,7 +62,7 @@ PROJECT = Operation(
 )
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """No, one and many Gaussians, some behind the camera; circles; slopes by autograd."""
     found = []
     for count in (0, 1, 1000, 1 << 16):
