@@ -169,7 +169,7 @@ def _line_of(run: Run) -> str:
 
 def _settings(run: Run) -> Texts:
     """The settings of a run by name, without seeds, as text; none for scored pictures."""
-    config = run.record["made_of"].get("config", {})
+    config = run.config
     return {name: _text(name, of) for name, of in unseeded(config) if name not in HIDDEN}
 
 
@@ -181,5 +181,5 @@ def _text(name: str, value: Any) -> str:
 
 def _typed(run: Run) -> list[str]:
     """The names of the settings that were typed for a run."""
-    words = shlex.split(str(run.record["command"]))
+    words = shlex.split(run.command)
     return [word.lstrip("+").partition("=")[0] for word in words if "=" in word]

@@ -136,7 +136,7 @@ def _figures(run: Run) -> Parts:
 
 def _provenance(runs: Runs) -> Parts:
     """The commands, then facts: one line if all runs share it, otherwise one line per run."""
-    commands = "\n".join(dict.fromkeys(run.record["command"] for run in runs))
+    commands = "\n".join(dict.fromkeys(run.command for run in runs))
     lines = []
     for name in runs[0].provenance:
         values = [run.provenance[name] for run in runs]

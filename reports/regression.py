@@ -94,7 +94,7 @@ class Figures:
             if averaged[metric].notna().all():
                 frames[metric] = dict(zip(names, averaged[metric].astype(float), strict=True))
         views = [*map(str, run.views), run.rules]
-        scene = run.record["made_of"].get("config", {}).get("scene", {})
+        scene = run.config.get("scene", {})
         if scene.get("_target_") == "bench.scenes.embedded.load":
             views[0] = str(run.facts["scene"])
         return cls(values, frames, ", ".join(run.computer), ", ".join(views))

@@ -114,10 +114,25 @@ class Run:
         return self.rows.drop(columns=list(FIGURES), errors="ignore").iloc[0]
 
     @property
+    def command(self) -> str:
+        """What measures it again."""
+        return str(self.record["command"])
+
+    @property
+    def config(self) -> Named:
+        """Its settings; none of scored pictures."""
+        return self.record["made_of"].get("config", {})
+
+    @property
+    def digest(self) -> str:
+        """The digest of its scene."""
+        return self.record["scene"]["digest"]
+
+    @property
     def views(self) -> tuple[object, ...]:
         """Equal for runs that rendered the same frames of the same scene."""
         where = (self.facts["split"], self.facts["trajectory"], self.facts["resolution"])
-        return (self.record["scene"]["digest"], *where, len(self.frames))
+        return (self.digest, *where, len(self.frames))
 
     @property
     def computer(self) -> tuple[str, ...]:
@@ -161,7 +176,7 @@ class Run:
         seen = record.get("neighbours")  # none where nothing was timed here
         return {
             "run": self.key,
-            "scene": f"{row['scene']}, digest {record['scene']['digest'][:16]}",
+            "scene": f"{row['scene']}, digest {self.digest[:16]}",
             "frames": f"{row['trajectory']} at {row['resolution']}",
             "protocol": listed(record["protocol"]),
             "budget": listed(record["budget"]),
@@ -187,7 +202,7 @@ class Run:
     @property
     def settings(self) -> Texts:
         """The settings of the method by the names that one types; none for scored pictures."""
-        method = self.record["made_of"].get("config", {}).get("method", {})
+        method = self.config.get("method", {})
         named = ((name, str(value)) for name, value in flat({"method": method}))
         return dict(pair for pair in named if "._" not in pair[0])  # Hydra's own, as `_target_`
 
@@ -392,7 +407,7 @@ def _record(runs: Runs) -> Values:
     machines = [record["machine"] for record in records]
     machine = {name: joined(of[name] for of in machines) for name in ("cpu", "threads")}
     gpus = list(dict.fromkeys(gpu for of in machines for gpu in of["gpus"]))
-    digest = content_key({"mean of": [record["scene"]["digest"] for record in records]})
+    digest = content_key({"mean of": [run.digest for run in runs]})
     return {
         **records[0],
         "machine": {**machines[0], **machine, "gpus": gpus},

@@ -75,7 +75,7 @@ def _stored(store: Store, say: Say) -> list[Entry]:
     found: dict[str, Entry] = {}
     for run in standing(store, say):
         made_of = run.record["made_of"]
-        words, _ = _without_seed(own_words(str(run.record["command"])))
+        words, _ = _without_seed(own_words(run.command))
         command = shlex.join(words)
         config = {
             **made_of.get("config", {"command": command}),
@@ -103,7 +103,7 @@ def _places(run: Run) -> str:
     """The folder of the scene of a run or, of scored pictures, the command that names both."""
     if "scene_path" in run.record:
         return str(run.record["scene_path"])
-    words = shlex.split(str(run.record["command"]))
+    words = shlex.split(run.command)
     return " ".join(word for word in words if word.partition("=")[0] not in PLACES)
 
 

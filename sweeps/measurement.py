@@ -459,4 +459,4 @@ def of_scene(run: Run, config: DictConfig) -> bool:
     folder = scene_folder(config)
     if folder is None or run.record.get("scene_path") == folder or not Path(folder).is_dir():
         return True
-    return run.record["scene"]["digest"] == scene_digest(config)
+    return run.digest == scene_digest(config)

@@ -27,7 +27,7 @@ def standing(store: Store, say: Say) -> list[Run]:
         return max(store.used(run.key)[0], run.record["stored"])
 
     in_order = sorted(readable(store), key=last_used, reverse=True)
-    versions = grouped(in_order, lambda run: (_own_job(run), run.record["scene"]["digest"]))
+    versions = grouped(in_order, lambda run: (_own_job(run), run.digest))
     taken: list[Run] = []
     said: list[str] = []
     for several in versions.values():
@@ -59,7 +59,7 @@ def _own_job(run: Run) -> str:
     """The key of the job whose settings a run was stored with; of scored pictures, the command."""
     parts = run.record["made_of"]
     if "config" not in parts:
-        return str(run.record["command"])
+        return run.command
     return job_key(parts["config"], parts.get("turns", ""))
 
 

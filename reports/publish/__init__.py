@@ -126,7 +126,7 @@ def _origin(run: Run) -> Texts:
     return {
         "method": str(run.facts["method"]),
         "figures": "; ".join(figures),
-        "command": run.record["command"],
+        "command": run.command,
         **run.provenance,
         **({"settings": chosen} if chosen else {}),
     }
