@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from bench.types import Camera, Rays, check_shape
+from bench.types import Camera, Rays, TwoTensors, check_shape
 
 
 def pixel_grid(width: int, height: int, device: torch.device | str = "cpu") -> Tensor:
@@ -38,7 +38,7 @@ def unproject(camera: Camera, pixels: Tensor, depth: Tensor) -> Tensor:
     return rays.origins + depth[:, None] * rays.directions
 
 
-def project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
+def project(camera: Camera, points: Tensor) -> TwoTensors:
     """Pixels [..., 2] and z-depth [...] of `points` [..., 3] (Eq. 7, 9); none unless depth > 0."""
     check_shape("points", points, *[None] * (points.dim() - 1), 3)
     rotation = camera.rotation.to(points.dtype)

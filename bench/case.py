@@ -16,11 +16,12 @@ import torch
 from torch import Tensor
 
 from bench.clock import times_ms
-from bench.types import Log, Unavailable
+from bench.kinds import Named, Names, Row, Rows
+from bench.types import Log, SomeTensors, Unavailable
 
 Cell = tuple[str, str]  # a backend or an engine, and a precision
 Computation = Callable[[str], tuple[Tensor, ...]]  # computes the outputs with a backend
-Given = Mapping[str, Any]  # the inputs of an operation, by name
+Given = Named  # the inputs of an operation, by name
 Tolerance = float | Tensor  # the largest allowed error of a result, or of each of its numbers
 
 DTYPES = {
@@ -88,7 +89,7 @@ class Case:
         """Whether its inputs are few, so that checking it takes but a moment."""
         return not (self.slow or self.timed)
 
-    def check(self, cell: Cell, device: str) -> dict[str, Any]:
+    def check(self, cell: Cell, device: str) -> Row:
         """Check one cell; "status" is "ok", "failed", or "failed: " or "unavailable: " and why."""
         backend, precision = cell
         error, tolerance = math.inf, self.tolerances[cell]
@@ -115,6 +116,9 @@ class Case:
             "error": error if math.isfinite(error) else None,
             "status": status,
         }
+
+
+Cases = list[Case]
 
 
 @dataclass(frozen=True)
@@ -162,7 +166,7 @@ class Operation:
     """An operation; all its `backends` agree with the reference, forward and backward."""
 
     subject: str
-    backends: Sequence[str]
+    backends: Names
     compute: Callable[..., Any]  # its results, of the inputs by name and a `backend`
     outputs: Mapping[str, Bound]  # of each result, by its name, in their order
     gradients: Mapping[str, Bound] = field(default_factory=dict)  # of an input or a list of them
@@ -176,7 +180,7 @@ class Operation:
         *settings: object,
         precision: str = "fp32",
         items: int = 0,
-    ) -> list[Case]:
+    ) -> Cases:
         """The cases with the inputs that `make` makes of `settings` on the CPU: one of the outputs
         and, if there are gradients, one of outputs and gradients. They are timed if `items`, the
         number that a call processes, is at least `LEAST_TIMED`."""
@@ -200,9 +204,7 @@ class Operation:
             found.append(case)
         return found
 
-    def _prepare(
-        self, make: Callable[[], Given], learned: Sequence[str], device: str
-    ) -> Computation:
+    def _prepare(self, make: Callable[[], Given], learned: Names, device: str) -> Computation:
         """Computes the outputs, then the gradients of the inputs `learned`."""
         given = placed(make(), device)
         wanted = [x.requires_grad_() for name in learned for x in _several(given[name])]
@@ -249,7 +251,7 @@ class Operation:
         return [bound.of(given) for bound in bounds]
 
 
-def _several(value: Tensor | Sequence[Tensor]) -> Sequence[Tensor]:
+def _several(value: Tensor | SomeTensors) -> SomeTensors:
     return [value] if isinstance(value, Tensor) else value
 
 
@@ -273,7 +275,7 @@ def placed(value: Any, device: str, precision: str = "") -> Any:
 
 
 def on_backends(
-    units: float, *precisions: str, backends: Sequence[str] = ("reference", "cpu")
+    units: float, *precisions: str, backends: Names = ("reference", "cpu")
 ) -> dict[Cell, float]:
     """Tolerances of `units` u: of `backends` in fp32, of the reference alone in `precisions`."""
     cells = [*product(backends, ("fp32",)), *product(("reference",), precisions)]
@@ -281,7 +283,7 @@ def on_backends(
 
 
 def nearest(
-    results: Sequence[Tensor], reference: Sequence[Tensor], tolerances: Sequence[Tolerance]
+    results: SomeTensors, reference: SomeTensors, tolerances: Sequence[Tolerance]
 ) -> Deviation:
     """The error of that number of all results which is nearest to its tolerance, or exceeds it by
     the largest factor; inf if shapes or non-finite values differ."""
@@ -299,7 +301,7 @@ def nearest(
     return worst
 
 
-def largest_error(results: Sequence[Tensor], reference: Sequence[Tensor]) -> float:
+def largest_error(results: SomeTensors, reference: SomeTensors) -> float:
     """Largest |result - reference| over all outputs; inf if shapes or non-finite values differ."""
     return nearest(results, reference, [1.0] * len(results)).error
 
@@ -315,7 +317,7 @@ def _errors(got: Tensor, want: Tensor) -> Tensor:
     return torch.where(error.isnan(), torch.inf, error)
 
 
-def run_cases(cases: Sequence[Case], devices: Sequence[str], log: Log) -> Iterator[dict[str, Any]]:
+def run_cases(cases: Sequence[Case], devices: Names, log: Log) -> Iterator[Row]:
     """Check all cells of `cases` on all `devices`, and yield their rows; see `Case.check`."""
     cells = sum(len(case.tolerances) for case in cases)
     with log.progress("stress", cells * len(devices)) as progress:
@@ -326,13 +328,13 @@ def run_cases(cases: Sequence[Case], devices: Sequence[str], log: Log) -> Iterat
                 progress.advance(note="")
 
 
-def failed(row: Mapping[str, Any]) -> bool:
+def failed(row: Named) -> bool:
     return row["status"].startswith("failed")
 
 
 def timed_rows(
     cases: Sequence[Case], device: str, backends: Collection[str], repeats: int, log: Log
-) -> list[dict[str, Any]]:
+) -> Rows:
     """Check the cases and time the correct ones; one row per timed case and supported backend.
 
     A backend that fails any case of a kernel, timed or not, is not timed; its status names these
@@ -341,7 +343,7 @@ def timed_rows(
     """
     subjects = {case.subject for case in cases if case.timed}
     checked = [case for case in cases if case.subject in subjects and not case.slow]
-    results: list[tuple[Case, Difference, list[dict[str, Any]]]] = []
+    results: list[tuple[Case, Difference, Rows]] = []
     wrong: dict[tuple[str, str], list[str]] = {}
     with log.progress("kernels", len(checked) + sum(bool(c.timed) for c in checked)) as progress:
         for case in checked:
@@ -365,7 +367,7 @@ def timed_rows(
     return rows
 
 
-def _row(case: Case, check: Mapping[str, Any], times: Mapping[str, float]) -> dict[str, Any]:
+def _row(case: Case, check: Named, times: Mapping[str, float]) -> Row:
     backend = check["backend"]
     row = {
         "kernel": case.subject,

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bench.cameras import cast, look_at, move_camera, pixel_grid, place_camera, project, unproject
-from bench.case import U32, Case, Property
+from bench.case import U32, Case, Cases, Property
 from bench.types import Camera
 
 IDENTITY = torch.eye(4)[:3]
@@ -30,7 +30,7 @@ CAMERAS = {
 DEPTHS = (1e-20, 1e-3, 1.0, 1e6, 1e20)
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """Cases that project and unproject points at all scales, or move everything rigidly."""
     front = _property("projection", "its depth is not positive, its pixel finite", "comparisons: 0")
     pixels = _property(

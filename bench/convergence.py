@@ -3,13 +3,13 @@
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from bench.clock import times_ms
+from bench.kinds import Rows
 from bench.types import Log
 
 
@@ -33,9 +33,7 @@ class Experiment:
 
 
 @torch.no_grad()
-def experiment_rows(
-    experiments: Sequence[Experiment], repeats: int, log: Log
-) -> list[dict[str, Any]]:
+def experiment_rows(experiments: Sequence[Experiment], repeats: int, log: Log) -> Rows:
     """Run the experiments; one row for each trial: its largest absolute error, median and extremes
     of `repeats` times, and the observed order, fitted on the `smooth` settings."""
     rows = []

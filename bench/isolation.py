@@ -18,6 +18,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ import numpy as np
 import torch
 from PIL import ImageFile
 
+from bench.kinds import Json, Say, Texts, Values
 from bench.provenance import is_edited
 from bench.threads import in_parallel
 from bench.types import Budget, Camera, Log, Method, Scene, SteerbenchError
@@ -132,7 +134,7 @@ OF_IMPORTS = ("the environment", "filters of warnings")
 """Parts that libraries change when they are first imported; no line is said of these."""
 
 
-def _state() -> dict[str, Any]:
+def _state() -> Values:
     """The global state that is put back, but for random numbers, by what it is called."""
     device = torch.get_default_device()
     return {
@@ -167,7 +169,7 @@ def _folder() -> str:
         return ""
 
 
-def _set_environment(variables: dict[str, str]) -> None:
+def _set_environment(variables: Texts) -> None:
     os.environ.clear()
     os.environ.update(variables)
 
@@ -192,14 +194,6 @@ def _set_autocast(kinds: list[bool]) -> None:
         torch.set_autocast_enabled(kind, enabled)
 
 
-def _set_onednn(enabled: bool) -> None:
-    torch.backends.mkldnn.enabled = enabled  # type: ignore[assignment]
-
-
-def _set_truncated(allowed: bool) -> None:
-    ImageFile.LOAD_TRUNCATED_IMAGES = allowed
-
-
 def _set_collection(enabled: bool) -> None:
     (gc.enable if enabled else gc.disable)()
 
@@ -207,10 +201,6 @@ def _set_collection(enabled: bool) -> None:
 def _set_cudnn(values: list[Any]) -> None:
     for name, value in zip(CUDNN, values, strict=True):
         setattr(torch.backends.cudnn, name, value)
-
-
-def _set_cores(cores: set[int]) -> None:
-    os.sched_setaffinity(0, cores)
 
 
 SETTERS: Mapping[str, Callable[[Any], object]] = {
@@ -221,8 +211,8 @@ SETTERS: Mapping[str, Callable[[Any], object]] = {
     "torch's precision of products": torch.set_float32_matmul_precision,
     "torch's deterministic mode": torch.set_deterministic_debug_mode,
     "torch's autocast": _set_autocast,
-    "torch's use of oneDNN": _set_onednn,
-    "Pillow's reading of truncated files": _set_truncated,
+    "torch's use of oneDNN": partial(setattr, torch.backends.mkldnn, "enabled"),
+    "Pillow's reading of truncated files": partial(setattr, ImageFile, "LOAD_TRUNCATED_IMAGES"),
     "collection of garbage": _set_collection,
     "the interval of switching threads": sys.setswitchinterval,
     "cuDNN's options": _set_cudnn,
@@ -233,11 +223,11 @@ SETTERS: Mapping[str, Callable[[Any], object]] = {
     "sys.argv": _set_words,
     "handlers of signals": _set_handlers,
     "filters of warnings": _set_warnings,
-    "the cores of this process": _set_cores,
+    "the cores of this process": partial(os.sched_setaffinity, 0),
 }
 """What sets each part of `_state` again."""
 
-USUAL: Mapping[str, object] = {
+USUAL: Json = {
     "torch's default type": torch.float32,
     "torch's default device": None,
     "torch's recording of gradients": True,
@@ -266,7 +256,7 @@ def _draw_from(drawn: tuple[Any, ...]) -> None:
 
 
 @contextmanager
-def put_back(tell: Callable[[str], object] = lambda part: None) -> Iterator[None]:
+def put_back(tell: Say = lambda part: None) -> Iterator[None]:
     """Put the global state of this process back as it was when the body ends; `tell` gets each part
     but random numbers that the body changed."""
     before = _state()

@@ -12,7 +12,6 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,6 +21,7 @@ from torch import Tensor
 from bench.clock import FrameRecord, StageClock, counted
 from bench.errors import unexpected
 from bench.isolation import Guard, Isolated, check_originals, fit, lent, moved, sees_scored
+from bench.kinds import Labels, Names, Numbers, Rows, Values
 from bench.memory import MemoryMeter, give_back
 from bench.metrics import Lpips, psnr_of_mse
 from bench.neighbours import Neighbours, Watch
@@ -149,7 +149,7 @@ class _Take:
             _shown(task),
             task.scene.surface,
         )
-        self.rows: list[dict[str, Any]] = []  # of the first round
+        self.rows: Rows = []  # of the first round
         # Of its steady frames with a ground truth, how far they are from the first method's: MSE,
         # and largest difference of any channel.
         self.apart: list[tuple[float, float]] = []
@@ -229,25 +229,21 @@ def _shown(task: Task) -> set[int]:
 
 
 def _measurement(
-    take: _Take, task: Task, missing: Mapping[str, str], neighbours: Neighbours, in_turns: int
+    take: _Take, task: Task, missing: Labels, neighbours: Neighbours, in_turns: int
 ) -> Measurement:
     """What was measured of one of `in_turns` methods."""
-    scene = task.scene
-    trajectory = task.trajectory
-    protocol = task.protocol
-    budget = task.budget
-    method = take.method
-    scoring = take.scoring
+    scene, trajectory, protocol = task.scene, task.trajectory, task.protocol
+    method, scoring = take.method, take.scoring
     peak_bytes, source = take.peak(in_turns)
     records, means = take.timed(len(take.clock.frames) - protocol.rounds * len(take.rows))
     rows_of_frames = [row | _costs(timed) for row, timed in zip(take.rows, records, strict=True)]
     frames = _frame_table(rows_of_frames, scoring.names)
-    summary: list[dict[str, Any]] = []
+    summary: Rows = []
     for phase in (STEADY, COLD):
         of_phase = frames[frames["phase"] == phase]
         if len(of_phase):
             summary += [row | {"phase": phase} for row in phase_rows(of_phase)]
-    whole: dict[str, float] = {}
+    whole: Numbers = {}
     if protocol.rounds > 1:
         whole |= {"frame_ms.fastest": min(means), "frame_ms.slowest": max(means)}
     if take.apart:  # the PSNR from the MSE over all frames, inf if they are equal
@@ -268,14 +264,14 @@ def _measurement(
         trajectory=trajectory.name,
         resolution=trajectory.resolution,
         protocol=protocol.name,
-        budget=budget.name,
+        budget=task.budget.name,
         seed=task.seed,
         **facts,
     )
     known = [row["metric"] for row in summary if row["n"]]
-    record: dict[str, Any] = {
+    record: Values = {
         "protocol": asdict(protocol),
-        "budget": asdict(budget),
+        "budget": asdict(task.budget),
         "scene": {"name": scene.name, "digest": scene.digest, "unit_length": scene.unit_length},
         "parts": dict(study_of(method).parts),
         "missing": {**missing, **scoring.missing(known)},
@@ -289,26 +285,25 @@ def _measurement(
     return Measurement(rows, frames, scoring.images, record)
 
 
-def _sizes(method: Method) -> dict[str, float]:
+def _sizes(method: Method) -> Numbers:
     """The bytes of each component of `method`, and of all; none if it tells none."""
-    sizes = method.sizes()
-    found: dict[str, float] = {}
-    for part, size in sizes.items():
-        found[f"size_bytes.{part}"] = counted(f"{method.name}: size of {part}", size)
+    found: Numbers = {
+        f"size_bytes.{part}": counted(f"{method.name}: size of {part}", size)
+        for part, size in method.sizes().items()
+    }
     return found | {"size_bytes.total": sum(found.values())} if found else {}
 
 
-def _costs_of_training(method: Method) -> dict[str, float]:
+def _costs_of_training(method: Method) -> Numbers:
     """Seconds and peak memory of the training, and the seconds of compiling if that was needed."""
-    found: dict[str, float] = {}
-    found["train_s"] = method.train_s
-    found["train_peak_bytes"] = getattr(method, "train_peak_bytes", math.nan)
-    seconds = getattr(method, "compile_s", 0.0)
-    if seconds:
+    found: Numbers = {
+        "train_s": method.train_s,
+        "train_peak_bytes": getattr(method, "train_peak_bytes", math.nan),
+    }
+    if seconds := getattr(method, "compile_s", 0.0):
         found["compile_s"] = seconds
     for name, value in found.items():
-        known = not math.isnan(value)
-        if known and not 0 <= value < math.inf:
+        if value < 0 or value == math.inf:
             raise unexpected(f"{method.name}: {name}", "0 or more, or NaN: not known", value)
     return found
 
@@ -335,7 +330,7 @@ def _doubted_times(records: Sequence[FrameRecord]) -> str:
     )
 
 
-def _waits(of_frames: Sequence[Counter[CodeLine]]) -> list[dict[str, Any]]:
+def _waits(of_frames: Sequence[Counter[CodeLine]]) -> Rows:
     """Where the host waits for the GPU in a steady frame, the most frequent first."""
     return [
         {"waits": count / len(of_frames), "line": line.place, "source": line.source}
@@ -447,7 +442,7 @@ def _score(
     protocol = task.protocol
     if index == len(task.trajectory.steps) // 2:
         take.middle = frame.rgb.cpu()
-    figures: dict[str, Any] = {"frame": index, "phase": phase}
+    figures: Values = {"frame": index, "phase": phase}
     scored = step.truth is not None
     truth: Tensor | None = None
     mask: Tensor | None = None
@@ -476,7 +471,7 @@ def _score(
     take.rows.append(figures | scores)
 
 
-def _costs(record: FrameRecord) -> dict[str, float]:
+def _costs(record: FrameRecord) -> Numbers:
     return {
         "frame_ms": record.total_ns / 1e6,
         **({} if record.wall_ns is None else {"wall_ms": record.wall_ns / 1e6}),
@@ -486,7 +481,7 @@ def _costs(record: FrameRecord) -> dict[str, float]:
     }
 
 
-def _frame_table(table: list[dict[str, Any]], scores: Sequence[str]) -> pd.DataFrame:
+def _frame_table(table: Rows, scores: Names) -> pd.DataFrame:
     """One row per frame; missing stages and counters are 0, missing scores NaN."""
     frames = pd.DataFrame(table)
     touched = [name for name in map(str, frames) if name.startswith(("stage_ms.", "work."))]

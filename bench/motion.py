@@ -5,7 +5,6 @@ about a `target` [3], the point in scene units that the cameras look at or move 
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -14,7 +13,7 @@ from torch import Generator, Tensor
 from torch.nn.functional import normalize
 
 from bench.errors import unexpected
-from bench.types import Camera, Scene, check_shape
+from bench.types import Camera, Cameras, Scene, check_shape
 
 BEND_DEG = 2.0  # the rotation axis of a random motion turns by at most this a frame
 ZOOM = 0.005
@@ -95,7 +94,7 @@ def preceding(
     return [replace(frame, c2w=frame.c2w.to(camera.c2w)) for frame in path[:0:-1]]
 
 
-def novel_view(cameras: Sequence[Camera], target: Tensor, generator: Generator) -> Camera:
+def novel_view(cameras: Cameras, target: Tensor, generator: Generator) -> Camera:
     """A random camera from the region in which `cameras` view `target` [3].
 
     It lies between a camera and one of its nearest neighbours by direction, at a distance between
@@ -118,7 +117,7 @@ def novel_view(cameras: Sequence[Camera], target: Tensor, generator: Generator) 
     return _turned(view, target, step, zoom)
 
 
-def _nearest(cameras: Sequence[Camera], target: Tensor, index: int) -> list[int]:
+def _nearest(cameras: Cameras, target: Tensor, index: int) -> list[int]:
     """The cameras whose direction to `target` is nearest to that of camera `index`, of those with
     pictures of its size; without any, that camera itself."""
     offsets = torch.stack([_offset(camera, target) for camera in cameras])  # [N, 3]

@@ -6,7 +6,6 @@ OpenCV's in those of NerfBaselines, instant-ngp and 3D Gaussian Splatting.
 
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,7 +30,7 @@ from bench.scenes.files import (
 )
 from bench.scenes.remarks import Remarks
 from bench.scenes.transforms import KNOWN, program_maps, read_camera, read_lens
-from bench.types import Camera, Scene
+from bench.types import Camera, Cameras, Scene
 
 KEYFRAMES = "camera_path"  # under which a file of nerfstudio's viewer lists its cameras
 OURS = {"coordinates": "data set"}  # in such files that we wrote
@@ -173,11 +172,11 @@ def _out_of_model(
     return moved
 
 
-def _centres(cameras: Sequence[Camera]) -> Tensor:
+def _centres(cameras: Cameras) -> Tensor:
     return torch.stack([camera.centre for camera in cameras])
 
 
-def _moved(cameras: Sequence[Camera], move: Tensor, where: Path) -> list[Camera]:
+def _moved(cameras: Cameras, move: Tensor, where: Path) -> list[Camera]:
     """The cameras after a similarity [4, 4] moved the world."""
     scale = number(torch.linalg.det(move).item(), f"{where}: determinant", 0) ** (1 / 3)
     moved = []
@@ -197,7 +196,7 @@ def _centred(pose: Tensor, degrees: object, width: int, height: int, settings: F
 
 def write_path(
     path: Path,
-    cameras: Sequence[Camera],
+    cameras: Cameras,
     scene: Scene,
     fps: float = 30.0,
     nerfbaselines: bool = False,
@@ -215,7 +214,7 @@ def _plain(camera: Camera) -> bool:
     return all(math.isclose(*pair, rel_tol=1e-6) for pair in pairs)
 
 
-def _viewers(cameras: Sequence[Camera], fps: float) -> dict:
+def _viewers(cameras: Cameras, fps: float) -> dict:
     first, keyframes = cameras[0], []
     for camera in cameras:
         pose = opengl_to_opencv(camera.c2w.double())  # its own inverse: it flips two axes
@@ -234,7 +233,7 @@ def _viewers(cameras: Sequence[Camera], fps: float) -> dict:
     }
 
 
-def _nerfbaselines(cameras: Sequence[Camera], fps: float) -> dict:
+def _nerfbaselines(cameras: Cameras, fps: float) -> dict:
     frames = [
         {
             "pose": camera.c2w.flatten().tolist(),

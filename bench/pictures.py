@@ -5,11 +5,11 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from glob import glob
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 from unicodedata import normalize
 
 import pandas as pd
@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from bench.errors import not_there, some, unexpected
+from bench.kinds import Named, Names, Rows, Size
 from bench.metrics import Lpips, check_size
 from bench.protocol import EvaluationProtocol
 from bench.results import STEADY, Measurement, read_table
@@ -25,7 +26,7 @@ from bench.scenes.images import contents, decode_bytes
 from bench.scenes.lookup import natural
 from bench.scoring import PICTURES, Scoring
 from bench.trajectories import resolution, spread
-from bench.types import BACKGROUNDS, Camera, Log, Split, SteerbenchError, composite
+from bench.types import BACKGROUNDS, ByCamera, Camera, Log, Split, SteerbenchError, composite
 
 SUFFIXES = (
     ".png", ".jpg", ".jpeg", ".webp", ".avif", ".bmp", ".gif", ".jp2", ".ppm", ".tif", ".tiff",
@@ -68,7 +69,7 @@ def pairs_with_split(pictures: Path, split: Split, match: Match = "name") -> lis
     return [Pair(*pair) for pair in pairs]
 
 
-def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
+def matched(folder: Path, names: Names, match: Match) -> list[Path]:
     """The file of `folder` for each of `names`, without ending: by its path below the folder, or by
     its name if all are in the folder. Raises if one is missing, surplus or ambiguous."""
     files = listed(folder)
@@ -96,7 +97,7 @@ def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
     return [known[name] for name in names]
 
 
-def _keys(names: Sequence[str]) -> list[str]:
+def _keys(names: Names) -> list[str]:
     """`names` without ending, and without the folders that all of them are in."""
     names = [normalize("NFC", name.lstrip("/")) for name in names]  # not as macOS writes accents
     paths = [Path(name).with_suffix("") for name in names]
@@ -104,7 +105,7 @@ def _keys(names: Sequence[str]) -> list[str]:
     return [str(path.relative_to(shared)) for path in paths]
 
 
-def below(folder: Path, pattern: str, endings: Sequence[str] = ()) -> list[Path]:
+def below(folder: Path, pattern: str, endings: Names = ()) -> list[Path]:
     """What is in a folder by a `pattern`, with one of the `endings` if there are any, 10 after 9:
     unlike what Path finds, without what is hidden, and through links."""
     names = sorted(glob(pattern, root_dir=folder, recursive=True), key=natural)  # noqa: PTH207
@@ -165,12 +166,12 @@ def score(
     pairs: Sequence[Pair],
     protocol: EvaluationProtocol,
     lpips: Mapping[str, Lpips],
-    facts: Mapping[str, Any],
+    facts: Named,
     log: Log,
     *,
     sequence: bool = False,
     kept: int = PICTURES,
-    surface: Callable[[Camera], Tensor] | None = None,
+    surface: ByCamera | None = None,
     times: Sequence[float] = (),
 ) -> Measurement:
     """Score pictures under a protocol, on whose background any alpha is composited.
@@ -182,8 +183,8 @@ def score(
     """
     background = torch.full((3,), BACKGROUNDS[protocol.background])
     scoring = Scoring(protocol, lpips, background, spread(len(pairs), kept), surface)
-    frames: list[dict[str, Any]] = []
-    sizes: list[tuple[int, int]] = []
+    frames: Rows = []
+    sizes: list[Size] = []
     alphas = 0
     seen, truths = hashlib.sha256(), hashlib.sha256()
     with log.progress("scoring", len(pairs)) as progress:
@@ -232,5 +233,5 @@ def _check(
         raise SteerbenchError(f"{path}: {error}") from error
 
 
-def _repeated(names: Sequence[str]) -> list[str]:
+def _repeated(names: Names) -> list[str]:
     return sorted((name for name, count in Counter(names).items() if count > 1), key=natural)

@@ -16,7 +16,7 @@ import struct
 import subprocess
 import sys
 import sysconfig
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sized
+from collections.abc import Collection, Iterable, Iterator, Sized
 from contextlib import suppress
 from functools import cache
 from importlib import metadata
@@ -26,6 +26,10 @@ from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 from bench.errors import SteerbenchError, unexpected
+from bench.kinds import Json, Named, Names, Texts
+from bench.records import without
+
+Stamp = tuple[int, ...]  # of a file, see `stamp`
 
 ROOT = Path(__file__).resolve().parent.parent
 OURS = ("bench", "methods")
@@ -56,7 +60,7 @@ def commit() -> str:
     return _commit_of(Path(__file__)) or metadata.version("steerbench")
 
 
-def repositories(*things: Any) -> dict[str, str]:
+def repositories(*things: Any) -> Texts:
     """The commits of the git checkouts that files of others among the `sources` of `things` lie in,
     with `-dirty` if changed, by their top-level package."""
     first = {name.partition("/")[0]: path for name, path in sorted(sources(*things).items())}
@@ -79,7 +83,7 @@ def _commit_of(file: Path) -> str | None:
         return None
 
 
-def machine() -> dict[str, object]:
+def machine() -> Json:
     """The machine and its system, for the record of a run."""
     import torch  # imported here, because reading the store needs no torch
 
@@ -99,7 +103,7 @@ def machine() -> dict[str, object]:
     }
 
 
-def computed_by(*things: Any) -> dict[str, object]:
+def computed_by(*things: Any) -> Json:
     """What decides the results of `things` (classes or functions) beside their inputs, for keys."""
     record = machine()
     return {
@@ -107,15 +111,15 @@ def computed_by(*things: Any) -> dict[str, object]:
         "libraries": libraries(*things),
         "machine": {name: record[name] for name in ("cpu", "instructions", "gpus", "python")},
         "threads": record["threads"],
-        "environment": {name: of for name, of in _tuning().items() if name not in OF_TIMES},
+        "environment": without(_tuning(), OF_TIMES),
     }
 
 
-def _tuning() -> dict[str, str]:
+def _tuning() -> Texts:
     return {name: of for name, of in sorted(os.environ.items()) if TUNING.match(name)}
 
 
-def conditions_apart(then: Mapping[str, Any]) -> str:
+def conditions_apart(then: Named) -> str:
     """What may change times since a run with `then` as record of its machine, although it changes
     no result; empty if nothing."""
     cores = len(os.sched_getaffinity(0))
@@ -173,14 +177,14 @@ def sums_of(places: Iterable[Path], where: str) -> list[str]:
     return sorted(code_sha256(file) for file in found)
 
 
-def stamp(path: Path) -> tuple[int, ...]:
+def stamp(path: Path) -> Stamp:
     """Times, size and number of a file: they change whenever its content does."""
     now = path.stat()
     return now.st_mtime_ns, now.st_ctime_ns, now.st_size, now.st_ino
 
 
 @cache
-def _sha256(path: Path, stamp: tuple[int, ...]) -> str:
+def _sha256(path: Path, stamp: Stamp) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -189,13 +193,13 @@ class _Module(NamedTuple):
     """What is known of a file of Python: the modules, and names from modules, that it imports
     anywhere in its code; SHA-256 of its syntax tree; whether it reads docstrings."""
 
-    imports: tuple[str, ...]
+    imports: Names
     sha256: str
     documented: bool = False
 
 
 @cache
-def _module(path: Path, stamp: tuple[int, ...]) -> _Module:
+def _module(path: Path, stamp: Stamp) -> _Module:
     content = path.read_bytes()
     in_bytes = hashlib.sha256(content).hexdigest()
     try:
@@ -248,7 +252,7 @@ def _is_text(node: object) -> bool:
     return alone and isinstance(node.value.value, str)  # type: ignore[attr-defined]
 
 
-def libraries(*things: Any) -> dict[str, str]:
+def libraries(*things: Any) -> Texts:
     """Versions of all installed distributions that the `sources` of `things` import.
 
     A class that loads libraries by name lists them in its attribute `libraries`.
@@ -399,7 +403,7 @@ def is_as_loaded(path: Path) -> bool:
 
 
 @cache
-def _is_compiled(path: Path, compiled: Path, *stamps: tuple[int, ...]) -> bool:
+def _is_compiled(path: Path, compiled: Path, *stamps: Stamp) -> bool:
     """Whether what Python has `compiled` of a file is what the file holds."""
     content = compiled.read_bytes()
     flags, time, size = struct.unpack("<4xIII", content[:16])
@@ -494,7 +498,7 @@ def _ours(name: str) -> list[Path]:
     return []
 
 
-def _imports(path: Path) -> tuple[str, ...]:
+def _imports(path: Path) -> Names:
     return _module(path, stamp(path)).imports if path.suffix == ".py" else ()
 
 

@@ -1,7 +1,7 @@
 """Files of JSON: what is wrong with one is said in one line, with the file and the place in it."""
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import MISSING, fields, is_dataclass
 from functools import partial
 from pathlib import Path
@@ -9,6 +9,7 @@ from types import UnionType
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from bench.errors import nearest, not_there, unexpected
+from bench.kinds import Named, Values
 
 T = TypeVar("T")
 
@@ -60,6 +61,11 @@ def read_json(path: Path, kind: Callable[[dict], dict] | None = None, listed: st
 def read_record(path: Path) -> Any:
     """The `Record` in a file of ours; raises as `read_json` does."""
     return read_json(path, partial(Record, path=path))
+
+
+def without(values: Named, names: Collection[str]) -> Values:
+    """The `values` by name, but for those of `names`."""
+    return {name: value for name, value in values.items() if name not in names}
 
 
 def made(kind: type[T], held: Any, where: str) -> T:

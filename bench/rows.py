@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 from scipy import fft, special
 
+from bench.kinds import Names, Row, Rows
 from bench.results import WHOLE
 
 CONFIDENCE = 0.95
@@ -21,13 +22,13 @@ UNITS = {
 """Units of metrics, by name up to the first dot; other metrics have no unit."""
 
 
-def row_table(rows: Sequence[dict[str, Any]], **facts: Any) -> pd.DataFrame:
+def row_table(rows: Sequence[Row], **facts: Any) -> pd.DataFrame:
     """The table of `rows` with their units and the `facts` that all of them share."""
     units = [UNITS.get(row["metric"].split(".")[0], "1") for row in rows]
     return pd.DataFrame(rows).assign(unit=units, **facts)
 
 
-def phase_rows(frames: pd.DataFrame) -> list[dict[str, Any]]:
+def phase_rows(frames: pd.DataFrame) -> Rows:
     """Mean and interval of every column, quantiles of the frame time, frames per second.
 
     `frames` are at least one, in path order, with columns `frame`, `name` and `phase`, scores,
@@ -48,13 +49,13 @@ def phase_rows(frames: pd.DataFrame) -> list[dict[str, Any]]:
     ]
 
 
-def score_rows(frames: pd.DataFrame, scores: Sequence[str]) -> list[dict[str, Any]]:
+def score_rows(frames: pd.DataFrame, scores: Names) -> Rows:
     """Mean and interval of each of `scores`; of the flicker only where a frame has one."""
     named = [name for name in scores if name != "flicker" or frames[name].notna().any()]
     return [mean_row(name, frames[name]) for name in named]
 
 
-def mean_row(metric: str, values: pd.Series) -> dict[str, Any]:
+def mean_row(metric: str, values: pd.Series) -> Row:
     """The row of a metric: mean and interval over the frames, in path order, that have a value."""
     known = values.dropna().to_numpy(dtype=float)
     value = known.mean() if len(known) else math.nan
@@ -63,7 +64,7 @@ def mean_row(metric: str, values: pd.Series) -> dict[str, Any]:
     return {"metric": metric} | figures
 
 
-def single(metric: str, value: float) -> dict[str, Any]:
+def single(metric: str, value: float) -> Row:
     """The row of a single figure; it belongs to the whole run unless its phase is replaced."""
     known = int(not math.isnan(value))
     row = {"metric": metric, "value": float(value), "n": known, "lo": math.nan, "hi": math.nan}

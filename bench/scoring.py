@@ -1,7 +1,7 @@
 """Scores of rendered frames by a protocol, one after the other, with pictures of some of them."""
 
 from collections import deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -10,8 +10,9 @@ from torch import Tensor
 
 from bench import metrics, video_metrics
 from bench.errors import unexpected
+from bench.kinds import Numbers, Texts
 from bench.protocol import EvaluationProtocol
-from bench.types import Camera, Frame, SteerbenchError, composite
+from bench.types import ByCamera, Camera, Frame, SteerbenchError, composite
 
 PICTURES = 3  # default number of scored frames whose pictures are kept
 ERROR_RANGE = 0.1  # mean absolute error of the brightest colour of an error map
@@ -99,7 +100,7 @@ class Scoring:
         lpips: Mapping[str, metrics.Lpips],
         background: Tensor,
         shown: Collection[int],
-        surface: Callable[[Camera], Tensor] | None = None,
+        surface: ByCamera | None = None,
     ) -> None:
         self.images: dict[str, np.ndarray] = {}
         self._protocol, self._lpips, self._scored = protocol, lpips, 0
@@ -127,14 +128,14 @@ class Scoring:
         camera: Camera | None = None,
         depth: Tensor | None = None,
         mask: Tensor | None = None,
-    ) -> dict[str, float]:
+    ) -> Numbers:
         """The figures of frame `index`, rendered as `rgb` [H, W, 3].
 
         `truth` is uint8 [H, W, 3 or 4]; that of a frame which is not `scored` serves the path
         alone. `depth` [H, W] is the method's own, `mask` bool [H, W] says which pixels count.
         Frames before a `cut`, or of another size, are not compared with.
         """
-        figures: dict[str, float] = {}
+        figures: Numbers = {}
         true = None if truth is None else composite(truth.to(rgb.device), self._background)
         shown, mask = rgb, mask if self._protocol.mask == "scene" else None
         if mask is not None and true is not None:
@@ -154,9 +155,9 @@ class Scoring:
         kept = self._protocol.rounded(rgb).cpu(), None if true is None else true.cpu()
         return figures | self._path(Shot(*kept, view), cut, rgb.device)
 
-    def _path(self, shot: Shot, cut: bool, device: torch.device) -> dict[str, float]:
+    def _path(self, shot: Shot, cut: bool, device: torch.device) -> Numbers:
         """The figures of the next frame against those before it, LPIPS computed on `device`."""
-        figures: dict[str, float] = {}
+        figures: Numbers = {}
         if cut or (self._last and self._last[-1].image.shape != shot.image.shape):
             self._last.clear()
         before = self._last[-1] if self._last else None
@@ -174,7 +175,7 @@ class Scoring:
                     figures[f"{name}_true"] = error
         return figures
 
-    def _step(self, now: Tensor, true: Tensor, old: Tensor, true_old: Tensor) -> dict[str, float]:
+    def _step(self, now: Tensor, true: Tensor, old: Tensor, true_old: Tensor) -> Numbers:
         """The figures of a frame and its truth, and those of the frame before.
 
         tPSNR is the PSNR of the change from frame to frame, tLPIPS the absolute difference of its
@@ -187,7 +188,7 @@ class Scoring:
             figures[f"tlpips_{net}"] = abs(lpips(old, now) - lpips(true_old, true))
         return figures
 
-    def missing(self, found: Collection[str]) -> dict[str, str]:
+    def missing(self, found: Collection[str]) -> Texts:
         """Why wanted metrics are not among those `found`, but for networks that are not there."""
         needs = {name: video_metrics.NEEDS[name.split("_")[0]] for name in self._of_path}
         why = {name: f"needs {what}" for name, what in needs.items() if name not in found}

@@ -7,7 +7,7 @@ all cameras. `bench.motion` computes the motion between two poses, `bench.paths`
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -20,6 +20,7 @@ from torch import Tensor
 
 from bench.cameras import frame_camera
 from bench.errors import unexpected
+from bench.kinds import Size
 from bench.motion import (
     between,
     lens_between,
@@ -32,7 +33,7 @@ from bench.paths import MODEL, read_path
 from bench.provenance import sha256
 from bench.scenes.files import whole_number
 from bench.scenes.remarks import Remarks
-from bench.types import Camera, Scene, SteerbenchError
+from bench.types import Camera, Cameras, Scene, SteerbenchError
 
 MIXED = "mixed"  # the resolution of a trajectory whose frames differ in size
 
@@ -82,7 +83,7 @@ def resized(trajectory: Trajectory, width: int, height: int) -> Trajectory:
     return replace(trajectory, steps=tuple(steps))
 
 
-def resolution(sizes: Iterable[tuple[int, int]]) -> str:
+def resolution(sizes: Iterable[Size]) -> str:
     """`WIDTHxHEIGHT` of pictures with these widths and heights, or `MIXED`."""
     names = {f"{width}x{height}" for width, height in sizes}
     return names.pop() if len(names) == 1 else MIXED
@@ -177,7 +178,7 @@ def approached(
 
 def _kept(
     scene: Scene, split: str, limit: int, *, spaced: bool = False
-) -> tuple[Sequence[Camera], list[int], str]:
+) -> tuple[Cameras, list[int], str]:
     """The cameras of a split; the indices of the first, or evenly `spaced`, `limit` (0: all) of
     them; and the part of the trajectory's name that says how many these are."""
     if split not in scene.splits or not len(scene.splits[split]):
@@ -261,7 +262,7 @@ def spline(
     return Trajectory(name, through.split, tuple(steps), through.reads, through.notes)
 
 
-def leading(keys: Sequence[Camera], target: Tensor, degrees: float) -> list[list[Camera]]:
+def leading(keys: Cameras, target: Tensor, degrees: float) -> list[list[Camera]]:
     """A smooth path through `keys`, one segment for each key but the first.
 
     A segment holds the cameras after the previous key, up to and including its own, evenly spaced

@@ -35,6 +35,11 @@ from torch import Tensor
 from bench.errors import SteerbenchError as SteerbenchError
 from bench.errors import Unavailable as Unavailable
 from bench.errors import unexpected
+from bench.kinds import Json, Names, Size, Sizes, Texts
+
+TwoTensors = tuple[Tensor, Tensor]
+SomeTensors = Sequence[Tensor]
+ThreeTensors = tuple[Tensor, Tensor, Tensor]
 
 EMPTY_ALPHA = 1e-3  # pixels with a lower opacity are empty: their depth is +inf
 BACKGROUNDS = {"white": 1.0, "black": 0.0}  # by name, every channel of `Scene.background`
@@ -79,7 +84,7 @@ class Camera:
     height: int
 
     @property
-    def size(self) -> tuple[int, int]:
+    def size(self) -> Size:
         """Width and height."""
         return self.width, self.height
 
@@ -97,6 +102,10 @@ class Camera:
     def centre(self) -> Tensor:
         """[3], where the camera is."""
         return self.c2w[:, 3]
+
+
+Cameras = Sequence[Camera]
+ByCamera = Callable[[Camera], Tensor]  # a picture, or a map with its size
 
 
 @dataclass(frozen=True)
@@ -129,9 +138,9 @@ class Split:
     """Cameras and their pictures, `images[n]` uint8 [H, W, 3 or 4] (4: straight alpha). `masks`,
     if any, say which pixels count, bool [H, W]; None: all of that picture."""
 
-    cameras: Sequence[Camera]
-    images: Sequence[Tensor]
-    names: Sequence[str]
+    cameras: Cameras
+    images: SomeTensors
+    names: Names
     masks: Sequence[Tensor | None] = ()
 
     def __len__(self) -> int:
@@ -163,8 +172,8 @@ class Scene:
     digest: str  # content hash of cameras, pictures and normalisation
     origin: Tensor = field(default_factory=lambda: torch.zeros(3).double())  # float64
     space: str = "box"
-    exact: Callable[[Camera], Tensor] | None = None
-    surface: Callable[[Camera], Tensor] | None = None
+    exact: ByCamera | None = None
+    surface: ByCamera | None = None
     maps: Mapping[str, Tensor] = field(default_factory=dict)
     files: tuple[Path, ...] = ()  # that it was read from
 
@@ -206,7 +215,7 @@ class Log(Protocol):
     def progress(self, label: str, total: int) -> AbstractContextManager[Progress]:
         """A progress bar with the time left, for work of `total` steps."""
 
-    def stage_dir(self, kind: str, key: Mapping[str, object]) -> Path:
+    def stage_dir(self, kind: str, key: Json) -> Path:
         """The folder of a trained stage, `outputs/stages/<kind>-<hash of key>`; made if missing."""
 
 
@@ -269,10 +278,10 @@ class Method(Protocol):
     def render(self, camera: Camera, probe: Probe) -> Frame:
         """Render one frame of the current sequence."""
 
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         """Bytes by component, as stored in a file of the model."""
 
-    def settings(self) -> dict[str, str]:
+    def settings(self) -> Texts:
         """The resolved `device`, `backend`, `engine`, `precision` and `field_precision`, which rows
         show as docs/protocol.md explains."""
 

@@ -146,7 +146,7 @@ def gap(metric: str, one: Repeated, other: Repeated) -> Gap:
     ]
     if not pairs:
         return NOT_MEASURED
-    by_scene = grouped(pairs, lambda pair: pair[0].record["scene"]["digest"]).values()
+    by_scene = grouped(pairs, lambda pair: pair[0].digest).values()
     of_scenes = [[_apart(metric, *pair) for pair in of_scene] for of_scene in by_scene]
     # The seeds of a scene share what is particular to it: of several scenes, each is one sample.
     means = [float(np.mean(of_scene)) for of_scene in of_scenes]
@@ -166,7 +166,7 @@ def _identity(run: Run, metric: str) -> tuple[object, ...]:
     measured in turns with it: equal in a pair."""
     timed = metric.partition(".")[0] in TIMES
     when = (run.computer, run.record["made_of"].get("beside")) if timed else ()
-    return (run.record["scene"]["digest"], run.facts["seed"], when)
+    return (run.digest, run.facts["seed"], when)
 
 
 def _apart(metric: str, run: Run, twin: Run) -> float:

@@ -1,16 +1,17 @@
 """Tables of several runs, a line for each of their settings, with the best figures in bold."""
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from functools import partial
 
 import pandas as pd
 
 from bench.errors import SteerbenchError
+from bench.kinds import Labels, Names
 from bench.rows import UNITS, half_interval
 from reports.lines import COMMON, Lines, Settings
-from reports.runs import Repeated, Run, grouped, joined, listed
+from reports.runs import Repeated, Runs, TableLines, conditions, grouped, joined, listed
 from reports.tables import BOLD, NOT_AVAILABLE, QUALITY, Metric, Table, decimal, megabytes
 
 Write = Callable[[str, float], str]  # writes a figure of a metric
@@ -28,7 +29,7 @@ COLD_FRAMES = (
 )
 
 
-def comparison(lines: Lines, failures: Mapping[str, str]) -> list[Table]:
+def comparison(lines: Lines, failures: Labels) -> list[Table]:
     """The figures of `lines`, then those of their cold frames if they have any.
 
     Figures are ranked only among lines under the same conditions, if there are at least two; the
@@ -57,8 +58,8 @@ def columns_of(lines: Lines) -> list[str]:
 def _table(
     title: str,
     settings: Settings,
-    lines: Sequence[Repeated],
-    metrics: Sequence[str],
+    lines: TableLines,
+    metrics: Names,
 ) -> Table:
     columns = dict(settings)
     phases = [str(line.runs[0].headline["phase"].iloc[0]) for line in lines]
@@ -72,9 +73,7 @@ def _table(
     return line_table(title, columns, lines)
 
 
-def line_table(
-    title: str, columns: Mapping[str, Sequence[str]], lines: Sequence[Repeated]
-) -> Table:
+def line_table(title: str, columns: Mapping[str, Names], lines: TableLines) -> Table:
     """A table of `lines` from its `columns`, by their headings."""
     cells = list(zip(*columns.values(), strict=True))
     return Table(title, tuple(columns), cells, [line.keys for line in lines])
@@ -110,9 +109,7 @@ def written(line: Repeated, metric: str, write: Write = usual) -> str | None:
     return f"{write(metric, mean)} ± {write(metric, half)}" if half > 0 else write(metric, mean)
 
 
-def marked(
-    lines: Sequence[Repeated], metric: str, marks: Sequence[str], write: Write = usual
-) -> list[str | None]:
+def marked(lines: TableLines, metric: str, marks: Names, write: Write = usual) -> list[str | None]:
     """A column: what `written` returns for each line, the best and the second best with `marks`.
 
     The second of two gets no mark (see `ranks`), and no stage does.
@@ -123,7 +120,7 @@ def marked(
     return [text and forms.get(places.get(n, 0), "%s") % text for n, text in enumerate(texts)]
 
 
-def ranks(lines: Sequence[Repeated], metric: str, write: Write = usual) -> dict[int, int]:
+def ranks(lines: TableLines, metric: str, write: Write = usual) -> dict[int, int]:
     """The rank, from 1, of each of `lines` among those under the same conditions, by its index.
 
     Figures share the rank of a better one from which they differ by no more than the interval over
@@ -163,18 +160,13 @@ def _apart(one: Repeated, other: Repeated, metric: str, write: Write) -> bool:
     return not abs(high.mean() - low.mean()) <= interval  # nan: of a perfect seed
 
 
-def machines(runs: Sequence[Run]) -> str:
+def machines(runs: Runs) -> str:
     """On which machines `runs` were measured, with how many threads."""
     found = (run.record["machine"] for run in runs)
     return joined(f"{x['cpu']} with {x['threads']} threads" for x in found)
 
 
-def conditions(runs: Sequence[Run], names: Sequence[str]) -> dict[str, str]:
-    """The facts `names` of `runs`, each with all of its values."""
-    return {name: joined(run.facts[name] for run in runs) for name in names}
-
-
-def conditions_of(runs: Sequence[Run], without: Collection[str] = ()) -> str:
+def conditions_of(runs: Runs, without: Collection[str] = ()) -> str:
     """Scene, resolution, trajectory and so on of `runs`, as text, `without` some of them."""
     names = [name for name in COMMON if name not in without]
     return listed(conditions(runs, names))

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 
 import pandas as pd
 
+from bench.kinds import Names
 from reports.comparison import conditions_of, marked, shown_as, usual
 from reports.paper_tables import Measured, PaperTable, Shown, figure_table
-from reports.tables import Table, decimal
+from reports.tables import Rows, Table, decimal
 
 DECIMALS = {"ssim": 3, "lpips": 3, "frame": 2, "size": 1}
 """Decimals of the paper where pages have others, by the first part of a metric's name."""
@@ -83,8 +84,8 @@ def _tabular(
     caption: str,
     name: str,
     sides: str,
-    heads: Sequence[str],
-    rows: Sequence[Sequence[str]],
+    heads: Names,
+    rows: Rows,
 ) -> str:
     """A table for the package booktabs; the cells of `rows` are LaTeX already."""
     return pd.DataFrame(rows, columns=list(map(escaped, heads))).to_latex(

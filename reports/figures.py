@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import cycle
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
@@ -19,11 +18,12 @@ from matplotlib.transforms import Bbox
 from numpy.typing import ArrayLike
 
 from bench.clock import OTHER
+from bench.kinds import Named, Values
 from bench.results import COLD
 from reports.comparison import written
 from reports.images import Picture
 from reports.lines import METHOD, Lines, Settings
-from reports.runs import Repeated, Run
+from reports.runs import Repeated, Run, Runs, TableLines
 from reports.tables import NOT_AVAILABLE
 
 LEGEND_COLUMNS = 4
@@ -61,8 +61,7 @@ def stage_bars(runs: Sequence[Run | Repeated], path: Path) -> None:
     widths[OTHER] = widths.pop(OTHER)
     ends = widths.cumsum(axis=1)
     legend_lines = -(-len(widths.columns) // LEGEND_COLUMNS)
-    figure = Figure(figsize=(8, 0.7 + 0.25 * legend_lines + 0.5 * len(runs)), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = _plot(height=0.7 + 0.25 * legend_lines + 0.5 * len(runs))
     for number, (part, width) in enumerate(widths.items()):
         colour = "lightgrey" if part == OTHER else _style(number)["color"]
         axes.barh(
@@ -74,13 +73,11 @@ def stage_bars(runs: Sequence[Run | Repeated], path: Path) -> None:
     axes.set_yticks(widths.index, [run.label for run in runs])
     axes.invert_yaxis()
     axes.set_xlabel("mean ms of a frame")
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(loc="outside upper center", ncols=LEGEND_COLUMNS, frameon=False)
-    _save(figure, path)
+    _save_with_legend(figure, path)
 
 
 def quality_plot(
-    lines: Sequence[Repeated], metric: str, settings: Mapping[str, Sequence[str]] = {}
+    lines: TableLines, metric: str, settings: Mapping[str, Sequence[str]] = {}
 ) -> Picture:
     """`quality_against` as a part of a page, with a mark for each line that has both figures."""
     stem, _, axis = COSTS[metric]
@@ -95,7 +92,7 @@ def quality_plot(
 
 
 def quality_against(
-    lines: Sequence[Repeated], metric: str, path: Path, settings: Mapping[str, Sequence[str]] = {}
+    lines: TableLines, metric: str, path: Path, settings: Mapping[str, Sequence[str]] = {}
 ) -> None:
     """Write a PNG: PSNR of each of `lines` against its `metric`, one of `COSTS`, with its name.
 
@@ -106,7 +103,7 @@ def quality_against(
     _, unit, label = COSTS[metric]
     figure, axes = _of_quality(label)
     first = next(iter(settings.values()), range(len(lines)))  # methods
-    styles: Sequence[Mapping[str, Any]] = [_style(number) for number in range(len(lines))]
+    styles: Sequence[Named] = [_style(number) for number in range(len(lines))]
     handles: Sequence[Line2D] = ()
     crowded = len(set(first)) < len(lines) or len(lines) > MOST_NAMES
     if crowded and any(len(set(of)) > 1 for of in settings.values()):
@@ -141,7 +138,7 @@ def quality_against(
 
 def _legend(
     settings: Settings,
-) -> tuple[Sequence[Mapping[str, Any]], Sequence[Line2D]]:
+) -> tuple[Sequence[Named], Sequence[Line2D]]:
     """The style of each line by its settings, and what a legend says of them: the first setting
     that differs has colours, the others markers."""
     first, *rest = (
@@ -180,7 +177,7 @@ def _name(axes: Axes, points: Sequence[tuple[str, tuple[float, float]]]) -> None
         taken.append(box)
 
 
-def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
+def quality_over_frames(runs: Runs, path: Path) -> None:
     """Write a PNG: PSNR of scored frames along the path, one curve per run; cold are hollow."""
     figure, axes = _of_quality("frame of the path", height=3.5)
     for number, run in enumerate(runs):
@@ -188,8 +185,7 @@ def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
         colour, cold = _style(number)["color"], scored[scored["phase"] == COLD]
         axes.plot(scored["frame"], scored["psnr"], marker="o", color=colour, label=run.label)
         axes.plot(cold["frame"], cold["psnr"], "o", color=colour, markerfacecolor="white")
-    figure.legend(loc="outside upper center", ncols=LEGEND_COLUMNS, frameon=False)
-    _save(figure, path)
+    _save_with_legend(figure, path)
 
 
 def quality_along(lines: Lines, name: str, path: Path) -> None:
@@ -231,23 +227,29 @@ def as_number(value: str) -> float | None:
         return None
 
 
-def _style(number: int) -> dict[str, Any]:
+def _style(number: int) -> Values:
     marker, colour = MARKERS[number % len(MARKERS)], COLOURS[number % len(COLOURS)]
     return {"marker": marker, "color": colour, "linestyle": "none"}
 
 
 def _of_quality(across: str, height: float = 4.5) -> tuple[Figure, Axes]:
     """An empty plot of the PSNR, with the label of the axis across."""
-    figure = Figure(figsize=(8, height), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = _plot(height)
     axes.set_xlabel(across)
     axes.set_ylabel("PSNR, dB")
     axes.grid(alpha=0.3)
+    return figure, axes
+
+
+def _plot(height: float) -> tuple[Figure, Axes]:
+    """An empty plot, open at the top and on the right."""
+    figure = Figure(figsize=(8, height), layout="constrained")
+    axes = figure.subplots()
     axes.spines[["top", "right"]].set_visible(False)
     return figure, axes
 
 
-def frontier_plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+def frontier_plot(rows: Sequence[Named], path: Path) -> None:
     """Write a PNG: error of a frame against its time, log-log, one point per setting.
 
     The left panel shows the error against the ground truth, with the Pareto frontier as a
@@ -283,7 +285,7 @@ def frontier_plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 def _circle(axes: Axes, rows: pd.DataFrame, column: str) -> None:
     """Circle the points of `rows`, and name each on its left unless another name is there."""
-    style: dict[str, Any] = {"textcoords": "offset points", "size": 8, "ha": "right", "va": "top"}
+    style: Values = {"textcoords": "offset points", "size": 8, "ha": "right", "va": "top"}
     names: list[np.ndarray] = []
     for setting, ms, error in zip(rows["setting"], rows["ms"], _rms(rows[column]), strict=True):
         place = (ms, error)
@@ -319,6 +321,11 @@ def _error_against_time(axes: Axes, rows: pd.DataFrame, column: str) -> None:
         axis.set_minor_locator(NullLocator())
     axes.grid(color="0.92")
     axes.set_axisbelow(True)
+
+
+def _save_with_legend(figure: Figure, path: Path) -> None:
+    figure.legend(loc="outside upper center", ncols=LEGEND_COLUMNS, frameon=False)
+    _save(figure, path)
 
 
 def _save(figure: Figure, path: Path, dpi: int = 150) -> None:

@@ -15,10 +15,11 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import uniform_filter
 
+from bench.kinds import Size
 from bench.results import COLD
 from bench.trajectories import spread
-from reports.runs import Run, read_picture
-from reports.tables import Table
+from reports.runs import Run, Runs, read_picture
+from reports.tables import Rows, Table
 
 MOST_FRAMES = 3  # maximum number of frames of a run on a page
 
@@ -80,16 +81,17 @@ class ComparedFrame:
 
 
 Part = str | Table | Picture | ComparedFrame  # a part that is a string is Markdown
+Parts = Iterator[Part]  # of a page
 
 
-def kept_frames(runs: Sequence[Run]) -> list[str]:
+def kept_frames(runs: Runs) -> list[str]:
     """File name prefixes of at most `MOST_FRAMES` frames that all `runs` kept, evenly spread."""
     kept = [{path.name.split("-")[0] for path in run.pictures.glob("*-truth.png")} for run in runs]
     common = sorted(set.intersection(*kept))
     return [common[index] for index in spread(len(common), MOST_FRAMES)]
 
 
-def frame_section(runs: Sequence[Run], frame: str, stem: str) -> Iterator[str | ComparedFrame]:
+def frame_section(runs: Runs, frame: str, stem: str) -> Iterator[str | ComparedFrame]:
     """`frame` of `runs` as parts of a page: heading, pictures and caption."""
     first = runs[0]
     truth = read_picture(first.pictures / f"{frame}-truth.png")
@@ -180,7 +182,7 @@ def write_image(frame: ComparedFrame, path: Path) -> None:
     _compose(titles, bands, size).save(path)
 
 
-def _error_colours(size: tuple[int, int]) -> Image.Image:
+def _error_colours(size: Size) -> Image.Image:
     """A panel with the colours of an error map, from no error on."""
     colours = matplotlib.colormaps["inferno"](np.linspace(0, 1, size[0]), bytes=True)[None, :, :3]
     panel = Image.new("RGB", size, PAPER)
@@ -193,9 +195,7 @@ def _outlined(panel: Image.Image, box: Sequence[int]) -> Image.Image:
     return panel
 
 
-def _compose(
-    titles: Sequence[Sequence[str]], bands: Sequence[Band], size: tuple[int, int]
-) -> Image.Image:
+def _compose(titles: Rows, bands: Sequence[Band], size: Size) -> Image.Image:
     """Arrange panels of this size in rows and columns, below titles and captions."""
     width, height = size
     heads = max(map(len, titles))
@@ -217,7 +217,7 @@ def _compose(
     return image
 
 
-def _write(image: Image.Image, place: tuple[int, int], text: str, room_px: int) -> None:
+def _write(image: Image.Image, place: Size, text: str, room_px: int) -> None:
     """Write one line of text, in a smaller size if it does not fit."""
     draw, size = ImageDraw.Draw(image), 16
     while size > 8 and draw.textlength(text, font=ImageFont.load_default(size)) > room_px:

@@ -1,15 +1,25 @@
 """Runs as lines of a table: seeds are repetitions, and settings that differ are columns."""
 
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
 import pandas as pd
 
+from bench.kinds import Choices, Names, Say, Texts
 from bench.results import COLUMNS, Store, content_key
-from reports.runs import Repeated, Run, grouped, over_common_frames, readable, unseeded
+from reports.runs import (
+    Repeated,
+    Run,
+    Runs,
+    TableLines,
+    grouped,
+    over_common_frames,
+    readable,
+    unseeded,
+)
 from reports.tables import QUALITY
 
 METHOD = "method"  # the first column
@@ -39,14 +49,14 @@ class Lines:
     with the value of each line.
     """
 
-    lines: Sequence[Repeated]
+    lines: TableLines
     settings: Settings
 
     @property
     def runs(self) -> list[Run]:
         return [run for line in self.lines for run in line.runs]
 
-    def frame(self, metrics: Sequence[str]) -> pd.DataFrame:
+    def frame(self, metrics: Names) -> pd.DataFrame:
         """A row each: settings, number of seeds, means of metrics and halves of their intervals."""
         figures: dict[str, Sequence[Any]] = {
             **self.settings,
@@ -58,7 +68,7 @@ class Lines:
         return pd.DataFrame(figures)
 
 
-def as_lines(runs: Sequence[Run]) -> Lines:
+def as_lines(runs: Runs) -> Lines:
     """The lines of `runs`, over the frames that are steady in all of them.
 
     The label of a run is shown as its method.
@@ -94,7 +104,7 @@ def seedless(lines: Lines) -> list[str]:
     return found
 
 
-def differing(runs: Sequence[Run]) -> dict[str, list[str]]:
+def differing(runs: Runs) -> Choices:
     """What `varied` finds, under short names: the symbol of the paper, or the last part."""
     columns = varied(runs)
     symbols = {name: of for run in runs for name, of in run.record.get("axes", {}).items()}
@@ -102,7 +112,7 @@ def differing(runs: Sequence[Run]) -> dict[str, list[str]]:
     return {short[name]: values for name, values in columns.items()}
 
 
-def shortened(names: Sequence[str]) -> dict[str, str]:
+def shortened(names: Names) -> Texts:
     """The last part of each of the `names` of settings or, if several columns end so, all of it."""
     ends = [*(name.rpartition(".")[2] for name in names), *TAKEN]
     return {
@@ -110,7 +120,7 @@ def shortened(names: Sequence[str]) -> dict[str, str]:
     }
 
 
-def varied(runs: Sequence[Run]) -> dict[str, list[str]]:
+def varied(runs: Runs) -> Choices:
     """The facts and the settings beside method and seed that differ between `runs`, with their
     values.
 
@@ -133,7 +143,7 @@ def varied(runs: Sequence[Run]) -> dict[str, list[str]]:
     return columns
 
 
-def results(store: Store, report: Callable[[str], object] = lambda line: None) -> pd.DataFrame:
+def results(store: Store, report: Say = lambda line: None) -> pd.DataFrame:
     """Every row of all runs, with a column for each setting that differs between them and, where
     runs differ in no setting, one with the commits and the time of each.
 
@@ -168,9 +178,9 @@ def _line_of(run: Run) -> str:
     return content_key({"settings": _settings(run), "where": list(map(str, run.conditions))})
 
 
-def _settings(run: Run) -> dict[str, str]:
+def _settings(run: Run) -> Texts:
     """The settings of a run by name, without seeds, as text; none for scored pictures."""
-    config = run.record["made_of"].get("config", {})
+    config = run.config
     return {name: _text(name, of) for name, of in unseeded(config) if name not in HIDDEN}
 
 
@@ -182,5 +192,5 @@ def _text(name: str, value: Any) -> str:
 
 def _typed(run: Run) -> list[str]:
     """The names of the settings that were typed for a run."""
-    words = shlex.split(str(run.record["command"]))
+    words = shlex.split(run.command)
     return [word.lstrip("+").partition("=")[0] for word in words if "=" in word]

@@ -1,18 +1,19 @@
 """Writes a page about measured runs: one table of all, pictures, provenance of every figure."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
+from bench.kinds import Labels
 from bench.results import Store
 from reports import figures
 from reports.comparison import comparison, conditions_of, machines
-from reports.images import MOST_RENDERINGS, Part, Picture, frame_section, kept_frames
+from reports.images import MOST_RENDERINGS, Parts, Picture, frame_section, kept_frames
 from reports.lines import Lines, as_lines
 from reports.publish import publish
-from reports.runs import Run, grouped, joined, load_runs, missing_figures
+from reports.runs import Run, Runs, grouped, joined, load_runs, missing_figures
 from reports.tables import Table, run_tables
 
 
@@ -49,7 +50,7 @@ def write_page(
     return publish(parts, folder, runs)
 
 
-def _heading(lines: Lines, failures: Mapping[str, str]) -> Iterator[Part]:
+def _heading(lines: Lines, failures: Labels) -> Parts:
     """Title, the table of all lines, and how to read it."""
     runs, (methods, *varied) = lines.runs, lines.settings
     labels = ", ".join(dict.fromkeys(lines.settings[methods]))
@@ -87,7 +88,7 @@ def _heading(lines: Lines, failures: Mapping[str, str]) -> Iterator[Part]:
     yield from missing_figures(runs)
 
 
-def _tradeoffs(lines: Lines) -> Iterator[Part]:
+def _tradeoffs(lines: Lines) -> Parts:
     """Plots of quality against its costs, if there are lines to compare."""
     for title, metric, better in (
         ("Quality against time", "frame_ms", "faster"),
@@ -103,7 +104,7 @@ def _tradeoffs(lines: Lines) -> Iterator[Part]:
             )
 
 
-def _ablations(lines: Lines) -> Iterator[Part]:
+def _ablations(lines: Lines) -> Parts:
     """Plots of quality over the settings with several numbers."""
     scored = lines.frame(["psnr"]).dropna(subset=["psnr"])
     for name in lines.settings:
@@ -114,7 +115,7 @@ def _ablations(lines: Lines) -> Iterator[Part]:
             yield "Bars are intervals over seeds; dashed: what has no such setting."
 
 
-def _pictures(runs: Sequence[Run]) -> Iterator[Part]:
+def _pictures(runs: Runs) -> Parts:
     """Images of the kept frames; runs that rendered the same frames share images."""
     groups = grouped(runs, lambda run: run.views).values()
     parts = [
@@ -126,16 +127,16 @@ def _pictures(runs: Sequence[Run]) -> Iterator[Part]:
     yield from ("## Pictures", *(parts or ["No picture was kept."]))
 
 
-def _figures(run: Run) -> Iterator[Part]:
+def _figures(run: Run) -> Parts:
     yield f"## {run.label}, run {run.key}"
     for table in run_tables(run.rows):
         yield f"### {table.title}"
         yield replace(table, sources=[[run.key]] * len(table.lines))
 
 
-def _provenance(runs: Sequence[Run]) -> Iterator[Part]:
+def _provenance(runs: Runs) -> Parts:
     """The commands, then facts: one line if all runs share it, otherwise one line per run."""
-    commands = "\n".join(dict.fromkeys(run.record["command"] for run in runs))
+    commands = "\n".join(dict.fromkeys(run.command for run in runs))
     lines = []
     for name in runs[0].provenance:
         values = [run.provenance[name] for run in runs]

@@ -3,7 +3,7 @@
 Its texts, and which lines its plots and images show, are in `paper/page.yaml`.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,12 +11,13 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from bench.kinds import Labels, Named
 from reports import figures
 from reports.claims import NOT_MEASURED, claim_table, finding_table
-from reports.images import Part, Picture, frame_section, kept_frames
+from reports.images import Parts, Picture, frame_section, kept_frames
 from reports.paper_tables import Measured, PaperTable, comparisons, measured_where, section
 from reports.publish import publish
-from reports.runs import Repeated, Run, listed
+from reports.runs import Repeated, Run, Runs, TableLines, listed
 
 PAGE: Any = OmegaConf.to_container(OmegaConf.load(Path(__file__).parent / "paper" / "page.yaml"))
 
@@ -36,9 +37,9 @@ def write_paper_page(
 def _parts(
     tables: Sequence[PaperTable],
     measured: Measured,
-    runs: Sequence[Run],
-    missing: Mapping[str, str],
-) -> Iterator[Part]:
+    runs: Runs,
+    missing: Labels,
+) -> Parts:
     shown = PAGE if any(table.number is not None for table in tables) else _of_own(tables)
     yield f"# {shown['title']}"
     compared = [each for table in tables for each in comparisons(table, measured)]
@@ -72,7 +73,7 @@ def _parts(
     yield f"## Runs\n\nTheir keys in the store, and the commands:\n\n```\n{sources}\n```"
 
 
-def _of_own(tables: Sequence[PaperTable]) -> Mapping[str, Any]:
+def _of_own(tables: Sequence[PaperTable]) -> Named:
     """Title, plots and images of all lines, for tables that are not the paper's."""
     every = ((table.name, key, line) for table in tables for key, line in table.lines.items())
     lines = {line.label: (name, key) for name, key, line in every}
@@ -83,7 +84,7 @@ def _of_own(tables: Sequence[PaperTable]) -> Mapping[str, Any]:
     }
 
 
-def _plot(plot: Mapping[str, Any], lines: Sequence[Repeated]) -> Iterator[Part]:
+def _plot(plot: Named, lines: TableLines) -> Parts:
     """A plot of `lines` with heading and caption, if any was measured."""
     if "metric" in plot:
         drawn = figures.quality_plot(lines, plot["metric"])
@@ -97,7 +98,7 @@ def _plot(plot: Mapping[str, Any], lines: Sequence[Repeated]) -> Iterator[Part]:
         yield plot["caption"].strip()
 
 
-def _images(title: str, lines: Sequence[Repeated]) -> Iterator[Part]:
+def _images(title: str, lines: TableLines) -> Parts:
     runs = _first_runs(lines, one_scene=True)
     runs = [run for run in runs if run.views == runs[0].views]
     if runs and (frames := kept_frames(runs)):
@@ -123,7 +124,7 @@ def _chosen(
     return chosen
 
 
-def _first_runs(lines: Sequence[Repeated], one_scene: bool) -> list[Run]:
+def _first_runs(lines: TableLines, one_scene: bool) -> list[Run]:
     """The first run of each line: the mean over all scenes, or that of the first scene."""
     runs = ((line.label, (line.measured if one_scene else line.runs)[0]) for line in lines)
     return [replace(run, label=label) for label, run in runs]

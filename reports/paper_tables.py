@@ -8,10 +8,12 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
+from bench.kinds import Labels, Names, Numbers, Texts
+from bench.records import without
 from reports.claims import Claim, Comparison, apart, compare, gap, told
-from reports.comparison import conditions, line_table, machines, marked, shown_as, written
+from reports.comparison import line_table, machines, marked, shown_as, written
 from reports.lines import COMMON
-from reports.runs import Repeated, Run, listed, missing_figures
+from reports.runs import Repeated, Runs, TableLines, conditions, listed, missing_figures
 from reports.tables import ABSENT, BOLD, Table
 
 METHOD = "method"  # the setting of a line that is another method
@@ -39,7 +41,7 @@ class Line:
     """
 
     label: str
-    job: Mapping[str, str]
+    job: Labels
     published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     every_seed: bool = False
     called: str = ""
@@ -61,17 +63,17 @@ class PaperTable:
 
     name: str
     title: str
-    metrics: Sequence[str]
+    metrics: Names
     lines: Mapping[str, Line]
-    data_sets: Sequence[str] = ("",)
-    published_on: Mapping[str, str] = field(default_factory=dict)
-    beside: Sequence[str] = ()
+    data_sets: Names = ("",)
+    published_on: Labels = field(default_factory=dict)
+    beside: Names = ()
     number: int | None = None
     notes: Sequence[str] = ()
     claims: Sequence[Claim] = ()
-    scenes: Sequence[str] = ()
+    scenes: Names = ()
     reference: str = ""
-    instead: Mapping[str, str] = field(default_factory=dict)
+    instead: Labels = field(default_factory=dict)
 
     @property
     def called(self) -> str:
@@ -136,7 +138,7 @@ class Shown:
         """The data set; of the first block, which has the title of the table, ""."""
         return "" if self.data_set == self.table.data_sets[0] else self.data_set
 
-    def published(self, metric: str) -> dict[str, float]:
+    def published(self, metric: str) -> Numbers:
         """The paper's figures, by key, of the lines that have one."""
         figures = {key: line.published.get(self.data_set, {}) for key, line in self.lines.items()}
         return {key: of[metric] for key, of in figures.items() if metric in of}
@@ -152,7 +154,7 @@ def comparisons(table: PaperTable, measured: Measured) -> list[Comparison]:
     ]
 
 
-def measured_where(runs: Sequence[Run]) -> dict[str, str]:
+def measured_where(runs: Runs) -> Texts:
     """Under which conditions, and on which machines, `runs` were measured."""
     return {**conditions(runs, (*COMMON, "seed", "commit")), "machine": machines(runs)}
 
@@ -181,7 +183,7 @@ def _block(block: Shown, said: Collection[str]) -> Iterator[str | Table]:
     of the table below its first block, and those on figures that could not be measured.
     """
     table, runs = block.table, [run for line in block.measured.values() for run in line.runs]
-    facts = {name: value for name, value in measured_where(runs).items() if name not in said}
+    facts = without(measured_where(runs), said)
     if runs and facts:
         yield f"Measured: {listed(facts)}."
     published = any(line.published.get(block.data_set) for line in block.lines.values())
@@ -226,7 +228,7 @@ def distance_table(block: Shown) -> Table:
     return _of_columns("Distances", "here (paper)", [reference, *runs.values()], columns)
 
 
-def _scenes(metrics: Sequence[str], lines: Sequence[Repeated]) -> Table:
+def _scenes(metrics: Names, lines: TableLines) -> Table:
     """Means over seeds, one line per scene and line."""
     shown = [
         Repeated(f"{scene}: {line.label}", line.by_scene[scene])
@@ -239,7 +241,7 @@ def _scenes(metrics: Sequence[str], lines: Sequence[Repeated]) -> Table:
 
 
 def _of_columns(
-    title: str, head: str, lines: Sequence[Repeated], columns: Mapping[str, Sequence[str | None]]
+    title: str, head: str, lines: TableLines, columns: Mapping[str, Sequence[str | None]]
 ) -> Table:
     """A table of `lines`, labelled and with their gaps, and the cells of `columns` by metric."""
     of_table = {head: [": ".join((line.label, *line.gaps)) for line in lines]}

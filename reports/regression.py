@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bench.errors import SteerbenchError, unexpected, unknown
+from bench.kinds import Words
 from bench.rows import half_interval, path_interval
 from reports.runs import Run
 from reports.tables import NETS, QUALITY, Table
@@ -32,7 +33,9 @@ class Limit:
         return f"{100 * self.relative:.4g} %" if self.relative else f"{self.absolute:.4g}"
 
 
-LIMITS: Mapping[str, Limit] = {
+Limits = Mapping[str, Limit]  # by metric
+
+LIMITS: Limits = {
     "psnr": Limit(1, absolute=0.1, unit="dB"),
     "ssim": Limit(1, absolute=0.002),
     **{f"lpips_{net}": Limit(-1, absolute=0.003) for net in NETS},
@@ -46,7 +49,7 @@ LIMITS: Mapping[str, Limit] = {
 """The metrics that are compared, unless a baseline has limits of its own."""
 
 
-def limited(words: Sequence[str], limits: Mapping[str, Limit] = LIMITS) -> dict[str, Limit]:
+def limited(words: Words, limits: Limits = LIMITS) -> dict[str, Limit]:
     """`limits` with those of `words` (psnr=0.2, frame_ms=10%); SteerbenchError if one is wrong."""
     directions = {metric: {"↑": 1, "↓": -1}.get(of.better) for metric, of in QUALITY.items()}
     known = {**{name: Limit(better) for name, better in directions.items() if better}, **LIMITS}
@@ -80,7 +83,7 @@ class Figures:
     views: str
 
     @classmethod
-    def of(cls, run: Run, limits: Mapping[str, Limit] = LIMITS) -> Figures:
+    def of(cls, run: Run, limits: Limits = LIMITS) -> Figures:
         values = {x: of for x, of in run.values.items() if x in limits and not math.isnan(of)}
         steady, frames = run.steady, {}
         for metric in values:
@@ -91,7 +94,7 @@ class Figures:
             if averaged[metric].notna().all():
                 frames[metric] = dict(zip(names, averaged[metric].astype(float), strict=True))
         views = [*map(str, run.views), run.rules]
-        scene = run.record["made_of"].get("config", {}).get("scene", {})
+        scene = run.config.get("scene", {})
         if scene.get("_target_") == "bench.scenes.embedded.load":
             views[0] = str(run.facts["scene"])
         return cls(values, frames, ", ".join(run.computer), ", ".join(views))
@@ -125,7 +128,7 @@ class Assertion:
 
 
 def changes(
-    old: Sequence[Figures], new: Sequence[Figures], limits: Mapping[str, Limit] = LIMITS
+    old: Sequence[Figures], new: Sequence[Figures], limits: Limits = LIMITS
 ) -> Iterator[Assertion]:
     """The change of every metric of `old` that has a limit, over runs with the same seeds.
 

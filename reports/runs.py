@@ -16,6 +16,7 @@ import torch
 
 from bench.clock import OTHER
 from bench.errors import SteerbenchError
+from bench.kinds import Labels, Named, Names, Numbers, Say, Texts, Values
 from bench.metrics import psnr
 from bench.neighbours import Neighbours
 from bench.records import Record
@@ -48,7 +49,7 @@ class Run:
     label: str
     rows: pd.DataFrame = field(repr=False)
     read_frames: Callable[[], pd.DataFrame] = field(repr=False)
-    record: Mapping[str, Any] = field(repr=False)
+    record: Named = field(repr=False)
     pictures: Path = field(repr=False)
 
     @property
@@ -83,9 +84,9 @@ class Run:
         return math.fsum(figures) if figures else None
 
     @property
-    def parts(self) -> dict[str, float]:
+    def parts(self) -> Numbers:
         """The mean ms of each part of a frame, as the method groups its stages, the rest last."""
-        grouping: Mapping[str, str] = self.record.get("parts", {})
+        grouping: Labels = self.record.get("parts", {})
         found = dict.fromkeys((*grouping.values(), OTHER), 0.0)
         for metric, value in self.values.items():
             if metric.startswith(STAGE):
@@ -113,10 +114,25 @@ class Run:
         return self.rows.drop(columns=list(FIGURES), errors="ignore").iloc[0]
 
     @property
+    def command(self) -> str:
+        """What measures it again."""
+        return str(self.record["command"])
+
+    @property
+    def config(self) -> Named:
+        """Its settings; none of scored pictures."""
+        return self.record["made_of"].get("config", {})
+
+    @property
+    def digest(self) -> str:
+        """The digest of its scene."""
+        return self.record["scene"]["digest"]
+
+    @property
     def views(self) -> tuple[object, ...]:
         """Equal for runs that rendered the same frames of the same scene."""
         where = (self.facts["split"], self.facts["trajectory"], self.facts["resolution"])
-        return (self.record["scene"]["digest"], *where, len(self.frames))
+        return (self.digest, *where, len(self.frames))
 
     @property
     def computer(self) -> tuple[str, ...]:
@@ -151,7 +167,7 @@ class Run:
         return float(np.mean(found)) if found else math.nan
 
     @property
-    def provenance(self) -> dict[str, str]:
+    def provenance(self) -> Texts:
         """Where the figures come from, except the command and the settings."""
         machine, record, row = self.record["machine"], self.record, self.facts
         memory = f"{machine['memory_bytes'] / 2**30:.0f} GiB"
@@ -160,7 +176,7 @@ class Run:
         seen = record.get("neighbours")  # none where nothing was timed here
         return {
             "run": self.key,
-            "scene": f"{row['scene']}, digest {record['scene']['digest'][:16]}",
+            "scene": f"{row['scene']}, digest {self.digest[:16]}",
             "frames": f"{row['trajectory']} at {row['resolution']}",
             "protocol": listed(record["protocol"]),
             "budget": listed(record["budget"]),
@@ -184,11 +200,14 @@ class Run:
         return ", ".join((self.facts["commit"], *(f"{top} {of}" for top, of in others.items())))
 
     @property
-    def settings(self) -> dict[str, str]:
+    def settings(self) -> Texts:
         """The settings of the method by the names that one types; none for scored pictures."""
-        method = self.record["made_of"].get("config", {}).get("method", {})
+        method = self.config.get("method", {})
         named = ((name, str(value)) for name, value in flat({"method": method}))
         return dict(pair for pair in named if "._" not in pair[0])  # Hydra's own, as `_target_`
+
+
+Runs = Sequence[Run]
 
 
 @dataclass(frozen=True)
@@ -201,13 +220,13 @@ class Repeated:
     """
 
     label: str
-    runs: Sequence[Run]
+    runs: Runs
     gaps: Sequence[str] = ()
-    by_scene: Mapping[str, Sequence[Run]] = field(default_factory=dict)
-    of_scenes: Sequence[Run] = ()
+    by_scene: Mapping[str, Runs] = field(default_factory=dict)
+    of_scenes: Runs = ()
 
     @property
-    def averaged(self) -> Sequence[Run]:
+    def averaged(self) -> Runs:
         """The stored runs that its means are made of, each of a single scene."""
         return self.of_scenes or self.runs
 
@@ -234,7 +253,7 @@ class Repeated:
         return half_interval(np.array(self._figures(metric)))
 
     @property
-    def parts(self) -> dict[str, float]:
+    def parts(self) -> Numbers:
         """The mean ms of each part of a frame; see `Run.parts`."""
         of_runs = pd.DataFrame([run.parts for run in self.runs]).fillna(0.0)
         return {str(part): float(ms) for part, ms in of_runs.mean().items()}
@@ -244,10 +263,13 @@ class Repeated:
         return [figure for figure in figures if figure is not None]
 
 
+TableLines = Sequence[Repeated]
+
+
 def readable(
     store: Store,
     keys: Collection[str] | None = None,
-    report: Callable[[str], object] = lambda unreadable: None,
+    report: Say = lambda unreadable: None,
 ) -> list[Run]:
     """Every readable run, or those in `keys`, labelled with its method, in the order of storing.
 
@@ -297,7 +319,7 @@ def _label(command: object, rows: pd.DataFrame) -> str:
     return typed[-1].partition("=")[2] if typed else str(rows["method"].iloc[0])
 
 
-def flat(node: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+def flat(node: Named, before: str = "") -> Iterator[tuple[str, Any]]:
     """The values of nested settings by the names that one types."""
     for name, value in node.items():
         if isinstance(value, Mapping) and value:
@@ -306,7 +328,7 @@ def flat(node: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]
             yield f"{before}{name}", value
 
 
-def unseeded(config: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+def unseeded(config: Named) -> Iterator[tuple[str, Any]]:
     """The `flat` settings of a run without its seed, and without those of its method, which have
     the same."""
     for name, value in flat(config):
@@ -315,13 +337,13 @@ def unseeded(config: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
             yield name, value
 
 
-def missing_figures(runs: Sequence[Run]) -> list[str]:
+def missing_figures(runs: Runs) -> list[str]:
     """Notes about every metric that could not be measured."""
     notes = (f"{name}: n/a. {why}" for run in runs for name, why in run.record["missing"].items())
     return list(dict.fromkeys(notes))
 
 
-def over_common_frames(runs: Sequence[Run]) -> list[Run]:
+def over_common_frames(runs: Runs) -> list[Run]:
     """The same runs, with steady figures recomputed over the frames that are steady in all of them.
 
     "All" are those of the same views. A method with memory has fewer steady frames, and the first
@@ -351,7 +373,7 @@ def _over(run: Run, kept: Collection[int]) -> Run:
     return replace(run, rows=rows)
 
 
-def over_scenes(runs: Sequence[Run]) -> Run:
+def over_scenes(runs: Runs) -> Run:
     """Average runs of one seed and different scenes into one run.
 
     Its rows are means of their headline rows, for the metrics that all of them have; its frames are
@@ -368,8 +390,7 @@ def over_scenes(runs: Sequence[Run]) -> Run:
         value=("value", lambda values: values.sum(skipna=False) / len(runs)),
         n=("n", "sum"),
     )
-    names = map(str, runs[0].facts.index)
-    facts: dict[str, Any] = {name: joined(run.facts[name] for run in runs) for name in names}
+    facts: Values = {**conditions(runs, list(map(str, runs[0].facts.index)))}
     facts["scene"] = f"mean of {', '.join(str(run.facts['scene']) for run in runs)}"
     facts["seed"] = runs[0].facts["seed"]
     key = facts["run"] = content_key({"mean of": [run.key for run in runs]})[:16]
@@ -380,13 +401,13 @@ def over_scenes(runs: Sequence[Run]) -> Run:
     return Run(key, runs[0].label, rows, frames, _record(runs), runs[0].pictures)
 
 
-def _record(runs: Sequence[Run]) -> dict[str, Any]:
+def _record(runs: Runs) -> Values:
     """The record of the first run, with the scenes, machines and missing figures of all."""
     records = [run.record for run in runs]
     machines = [record["machine"] for record in records]
     machine = {name: joined(of[name] for of in machines) for name in ("cpu", "threads")}
     gpus = list(dict.fromkeys(gpu for of in machines for gpu in of["gpus"]))
-    digest = content_key({"mean of": [record["scene"]["digest"] for record in records]})
+    digest = content_key({"mean of": [run.digest for run in runs]})
     return {
         **records[0],
         "machine": {**machines[0], **machine, "gpus": gpus},
@@ -406,7 +427,12 @@ def joined(values: Iterable[object]) -> str:
     return " / ".join(dict.fromkeys(map(str, values)))
 
 
-def listed(values: Mapping[str, Any]) -> str:
+def conditions(runs: Runs, names: Names) -> Texts:
+    """The facts `names` of `runs`, each with all of its values."""
+    return {name: joined(run.facts[name] for run in runs) for name in names}
+
+
+def listed(values: Named) -> str:
     """Names with their values, as text."""
     return ", ".join(
         f"{name} {' + '.join(value) or 'none' if isinstance(value, list) else value}"

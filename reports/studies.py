@@ -7,17 +7,16 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 from bench.clock import OTHER
 from bench.convergence import observed_order
-from reports.comparison import conditions
+from bench.kinds import Numbers, Values, Words
 from reports.figures import frontier_plot
-from reports.images import Part, Picture
-from reports.runs import Run, grouped
+from reports.images import Parts, Picture
+from reports.runs import Run, conditions, grouped
 from reports.tables import BOLD, DENSE, Table, Write, amount, decimal, megabytes, share
 
 WORK = "work."
@@ -34,7 +33,7 @@ class StudyLine:
     method: str
     group: str
     label: str
-    settings: tuple[str, ...] = ()
+    settings: Words = ()
     value: float = math.nan
 
 
@@ -63,7 +62,7 @@ class Measured:
         return self.run.values.get(metric, math.nan)
 
     @property
-    def work(self) -> dict[str, float]:
+    def work(self) -> Numbers:
         return {
             metric.removeprefix(WORK): value
             for metric, value in self.run.values.items()
@@ -71,10 +70,11 @@ class Measured:
         }
 
 
+MeasuredLines = Sequence[Measured]
 Columns = Mapping[str, Callable[[Measured], str]]  # what a column says of a line, by its heading
 
 
-def pooled(found: Sequence[Measured]) -> list[Measured]:
+def pooled(found: MeasuredLines) -> list[Measured]:
     """Each line once, with times that can be compared.
 
     Lines of different groups were not timed in the same minutes. Their times are scaled so that the
@@ -109,7 +109,7 @@ def by_method(found: Iterable[Measured]) -> dict[str, list[Measured]]:
     return {name: pooled(of) for name, of in methods.items()}
 
 
-def accuracy(found: Sequence[Measured]) -> Iterator[Part]:
+def accuracy(found: MeasuredLines) -> Parts:
     """Run time against error of all settings of a method, fastest first; the frontier is bold."""
     columns: Columns = {
         "ms / frame ↓": lambda line: decimal(line.ms, 1),
@@ -131,7 +131,7 @@ def accuracy(found: Sequence[Measured]) -> Iterator[Part]:
             yield Picture(f"frontier-{method}", shows, plot)
 
 
-def on_frontier(lines: Sequence[Measured]) -> list[Measured]:
+def on_frontier(lines: MeasuredLines) -> list[Measured]:
     """The lines, each with the best one that takes no longer: of the highest PSNR, then the least
     time. On the Pareto frontier that is the line itself."""
     rated = []
@@ -142,7 +142,7 @@ def on_frontier(lines: Sequence[Measured]) -> list[Measured]:
     return rated
 
 
-def _point(line: Measured) -> dict[str, Any]:
+def _point(line: Measured) -> Values:
     return {
         "setting": line.line.label,
         "knob": line.line.group,
@@ -156,7 +156,7 @@ def _point(line: Measured) -> dict[str, Any]:
     }
 
 
-def parity(found: Sequence[Measured]) -> Iterator[Part]:
+def parity(found: MeasuredLines) -> Parts:
     """Every engine and precision beside the first, torch in fp32."""
     columns: Columns = {
         **COMPARED,
@@ -169,7 +169,7 @@ def parity(found: Sequence[Measured]) -> Iterator[Part]:
         yield _table(f"{method}: engines and precisions,", "engine, precision", columns, lines)
 
 
-def skips(found: Sequence[Measured]) -> Iterator[Part]:
+def skips(found: MeasuredLines) -> Parts:
     """A frame without each of the skips: how it differs, and its work as a share of all work, that
     of the last line."""
     for method, lines in by_method(found).items():
@@ -179,7 +179,7 @@ def skips(found: Sequence[Measured]) -> Iterator[Part]:
         yield _table(title, "skipped", {**COMPARED, **shares}, lines)
 
 
-def breakdown(found: Sequence[Measured]) -> Iterator[Part]:
+def breakdown(found: MeasuredLines) -> Parts:
     """The ms of a frame that each of its parts takes itself, and where the host waits for a GPU."""
     there = dict.fromkeys(part for line in found for part in line.run.parts)
     columns: Columns = {
@@ -201,14 +201,14 @@ def breakdown(found: Sequence[Measured]) -> Iterator[Part]:
             yield Table(title, ("waits", "line", "source"), rows)
 
 
-def scaling(found: Sequence[Measured]) -> Iterator[Part]:
+def scaling(found: MeasuredLines) -> Parts:
     """How time, work and memory of a frame grow along each axis: all lines, and below those of an
     axis the exponent of each figure."""
     for method, lines in grouped(found, lambda each: each.line.method).items():
         yield _scaling_table(method, lines)
 
 
-def _scaling_table(method: str, every: Sequence[Measured]) -> Table:
+def _scaling_table(method: str, every: MeasuredLines) -> Table:
     counters = dict.fromkeys(name for line in every for name in line.work)
     figures: dict[str, tuple[str, Write]] = {
         "frame_ms": ("ms / frame ↓", partial(decimal, decimals=1)),
@@ -231,7 +231,7 @@ def _scaling_table(method: str, every: Sequence[Measured]) -> Table:
     return replace(_table(f"{method}:", "", columns, every), lines=cells, sources=sources)
 
 
-VIEWS: Mapping[str, Callable[[Sequence[Measured]], Iterator[Part]]] = {
+VIEWS: Mapping[str, Callable[[MeasuredLines], Parts]] = {
     view.__name__: view for view in (accuracy, parity, skips, breakdown, scaling)
 }
 """What each study shows of the lines that were measured, by the name of the study."""
@@ -241,7 +241,7 @@ def _table(
     title: str,
     head: str,
     columns: Columns,
-    lines: Sequence[Measured],
+    lines: MeasuredLines,
     best: Collection[StudyLine] = (),
 ) -> Table:
     """The `lines` below `head`, the `best` in bold, and what each of the `columns` says of them."""
@@ -294,7 +294,7 @@ COMPARED: Columns = {
 }
 
 
-def _where(lines: Sequence[Measured]) -> str:
+def _where(lines: MeasuredLines) -> str:
     """Scene, path and size of the frames."""
     facts = conditions([line.run for line in lines], ("scene", "trajectory", "resolution"))
     return ", ".join(fact for fact in facts.values() if " / " not in fact)

@@ -12,6 +12,7 @@ from functools import partial
 
 import pandas as pd
 
+from bench.kinds import Names, Numbers
 from bench.results import COLD, STEADY
 
 NOT_AVAILABLE = "n/a"
@@ -38,15 +39,18 @@ class Metric:
         return f"{self.name} {self.better}".rstrip()
 
 
+Rows = Sequence[Sequence[str]]  # cells, line by line
+
+
 @dataclass(frozen=True)
 class Table:
     """Lines under columns, in Markdown: a label, then figures or text. `sources` has the keys of
     the runs behind each line, or is empty."""
 
     title: str
-    columns: Sequence[str]
-    lines: Sequence[Sequence[str]]
-    sources: Sequence[Sequence[str]] = ()
+    columns: Names
+    lines: Rows
+    sources: Rows = ()
 
     def right(self, column: int) -> bool:
         """Whether the column is aligned right: at least half of what is in it are figures."""
@@ -132,7 +136,7 @@ def run_tables(rows: pd.DataFrame) -> list[Table]:
     return [table for table in (*tables, _memory(rows)) if table.lines]
 
 
-def _values(rows: pd.DataFrame, prefix: str = "") -> dict[str, float]:
+def _values(rows: pd.DataFrame, prefix: str = "") -> Numbers:
     """Figures of one run by metric, for metrics with `prefix`, which is removed from the names."""
     some = rows[rows["metric"].str.startswith(prefix)]
     return dict(zip(some["metric"].str.removeprefix(prefix), some["value"], strict=True))

@@ -6,16 +6,17 @@ import json
 import math
 import re
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from bench.errors import SteerbenchError, explained, some, unexpected
+from bench.kinds import Named, Names, Say, Values, Words
 from bench.records import made, read_record
 from bench.results import Store, existing_store
 from bench.sharing import whole
-from reports.regression import LIMITS, Assertion, Figures, Limit, changes, limited
+from reports.regression import LIMITS, Assertion, Figures, Limit, Limits, changes, limited
 from reports.runs import Run, unseeded
 from sweeps.measurement import PLACES, Failure, failures, own_words, portable
 from sweeps.versions import is_present, standing
@@ -26,6 +27,9 @@ NOTHING = Assertion("every metric", math.nan, math.nan, math.nan, None, Limit(1)
 TYPED = re.compile(r"[+~]*([\w.@/]+)=")  # a setting among the words of a command
 
 
+Checks = list[list[Assertion]]  # of the metrics of each run
+
+
 @dataclass(frozen=True)
 class Entry:
     """Runs by seed that are equal in all else: what `SUBJECT` names, and the flat `settings`.
@@ -34,7 +38,7 @@ class Entry:
     subject: Sequence[str]
     command: str
     settings: Mapping[str, str]
-    seeds: dict[str, Any]  # the Run of each in a store, the Figures of each in a baseline
+    seeds: Values  # the Run of each in a store, the Figures of each in a baseline
 
     def differences(self, other: Entry) -> list[str]:
         """The names of the settings of `other` that are not as here."""
@@ -50,7 +54,7 @@ class Entry:
             return all(self._equal_below(word, other, apart) for word in words)
         return self.subject == other.subject
 
-    def _equal_below(self, word: str, other: Entry, apart: Sequence[str]) -> bool:
+    def _equal_below(self, word: str, other: Entry, apart: Names) -> bool:
         """Whether no setting that a typed `word` is about is `apart`; of a choice that is about
         none, such as an experiment, nothing is known."""
         typed = TYPED.match(word)
@@ -66,12 +70,12 @@ class Entry:
         return next(there, None)
 
 
-def _stored(store: Store, say: Callable[[str], object]) -> list[Entry]:
+def _stored(store: Store, say: Say) -> list[Entry]:
     """The runs of `store` that stand for their jobs, by entry; `say` gets a line on versions."""
     found: dict[str, Entry] = {}
     for run in standing(store, say):
         made_of = run.record["made_of"]
-        words, _ = _without_seed(own_words(str(run.record["command"])))
+        words, _ = _without_seed(own_words(run.command))
         command = shlex.join(words)
         config = {
             **made_of.get("config", {"command": command}),
@@ -99,11 +103,11 @@ def _places(run: Run) -> str:
     """The folder of the scene of a run or, of scored pictures, the command that names both."""
     if "scene_path" in run.record:
         return str(run.record["scene_path"])
-    words = shlex.split(str(run.record["command"]))
+    words = shlex.split(run.command)
     return " ".join(word for word in words if word.partition("=")[0] not in PLACES)
 
 
-def read(path: Path) -> tuple[Mapping[str, Limit], list[Entry]]:
+def read(path: Path) -> tuple[Limits, list[Entry]]:
     """The limits by metric and the runs of a baseline; SteerbenchError if it cannot be read, or
     holds nothing that could be compared."""
     try:
@@ -124,7 +128,7 @@ def read(path: Path) -> tuple[Mapping[str, Limit], list[Entry]]:
         raise SteerbenchError(f"no baseline: {error}; {way}") from error
 
 
-def _limits(held: Mapping[str, Any], where: str) -> dict[str, Limit]:
+def _limits(held: Named, where: str) -> dict[str, Limit]:
     """The limits in a baseline, of metrics that exist, in their direction."""
     limits = {}
     known = limited([f"{metric}=0" for metric in held])  # refuses what is no metric
@@ -137,7 +141,7 @@ def _limits(held: Mapping[str, Any], where: str) -> dict[str, Limit]:
     return limits
 
 
-def _entry(held: Any, limits: Mapping[str, Limit], where: str) -> Entry:
+def _entry(held: Any, limits: Limits, where: str) -> Entry:
     """One entry of a baseline, with figures."""
     entry = made(Entry, held, where)
     if len(entry.subject) != len(SUBJECT) or not entry.seeds:
@@ -147,7 +151,7 @@ def _entry(held: Any, limits: Mapping[str, Limit], where: str) -> Entry:
     return entry
 
 
-def _figures(held: Any, limits: Mapping[str, Limit], where: str) -> Figures:
+def _figures(held: Any, limits: Limits, where: str) -> Figures:
     """The figures of one run in a baseline; those that are compared are numbers."""
     figures = made(Figures, held, where)
     compared = {x: value for x, value in figures.values.items() if x in limits}
@@ -167,7 +171,7 @@ def _refuse_endless(where: str, values: Iterable[float], but_for: Sequence[float
             raise unexpected(where, "a finite number", str(value)[:20])
 
 
-def record(path: Path, outputs: Path, words: Sequence[str], say: Callable[[str], object]) -> None:
+def record(path: Path, outputs: Path, words: Words, say: Say) -> None:
     """Write figures to `path`; `words` are limits (psnr=0.2), `say` gets what is left out. A
     baseline that is there keeps its other limits and its choice of runs."""
     store, limits = existing_store(outputs), LIMITS
@@ -192,9 +196,7 @@ def record(path: Path, outputs: Path, words: Sequence[str], say: Callable[[str],
     store.rows(report=say)  # on those that cannot be read
 
 
-def _say_left_out(
-    runs: Sequence[Entry], limits: Mapping[str, Limit], say: Callable[[str], object]
-) -> None:
+def _say_left_out(runs: Sequence[Entry], limits: Limits, say: Say) -> None:
     metrics = {
         metric
         for each in runs
@@ -210,9 +212,7 @@ def _say_left_out(
                 say(f"left out: of {each.command} seed={seed}, which has none: {some(unknown)}")
 
 
-def checked(
-    path: Path, outputs: Path, say: Callable[[str], object] = lambda line: None
-) -> list[list[Assertion]]:
+def checked(path: Path, outputs: Path, say: Say = lambda line: None) -> Checks:
     """Whether every metric of each run of the baseline `path` is as good in the store; `say` gets
     a line on which of several versions of a run were taken."""
     limits, entries = read(path)
@@ -235,7 +235,7 @@ def checked(
 
 
 def _compared(
-    old: Entry, new: Entry | None, limits: Mapping[str, Limit], outputs: Path
+    old: Entry, new: Entry | None, limits: Limits, outputs: Path
 ) -> tuple[list[Assertion], str]:
     """What became of the metrics of `old` in its runs `new`, and what else to know of these; raises
     SteerbenchError if some are missing, or of other frames."""
@@ -288,7 +288,7 @@ def _failure_of(
     return None
 
 
-def _without_seed(words: Sequence[str]) -> tuple[list[str], str]:
+def _without_seed(words: Words) -> tuple[list[str], str]:
     """The words of a command but for its seed, and this, 0 where none is given."""
     seeds = ["0", *(word.removeprefix("seed=") for word in words if word.startswith("seed="))]
     return [word for word in words if not word.startswith("seed=")], seeds[-1]

@@ -16,16 +16,18 @@ import re
 import signal
 import sys
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from bench.errors import SteerbenchError, unknown
+from bench.kinds import Named, Texts, Values, Words
+from bench.records import without
 from sweeps.processes import set_up
 
-COMMANDS: dict[str, dict[str, Any]] = tomllib.loads(
+COMMANDS: dict[str, Values] = tomllib.loads(
     (Path(__file__).parent / "commands.toml").read_text(encoding="utf-8")
 )
 """What commands.toml says of each command, by name."""
@@ -60,7 +62,7 @@ def main() -> None:
     sys.exit(guard(dispatch, sys.argv[1:]))
 
 
-def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
+def guard(command: Callable[[Words], int], argv: Words) -> int:
     """Run `command` and turn how it ends into an exit status and at most one message."""
     try:
         status = command(argv)
@@ -85,7 +87,7 @@ def _fail(message: str, status: int) -> int:
     return status
 
 
-def dispatch(argv: Sequence[str]) -> int:
+def dispatch(argv: Words) -> int:
     """Pass `argv` to the file of its command, which is imported only now."""
     of_hydra = argv[:1] == ["run"] or argv[:1] in (["-sc"], ["--shell-completion"])
     argv = list(_one_form(argv))
@@ -99,7 +101,7 @@ def dispatch(argv: Sequence[str]) -> int:
     return command.main(options or argv[argv[0] == "run" :])
 
 
-def _one_form(argv: Sequence[str]) -> Iterator[str]:
+def _one_form(argv: Words) -> Iterator[str]:
     """`argv` with the folders of store and page as its command takes them.
 
     They are an option or a setting; every command understands `--outputs DIR` and `outputs=DIR`.
@@ -127,13 +129,13 @@ class Parser(argparse.ArgumentParser):
         raise SteerbenchError(f"{message}\n{self.format_usage().rstrip()}")
 
 
-def parsed(argv: Sequence[str]) -> argparse.Namespace:
+def parsed(argv: Words) -> argparse.Namespace:
     """The arguments of a command other than `run`.
 
     Among them are the name of the `command`, None if there was none, the innermost `parser`, and
     what was `typed`.
     """
-    overview: dict[str, str] = {}
+    overview: Texts = {}
     for name, about in COMMANDS.items():
         lines = overview.get(about["group"], f"{about['group']}\n")
         overview[about["group"]] = f"{lines}  {name:12}{about['purpose']}\n"
@@ -165,7 +167,7 @@ def parsed(argv: Sequence[str]) -> argparse.Namespace:
     return options
 
 
-def _arguments(about: Mapping[str, Any]) -> Iterator[tuple[list[str], dict[str, Any]]]:
+def _arguments(about: Named) -> Iterator[tuple[list[str], Values]]:
     """The names and the options, as for `add_argument`, of each argument of a command."""
     include = about.get("include", [])
     if usual := about.get("settings"):
@@ -173,7 +175,7 @@ def _arguments(about: Mapping[str, Any]) -> Iterator[tuple[list[str], dict[str, 
     for group in (about.get("arguments", {}), *(_SHARED[name] for name in include)):
         for name, options in group.items():
             kind = TYPES[options["type"]] if "type" in options else {}
-            own = {key: of for key, of in options.items() if key not in ("type", "also")}
+            own = without(options, ("type", "also"))
             more = "; may be repeated" if kind.get("action") == "append" else ""
             more += f" (default {own['default']})" if own.get("default") else ""
             names = filter(None, (name, options.get("also")))
@@ -209,7 +211,7 @@ def config_dir(text: str) -> str:
 
 
 SEVERAL = {"action": "append", "default": []}
-TYPES: dict[str, dict[str, Any]] = {
+TYPES: dict[str, Values] = {
     "path": {"type": Path},
     "count": {"type": count, "metavar": "N"},
     "positive": {"type": positive},

@@ -23,8 +23,9 @@ from omegaconf.errors import OmegaConfBaseException
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable, unexpected, unknown
 from bench.isolation import as_begun, fit
+from bench.kinds import Named, Values
 from bench.protocol import EvaluationProtocol
-from bench.provenance import stamp
+from bench.provenance import Stamp, stamp
 from bench.records import coerced, fits
 from bench.scenes.assemble import hold_out
 from bench.trajectories import Trajectory
@@ -180,7 +181,7 @@ class _Read(NamedTuple):
 
     value: Any  # a Scene, or its digest
     files: Sequence[Path]
-    stamps: Mapping[str, tuple[int, ...]]
+    stamps: Mapping[str, Stamp]
 
 
 @cache
@@ -212,7 +213,7 @@ def _current(read: Any, config: DictConfig) -> Any:
     return found.value
 
 
-def _stamps(files: Iterable[Path]) -> dict[str, tuple[int, ...]]:
+def _stamps(files: Iterable[Path]) -> dict[str, Stamp]:
     """The `stamp` of each file, and of all files beside it: pictures may be added, lists of names
     changed."""
     folders = {file.parent for file in files}
@@ -258,14 +259,14 @@ def as_declared(node: Any) -> Any:
     return {name: coerced(as_declared(value), hints.get(name, Any)) for name, value in node.items()}
 
 
-def _hints(target: Any) -> dict[str, Any]:
+def _hints(target: Any) -> Values:
     # Types of inherited dataclass fields must be looked up in the modules of its bases.
     plain = inspect.isclass(target) and not is_dataclass(target)
     return get_type_hints(target.__init__ if plain else target)
 
 
 def check_settings(
-    target: Any, settings: Mapping[str, Any], prefix: str = "", given: Collection[str] = ()
+    target: Any, settings: Named, prefix: str = "", given: Collection[str] = ()
 ) -> None:
     """Raise `SteerbenchError` unless `target` accepts these settings, by name and type.
 

@@ -27,13 +27,15 @@ from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf, flag_override, open_dict
 
 from bench.console import ConsoleLog
-from bench.errors import SteerbenchError, Unavailable
+from bench.errors import SteerbenchError, Unavailable, reason
+from bench.kinds import Words
+from bench.records import without
 from bench.results import content_key
 from bench.study import study_of
 from reports.runs import grouped, load_runs
 from reports.tables import decimal
 from sweeps.configured import scene_folder, trained, training_threads
-from sweeps.measurement import Job, JobFailed, obtain, reason, stored
+from sweeps.measurement import Job, JobFailed, Jobs, obtain, stored
 from sweeps.overrides import CONFIGS, composed, explain, folder_words, setting, target_of
 from sweeps.processes import on_gpu, processes, set_up
 from sweeps.terminal import note, time_left
@@ -65,14 +67,17 @@ class Ended:
         return Ended, (self.run, self.measured, self.error and picklable(self.error))
 
 
+Endings = dict[str, Ended]  # by the keys of jobs
+
+
 @dataclass(frozen=True)
 class Launcher:
     """Where work is done, as Hydra's `config` says; errors quote the `words` of the command."""
 
     config: DictConfig
-    words: Sequence[str]
+    words: Words
 
-    def run(self, groups: Sequence[Group]) -> list[dict[str, Ended]]:
+    def run(self, groups: Sequence[Group]) -> list[Endings]:
         """How the jobs of each group ended, by their keys.
 
         Raises what was raised first beside them, once all is done; SteerbenchError if a setting of
@@ -115,15 +120,13 @@ def own_folder(config: DictConfig) -> None:
         config.hydra.overrides.hydra.append(setting("hydra.sweep.dir", str(folder)))
 
 
-def divided(words: Sequence[str]) -> tuple[list[str], list[str]]:
+def divided(words: Words) -> tuple[list[str], list[str]]:
     """The settings of runs among `words`, and those of Hydra."""
     of_hydra = [word for word in words if word.lstrip("+~").startswith(("hydra.", "hydra/"))]
     return [word for word in words if word not in of_hydra], of_hydra
 
 
-def _measured(
-    groups: Sequence[Group], begun: float, config: DictConfig
-) -> dict[str, Ended] | Exception:
+def _measured(groups: Sequence[Group], begun: float, config: DictConfig) -> Endings | Exception:
     """The task of a launcher's job, whose number says which of the `groups` it measures. An
     exception is returned, because Hydra would print it in its own way."""
     set_up()
@@ -145,7 +148,7 @@ def picklable(error: Exception) -> Exception:
         return SteerbenchError(f"{type(error).__name__}: {reason(error)}")
 
 
-def attempt(group: Group, total: int, folder: Path, begun: float) -> dict[str, Ended]:
+def attempt(group: Group, total: int, folder: Path, begun: float) -> Endings:
     """Obtain the runs of jobs that are measured together; print how each ended, and return it by
     the key of the job.
 
@@ -153,7 +156,7 @@ def attempt(group: Group, total: int, folder: Path, begun: float) -> dict[str, E
     `folder`. A job that fails is left out, and the others are measured without it. Its error is
     printed, and kept for reports.
     """
-    ended: dict[str, Ended] = {}
+    ended: Endings = {}
     left = list(group)
     while left:
         try:
@@ -196,7 +199,7 @@ def _progress(folder: Path, total: int, begun: float) -> str:
     return f"; {done} of {total} jobs done{left}"
 
 
-def run_jobs(jobs: Sequence[Job], launcher: Launcher) -> list[Ended]:
+def run_jobs(jobs: Jobs, launcher: Launcher) -> list[Ended]:
     """Run the jobs, equal ones only once, and say how each of them ended.
 
     Goes scene by scene, and measures what has the first seed, then what has the next. Where there
@@ -223,7 +226,7 @@ def run_jobs(jobs: Sequence[Job], launcher: Launcher) -> list[Ended]:
     return [ended[job.key] for job in jobs]
 
 
-def run_all(jobs: Sequence[Job], words: Sequence[str]) -> list[Ended]:
+def run_all(jobs: Jobs, words: Words) -> list[Ended]:
     """Run the jobs, see `run_jobs`, with the launcher that `words` of a command choose
     (`hydra/launcher=joblib`). Notes on the work go below the outputs of the jobs."""
     place = setting("outputs", str(jobs[0].outputs))
@@ -231,7 +234,7 @@ def run_all(jobs: Sequence[Job], words: Sequence[str]) -> list[Ended]:
     return run_jobs(jobs, Launcher(composed(words, return_hydra_config=True), words))
 
 
-def _groups(jobs: Sequence[Job], look_up: bool) -> tuple[list[Group], dict[str, Ended]]:
+def _groups(jobs: Jobs, look_up: bool) -> tuple[list[Group], Endings]:
     """The jobs that are measured together: of those with the same `turns`, what differs only in the
     method.
 
@@ -239,11 +242,11 @@ def _groups(jobs: Sequence[Job], look_up: bool) -> tuple[list[Group], dict[str, 
     """
 
     def together(job: Job) -> tuple[str, str]:
-        shared = {name: of for name, of in job.settings.items() if name not in OF_METHOD}
+        shared = without(job.settings, OF_METHOD)
         return job.turns, content_key(shared) if job.turns else job.key
 
     groups: list[Group] = []
-    ended: dict[str, Ended] = {}
+    ended: Endings = {}
     for of_group in grouped(jobs, together).values():
         found: dict[str, Job] = {}
         with suppress(SteerbenchError):  # a job that cannot start says so when it is measured
@@ -256,7 +259,7 @@ def _groups(jobs: Sequence[Job], look_up: bool) -> tuple[list[Group], dict[str, 
     return groups, ended
 
 
-def train_ahead(jobs: Sequence[Job], measured: Collection[str]) -> None:
+def train_ahead(jobs: Jobs, measured: Collection[str]) -> None:
     """Train the models of `jobs`, as many at a time as the cores allow: small trainings gain little
     from a second core.
 
@@ -282,7 +285,7 @@ def train_ahead(jobs: Sequence[Job], measured: Collection[str]) -> None:
             note(f"{how}: {names[ended]}{left}")
 
 
-def room(jobs: Sequence[Job]) -> int:
+def room(jobs: Jobs) -> int:
     """How many trainings can run at a time; 1 on a GPU, or if nothing sets their threads."""
     if any(on_gpu(job.config.device) for job in jobs):
         return 1
@@ -296,9 +299,8 @@ def _training(job: Job) -> str:
     """A key of all settings that a training may depend on; equal for jobs that share it."""
     method = job.settings["method"]
     chosen = study_of(target_of(method)).chosen
-    others = {name: value for name, value in job.settings.items() if name not in OF_MEASUREMENT}
-    own = {name: value for name, value in method.items() if name not in chosen}
-    return content_key({**others, "method": own})
+    others = without(job.settings, OF_MEASUREMENT)
+    return content_key({**others, "method": without(method, chosen)})
 
 
 def _train(config: DictConfig) -> float:

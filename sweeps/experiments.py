@@ -1,16 +1,16 @@
 """Reads the files of experiments: what they vary, and which axes of a method that makes."""
 
-from collections.abc import Sequence
 from typing import Any
 
 from bench.errors import SteerbenchError, unknown
+from bench.kinds import Choices, Words
 from bench.study import Axis
 from sweeps.overrides import choices, loaded, taken
 
 SEED = "seed"  # in a grid, it makes no lines: they are means over their seeds
 
 
-def experiment(name: str, words: Sequence[str] = ()) -> Any:
+def experiment(name: str, words: Words = ()) -> Any:
     """What the file of an experiment holds; `words` may name folders with further ones."""
     files = choices("experiment", words)
     if name not in files:
@@ -20,7 +20,7 @@ def experiment(name: str, words: Sequence[str] = ()) -> Any:
     return loaded(files[name]) or {}
 
 
-def grid(declared: Any) -> dict[str, list[str]]:
+def grid(declared: Any) -> Choices:
     """The settings that an experiment varies, each with its values, by what its file holds."""
     params = declared.get("hydra", {}).get("sweeper", {}).get("params") or {}
     words = [f"{name}={values}" for name, values in params.items()]

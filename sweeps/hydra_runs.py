@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, flag_override
 
 from bench.errors import unexpected
+from bench.kinds import Labels, Words
 from sweeps.overrides import CONFIGS, as_typed, explain, further, hint, of_hydra, settled, taken
 
 if TYPE_CHECKING:  # these load torch, which --help and completion do not need
@@ -44,7 +45,7 @@ class SweepCallback(Callback):
 
 
 def run_hydra(
-    argv: Sequence[str], alone: Callable[[DictConfig, list[str]], object]
+    argv: Words, alone: Callable[[DictConfig, list[str]], object]
 ) -> tuple[list[tuple[Job, Ended]], list[Exception]]:
     """Do what `argv` says: a sweep, one job, which is left to `alone` with its configuration and
     its command, or Hydra's own help.
@@ -97,7 +98,7 @@ def run_hydra(
     return list(zip(jobs, ended, strict=True)), errors
 
 
-def _job(config: DictConfig, command: Sequence[str]) -> Job:
+def _job(config: DictConfig, command: Words) -> Job:
     from sweeps.measurement import Job, turns_of
 
     experiment = HydraConfig.get().runtime.choices.get("experiment", "sweep")
@@ -116,7 +117,7 @@ def _named(found: Sequence[tuple[Job, str]]) -> list[Job]:
     ]
 
 
-def label(method: str, varied: Mapping[str, str]) -> str:
+def label(method: str, varied: Labels) -> str:
     """The label of a job among others: its method, and what it has of the settings that vary."""
     from reports.lines import shortened
 

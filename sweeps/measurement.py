@@ -16,8 +16,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.console import ConsoleLog
-from bench.errors import SteerbenchError, Unavailable, explained, some, unexpected
+from bench.errors import SteerbenchError, Unavailable, explained, reason, some, unexpected
 from bench.isolation import Guard, as_begun, put_back
+from bench.kinds import Named, Values, Words
 from bench.measure import MethodFailed, Task, measure, train
 from bench.neighbours import Neighbours
 from bench.provenance import (
@@ -61,7 +62,7 @@ AUTOMATIC = {"device": DEVICE, "backend": re.compile("reference|cpu|gpu")}
 """Settings that may be "auto", and what they can become in a key."""
 
 
-def described(config: DictConfig) -> dict[str, Any]:
+def described(config: DictConfig) -> Values:
     """The settings that determine a run; equal for equal jobs.
 
     Left out are: locations, except the last part of a scene's folder, which rows show; `split`,
@@ -71,7 +72,7 @@ def described(config: DictConfig) -> dict[str, Any]:
     try:
         plain: Any = OmegaConf.to_container(config, resolve=True)
     except OmegaConfBaseException as error:  # a setting that others use was removed
-        raise SteerbenchError(" ".join(str(error).split())) from error
+        raise SteerbenchError(reason(error)) from error
     unused = ["exclusive"] if plain.get("exclusive") is True else []
     unused += [] if "engine" in plain["method"] else ["engine", "precision"]
     left_out = ("split", "tables", "in_turns", *PLACES, *unused)
@@ -83,7 +84,7 @@ def described(config: DictConfig) -> dict[str, Any]:
     return kept
 
 
-def job_key(settings: Mapping[str, Any], turns: str) -> str:
+def job_key(settings: Named, turns: str) -> str:
     """Equal for jobs with the same `settings` (see `described`) and the same `turns`; raises
     SteerbenchError if a number is infinite or NaN."""
     try:
@@ -98,11 +99,6 @@ def turns_of(name: str, config: DictConfig) -> str:
     return f"{name}, {config.seed}, {scene}"
 
 
-def reason(error: BaseException) -> str:
-    """The message of `error` in one line."""
-    return " ".join(str(error).split()) or type(error).__name__
-
-
 def own_words(command: str) -> list[str]:
     """What determines a run among the words of its `command`."""
     words = map(portable, shlex.split(command)[1:])
@@ -115,12 +111,12 @@ class Job:
     trajectory, protocol and seed; a job without `turns` is measured alone."""
 
     config: DictConfig  # the composed run.yaml
-    command: Sequence[str]  # the words that make it alone, for the record
+    command: Words  # the words that make it alone, for the record
     name: str = ""  # at the terminal
     turns: str = ""
 
     @cached_property
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Values:
         return described(self.config)
 
     @cached_property
@@ -166,6 +162,9 @@ class Job:
                 file.unlink(missing_ok=True)
 
 
+Jobs = Sequence[Job]
+
+
 @dataclass(frozen=True)
 class Failure:
     """Why the last attempt of a job failed, which the `command` makes alone."""
@@ -194,7 +193,7 @@ class NotStored(SteerbenchError):
     """A run that is not in the store, where nothing may be measured (store=only)."""
 
 
-def obtain(jobs: Sequence[Job]) -> tuple[list[str], bool]:
+def obtain(jobs: Jobs) -> tuple[list[str], bool]:
     """The keys of the runs of `jobs`, whose `turns` are equal, and whether they are measured now.
 
     They are measured unless the store has all of them: figures that are compared come from the same
@@ -213,7 +212,7 @@ def obtain(jobs: Sequence[Job]) -> tuple[list[str], bool]:
         raise
 
 
-def _keep_failure(jobs: Sequence[Job], error: Exception) -> None:
+def _keep_failure(jobs: Jobs, error: Exception) -> None:
     failed, cause = jobs, error
     if isinstance(error, JobFailed) and isinstance(error.__cause__, Exception):
         failed, cause = [error.job], error.__cause__
@@ -222,7 +221,7 @@ def _keep_failure(jobs: Sequence[Job], error: Exception) -> None:
             job.keep_failure(cause)
 
 
-def _obtained(jobs: Sequence[Job], log: ConsoleLog) -> tuple[list[str], bool]:
+def _obtained(jobs: Jobs, log: ConsoleLog) -> tuple[list[str], bool]:
     ready, policy = _ready(jobs, log), jobs[0].config.get("store")
     measured = policy == "always" or not _stored(ready)
     if measured and policy == "only":
@@ -241,7 +240,7 @@ def _obtained(jobs: Sequence[Job], log: ConsoleLog) -> tuple[list[str], bool]:
     return _told(ready, measured, log), measured
 
 
-def stored(jobs: Sequence[Job]) -> dict[str, Job]:
+def stored(jobs: Jobs) -> dict[str, Job]:
     """Those of `jobs` that can be used here, by the keys that `obtain` would find in the store, if
     it has all of them and they need not be measured again; otherwise none."""
     log, left = ConsoleLog(jobs[0].outputs), list(jobs)
@@ -262,7 +261,7 @@ class _Ready:
     job: Job
     method: Method
     task: Task
-    parts: Mapping[str, Any]
+    parts: Named
     loaded: frozenset[str]  # the names of all modules before
     left: Sequence[str]  # what runs before it have left in modules of others
 
@@ -281,7 +280,7 @@ class _Ready:
         return self.job.store.key(self.parts)
 
 
-def _ready(jobs: Sequence[Job], log: Log) -> list[_Ready]:
+def _ready(jobs: Jobs, log: Log) -> list[_Ready]:
     """The `jobs`, ready to be measured.
 
     With `turns`, each key includes the keys of all of them: if one job changes, all are measured
@@ -300,13 +299,13 @@ def _ready(jobs: Sequence[Job], log: Log) -> list[_Ready]:
     if any(each.task.budget != ready[0].task.budget for each in ready):
         raise SteerbenchError("budget: expected the same for all that is measured in turns")
     keys = [content_key(each.parts) for each in ready]
-    shared: dict[str, Any] = {"beside": sorted(keys)}
+    shared: Values = {"beside": sorted(keys)}
     if ready[0].task.protocol.compared:
         shared["compared_with"] = keys[0]
     return [replace(each, parts={**each.parts, **shared}) for each in ready]
 
 
-def _needed(job: Job, jobs: Sequence[Job]) -> bool:
+def _needed(job: Job, jobs: Jobs) -> bool:
     """Whether the pictures of all `jobs` are compared with those of `job`."""
     return job is jobs[0] and bool(job.config.protocol.get("compared"))
 
@@ -342,19 +341,19 @@ def _prepared(job: Job, log: Log) -> _Ready:
     return _Ready(job, method, task, parts, loaded, left)
 
 
-def became(settings: Mapping[str, Any], method: Method, scene: Scene) -> dict[str, Any]:
+def became(settings: Named, method: Method, scene: Scene) -> Values:
     """`settings` with what "auto" stands for on this machine, and what `method` leaves to the scene
     as it is for this one: who types the same has the same run."""
     shown = method.settings()
     automatic = {
         name: shown[name] for name, form in AUTOMATIC.items() if form.fullmatch(shown[name])
     }
-    decided: Mapping[str, Any] = {}
+    decided: Named = {}
     if hasattr(method, "decided"):
         decided = method.decided(scene)
 
-    def resolved(node: Mapping[str, Any], before: str) -> dict[str, Any]:
-        found = {}
+    def resolved(node: Named, before: str) -> Values:
+        found: Values = {}
         for name, value in node.items():
             if isinstance(value, Mapping):
                 found[name] = resolved(value, f"{before}{name}.")
@@ -367,7 +366,7 @@ def became(settings: Mapping[str, Any], method: Method, scene: Scene) -> dict[st
     return resolved(settings, "")
 
 
-def _read_by(method: Method, trajectory: Trajectory, settings: Mapping[str, Any]) -> list[str]:
+def _read_by(method: Method, trajectory: Trajectory, settings: Named) -> list[str]:
     """The checksums of the files that a method and a path read, and of those whose names are
     settings of the method."""
     named = [Path(text) for _, text in flat(settings["method"]) if isinstance(text, str)]
@@ -441,7 +440,7 @@ def _measure(ready: Sequence[_Ready], guard: Guard, log: Log) -> None:
     for each in ready:
         each.job.store.remove(each.run)
     for each, measurement in zip(ready, measurements, strict=True):
-        record: dict[str, Any] = {
+        record: Values = {
             **measurement.record,
             "command": shlex.join(each.job.command),
             "scene_path": scene_folder(each.job.config),
@@ -471,4 +470,4 @@ def of_scene(run: Run, config: DictConfig) -> bool:
     folder = scene_folder(config)
     if folder is None or run.record.get("scene_path") == folder or not Path(folder).is_dir():
         return True
-    return run.record["scene"]["digest"] == scene_digest(config)
+    return run.digest == scene_digest(config)

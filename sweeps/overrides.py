@@ -27,7 +27,8 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf, open_dict
 from yaml import YAMLError
 
-from bench.errors import SteerbenchError, unexpected, unknown
+from bench.errors import SteerbenchError, reason, unexpected, unknown
+from bench.kinds import Choices, Named, Texts, Values, Words
 
 CONFIGS = Path(__file__).parent / "configs"
 FLAGS = ("--config-dir", "-cd")
@@ -45,7 +46,7 @@ PLUG_INS = "steerbench.configs"
 """Group of the entry points; the value of each is the package that holds the YAML files."""
 
 
-def composed(words: Sequence[str], **options: bool) -> DictConfig:
+def composed(words: Words, **options: bool) -> DictConfig:
     """The configuration of a run; `options` are those of Hydra's `compose`.
 
     SteerbenchError if a setting or a choice does not exist, or cannot be read.
@@ -87,14 +88,14 @@ def settled(config: DictConfig, folders: Sequence[Path]) -> DictConfig:
     return config
 
 
-def variants(words: Sequence[str]) -> Callable[[Sequence[str]], DictConfig]:
+def variants(words: Words) -> Callable[[Words], DictConfig]:
     """A function that makes the configuration of `words` with further settings.
 
     Each set of choices is composed once; values are set afterwards as Hydra would, which is faster.
     """
     with_choices = cache(lambda *chosen: composed([*words, *chosen]))
 
-    def varied(settings: Sequence[str]) -> DictConfig:
+    def varied(settings: Words) -> DictConfig:
         chosen = [x for x in settings if x[0] == "+" or choices(x.partition("=")[0], words)]
         values = [word for word in settings if word not in chosen]
         config = with_choices(*chosen).copy()
@@ -105,7 +106,7 @@ def variants(words: Sequence[str]) -> Callable[[Sequence[str]], DictConfig]:
     return varied
 
 
-def swept(words: Sequence[str]) -> dict[str, list[str]]:
+def swept(words: Words) -> Choices:
     """The values of every setting with several values (seed=0,1,2); the last word for it counts.
 
     SteerbenchError if a word cannot be read.
@@ -124,7 +125,7 @@ def swept(words: Sequence[str]) -> dict[str, list[str]]:
     }
 
 
-def taken(words: Sequence[str], name: str) -> tuple[list[str], list[str]]:
+def taken(words: Words, name: str) -> tuple[list[str], list[str]]:
     """The words without those that set `name`, and the different values that they give it."""
     named = [word for word in words if word.lstrip("+").partition("=")[0] == name]
     others = [word for word in words if word not in named]
@@ -188,7 +189,7 @@ def of_hydra(error: Exception) -> bool:
     return library in ("hydra", "omegaconf", "antlr4", "yaml") or isinstance(error, UnicodeError)
 
 
-def explain(error: Exception, words: Sequence[str]) -> SteerbenchError:
+def explain(error: Exception, words: Words) -> SteerbenchError:
     """Translate an error of Hydra; for unknown names it suggests the nearest existing ones."""
     if isinstance(error, OverrideParseException):
         return SteerbenchError(
@@ -226,7 +227,7 @@ def hint(word: str) -> str:
     return f"; a text with such signs is written in quotes inside quotes, {shown}" if equals else ""
 
 
-def _settings(words: Sequence[str]) -> list[str]:
+def _settings(words: Words) -> list[str]:
     """All settings that exist with the choices (scene=blender) in `words`."""
     folders = [CONFIGS, *further(words)]
     groups = {path.name for folder in folders for path in folder.iterdir() if path.is_dir()}
@@ -245,7 +246,7 @@ def leaves(config: Any, prefix: str = "") -> Iterator[str]:
             yield f"{prefix}{key}"
 
 
-def beside(name: str, words: Sequence[str]) -> list[str]:
+def beside(name: str, words: Words) -> list[str]:
     """The words for the method `name` in place of that of `words`, without settings it lacks."""
     other, missing = composed([*folder_words(words), f"method={name}"]), object()
 
@@ -259,7 +260,7 @@ def beside(name: str, words: Sequence[str]) -> list[str]:
     return [*filter(fits, words), f"method={name}"]
 
 
-def choices(group: str, words: Sequence[str] = ()) -> dict[str, Path]:
+def choices(group: str, words: Words = ()) -> dict[str, Path]:
     """The file of every choice of `group` by name, including folders named in `words`; of equal
     names, ours wins, then the first."""
     found = {
@@ -270,7 +271,7 @@ def choices(group: str, words: Sequence[str] = ()) -> dict[str, Path]:
     return dict(sorted(found.items()))
 
 
-def described(group: str, words: Sequence[str] = ()) -> dict[str, str]:
+def described(group: str, words: Words = ()) -> Texts:
     """Every choice of `group`, including folders named in `words`, with its description: the first
     comment that is not a Hydra directive (`# @package`)."""
     comments = {}
@@ -286,10 +287,10 @@ def loaded(path: Path) -> Any:
     try:
         return OmegaConf.to_container(OmegaConf.load(path))
     except (OSError, ValueError, YAMLError) as error:
-        raise unexpected(path, "a YAML file of settings", " ".join(str(error).split())) from error
+        raise unexpected(path, "a YAML file of settings", reason(error)) from error
 
 
-def target_of(node: Mapping[str, Any] | DictConfig) -> Any:
+def target_of(node: Named | DictConfig) -> Any:
     """The class or function that `_target_` names; SteerbenchError if it cannot be imported."""
     try:
         return pkgutil.resolve_name(node["_target_"])
@@ -300,27 +301,27 @@ def target_of(node: Mapping[str, Any] | DictConfig) -> Any:
         ) from error
 
 
-def engine_kinds(words: Sequence[str]) -> dict[str, Any]:
+def engine_kinds(words: Words) -> Values:
     """The class of each engine by name; torch, the standard, comes first."""
     files = sorted(choices("engine", words).items(), key=lambda file: (file[0] != "torch", file))
     return {name: target_of(loaded(path)) for name, path in files}
 
 
-def folder_words(words: Sequence[str]) -> list[str]:
+def folder_words(words: Words) -> list[str]:
     """The folders named in `words`, as words again."""
     return [f"{FLAGS[0]}={folder}" for folder in _typed(words)]
 
 
-def _overrides(words: Sequence[str]) -> list[str]:
+def _overrides(words: Words) -> list[str]:
     return [word for word in as_typed(words) if not word.startswith(f"{FLAGS[0]}=")]
 
 
-def further(words: Sequence[str]) -> list[Path]:
+def further(words: Words) -> list[Path]:
     """The folders named in `words`, and those of installed plug-ins."""
     return [*_typed(words), *(x for x in plug_ins().values() if isinstance(x, Path))]
 
 
-def _typed(words: Sequence[str]) -> Iterator[Path]:
+def _typed(words: Words) -> Iterator[Path]:
     """The folders named in `words` by `--config-dir=DIR` or by its form in two words."""
     for word, after in pairwise([*words, ""]):
         name, equals, value = word.partition("=")

@@ -1,6 +1,5 @@
 """The jobs of tables."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from bench.errors import Unavailable, unexpected
+from bench.kinds import Words
 from reports.paper_tables import METHOD, PaperTable, Place
 from sweeps import experiments
 from sweeps.configured import build
@@ -34,7 +34,7 @@ def repeats(seeds: int) -> int:
     return seeds
 
 
-def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -> list[Planned]:
+def plan(table: PaperTable, words: Words, data: DataSet | None = None) -> list[Planned]:
     """The jobs of `table` under the settings in `words`, for each line, seed and scene.
 
     Scenes are those of `data` or in `words`; each goes to the blocks with figures of its data set.
@@ -104,7 +104,7 @@ def _engine_here(experiment: DictConfig) -> list[str]:
     return []
 
 
-def scenes_of(words: Sequence[str], data: DataSet | None = None) -> list[str]:
+def scenes_of(words: Words, data: DataSet | None = None) -> list[str]:
     """The names of the scenes in `data` or in `words`; of a folder, its last part.
 
     SteerbenchError if a word gives several values to another setting than scene and seed.

@@ -6,7 +6,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,7 @@ from reports.tables import Table, run_tables
 if TYPE_CHECKING:  # loads torch, which `steerbench list` does without
     import pandas as pd
 
-    from reports.runs import Run
+    from reports.runs import Run, Runs
 
 
 class _Output(Console):
@@ -68,7 +68,7 @@ def note(line: str) -> None:
     print(line, file=sys.stderr)
 
 
-def say_missing(runs: Sequence[Run]) -> None:
+def say_missing(runs: Runs) -> None:
     from reports.runs import missing_figures  # loads torch
 
     for reason in missing_figures(runs):

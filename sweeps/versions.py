@@ -3,19 +3,20 @@ and the store keeps them all."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
 from bench.errors import some
+from bench.kinds import Say
 from bench.measure import measure
 from bench.provenance import digest
 from bench.results import Store
-from reports.runs import Run, readable
+from reports.runs import Run, Runs, grouped, readable
 from sweeps.measurement import job_key, targets
 
 
-def standing(store: Store, say: Callable[[str], object]) -> list[Run]:
+def standing(store: Store, say: Say) -> list[Run]:
     """One run of each job and scene in `store`, the one used last first.
 
     Of several versions the run of the present code stands; of several of these, or if there is
@@ -25,28 +26,24 @@ def standing(store: Store, say: Callable[[str], object]) -> list[Run]:
     def last_used(run: Run) -> float:
         return max(store.used(run.key)[0], run.record["stored"])
 
-    versions: dict[tuple[str, str], list[Run]] = {}
-    for run in sorted(readable(store), key=last_used, reverse=True):
-        scene = run.record["scene"]["digest"]
-        versions.setdefault((_own_job(run), scene), []).append(run)
+    in_order = sorted(readable(store), key=last_used, reverse=True)
+    versions = grouped(in_order, lambda run: (_own_job(run), run.digest))
     taken: list[Run] = []
     said: list[str] = []
     for several in versions.values():
-        if len(several) == 1:
-            taken += several
-            continue
-        present = [run for run in several if is_present(run)]
-        (first, *_), why = several, "the one used last"
-        if present:
-            (first, *_), why = present, "of the present code"
+        first = several[0]
+        if len(several) > 1:
+            present = [run for run in several if is_present(run)]
+            why = "of the present code" if present else "the one used last"
+            first = [*present, first][0]
+            said.append(f"{first.key} ({why}; {len(several) - 1} others)")
         taken.append(first)
-        said.append(f"{first.key} ({why}; {len(several) - 1} others)")
     if said:
         say(f"several versions of a run: taken {some(said)}")
     return taken
 
 
-def by_job(store: Store, say: Callable[[str], object]) -> Mapping[str, Sequence[Run]]:
+def by_job(store: Store, say: Say) -> Mapping[str, Runs]:
     """The `standing` runs by the key of each job that asked for them.
 
     A job has several if its settings fit scenes in different folders.
@@ -62,7 +59,7 @@ def _own_job(run: Run) -> str:
     """The key of the job whose settings a run was stored with; of scored pictures, the command."""
     parts = run.record["made_of"]
     if "config" not in parts:
-        return str(run.record["command"])
+        return run.command
     return job_key(parts["config"], parts.get("turns", ""))
 
 

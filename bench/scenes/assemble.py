@@ -23,7 +23,7 @@ from bench.scenes.images import Pictures, View, describe
 from bench.scenes.masks import Masks
 from bench.scenes.remarks import Remarks
 from bench.threads import in_parallel, torch_threads
-from bench.types import BACKGROUNDS, Camera, Log, Scene, Split
+from bench.types import BACKGROUNDS, Camera, Cameras, Log, Scene, SomeTensors, Split
 
 MARGIN = 0.05  # enlarges the box of a hull by this share of its longest side, half at each end
 
@@ -210,7 +210,7 @@ def _border_share(picture: Tensor, level: float) -> float:
     return (off <= JPEG_NOISE).float().mean().item()
 
 
-def box_of_cameras(cameras: Sequence[Camera]) -> Box:
+def box_of_cameras(cameras: Cameras) -> Box:
     """The cube around the point that cameras look at, with all of them inside or on a face.
 
     The point is the nearest to their optical axes, and a little to their centres, so that there is
@@ -240,7 +240,7 @@ def parse_box(value: object) -> Box:
 
 
 @torch_threads(1)
-def hull_box(cameras: Sequence[Camera], images: Sequence[Tensor], space: Box) -> Box | None:
+def hull_box(cameras: Cameras, images: SomeTensors, space: Box) -> Box | None:
     """The box of the visual hull of the pictures' masks (alpha > 0) inside `space`.
 
     A cell is dropped only if its whole projection, plus one pixel around it, lies inside a picture

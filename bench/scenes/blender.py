@@ -1,7 +1,6 @@
 """Loads NeRF-Synthetic: `transforms_{train,val,test}.json` beside RGBA pictures."""
 
-from pathlib import Path
-
+from bench.kinds import AnyPath
 from bench.records import read_json
 from bench.scenes.assemble import assemble, cube, describe_splits, hull_box, parse_box
 from bench.scenes.files import data_folder
@@ -12,7 +11,7 @@ HALF_EXTENT = 1.5  # the objects of NeRF-Synthetic lie in [-1.5, 1.5]^3
 
 
 def load(
-    path: str | Path,
+    path: AnyPath,
     *,
     downscale: int = 1,
     background: str = "white",

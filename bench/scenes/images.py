@@ -24,6 +24,7 @@ from torch import Tensor
 
 from bench.cameras import crop_camera, pixel_grid, scale_camera
 from bench.errors import not_there, unexpected
+from bench.kinds import Size
 from bench.threads import in_parallel
 from bench.types import Camera, Log
 
@@ -58,7 +59,7 @@ class ScaledView:
     camera: Camera
     sha256: str
     clear: bool  # whether it says how transparent its pixels are
-    seen: tuple[int, int]  # the size of what of it is left without its lens
+    seen: Size  # the size of what of it is left without its lens
     mask: "ScaledView | None" = None  # in full size, with the lens
     turned: bool | None = None  # whether its EXIF orientation is obeyed; None: it is upright
 
@@ -120,7 +121,7 @@ def orientation(image: Image.Image) -> int:
     return 1
 
 
-def image_size(path: Path, like: tuple[int, int] | None = None) -> tuple[int, int]:
+def image_size(path: Path, like: Size | None = None) -> Size:
     """Width and height in pixels, read from the file's header only, as viewers show it; with a size
     that it is to be `like`, as stored if that has the same shape."""
     with opened(path, path) as image:

@@ -1,10 +1,11 @@
 """What a reader puts right, leaves out or doubts is said in one line of each kind."""
 
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 
 import torch
 
+from bench.kinds import AnyPath, Say
 from bench.scenes.images import ScaledView
 
 OFF_CENTRE = 0.4  # of half a picture, from its middle: a doubtful principal point
@@ -17,7 +18,7 @@ class Remarks:
     def __init__(self) -> None:
         self._kinds: dict[str, list[str]] = {}
 
-    def add(self, where: str | Path, kind: str, got: object) -> None:
+    def add(self, where: AnyPath, kind: str, got: object) -> None:
         self._kinds.setdefault(kind, []).append(f"{where}: {kind}: {got}")
 
     def add_unread(self, where: Path, levels: Sequence[Mapping], known: Container[str]) -> None:
@@ -44,7 +45,7 @@ class Remarks:
             why = "right for a panorama; else poses have other axes than this format says"
             self.add("poses", "all cameras look away from their middle", why)
 
-    def tell(self, say: Callable[[str], object]) -> None:
+    def tell(self, say: Say) -> None:
         for first, *others in self._kinds.values():
             say(first + (f" (and {len(others)} more)" if others else ""))
 

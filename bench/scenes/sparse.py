@@ -17,6 +17,7 @@ from bench.records import read_text
 from bench.scenes.lookup import found
 
 Entry = tuple[str, Sequence[Any]]  # where an entry is, for messages, and its words
+Found = tuple[list[Any], int]  # the words of an entry of a binary list, and where the next begins
 
 REAL = r"\s+([-+]?(?:(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|nan|inf))"
 IMAGE = re.compile(r"\d+" + 7 * REAL + r"\s+(\d+)\s+(.+)", re.IGNORECASE)
@@ -80,7 +81,7 @@ def _text_points(file: Path) -> Iterator[Entry]:
             raise unexpected(where, "POINT3D_ID X Y Z ...", repr(line[:80])) from error
 
 
-def _entries(file: Path, read: Callable[[bytes, int], tuple[list[Any], int]]) -> Iterator[Entry]:
+def _entries(file: Path, read: Callable[[bytes, int], Found]) -> Iterator[Entry]:
     """The entries of a binary list: `read` has the place of one, and returns that of the next."""
     content, number, end = found(file.parent, file.name, file, "a file").read_bytes(), 0, 8
     try:
@@ -93,7 +94,7 @@ def _entries(file: Path, read: Callable[[bytes, int], tuple[list[Any], int]]) ->
         raise unexpected(file, "a whole list", f"a damaged one, at entry {number}") from error
 
 
-def _camera(content: bytes, at: int) -> tuple[list[Any], int]:
+def _camera(content: bytes, at: int) -> Found:
     import pycolmap
 
     camera_id, number, width, height = struct.unpack_from("<IiQQ", content, at)
@@ -105,13 +106,13 @@ def _camera(content: bytes, at: int) -> tuple[list[Any], int]:
     return [camera_id, models[number].name, width, height, *params], at + 24 + 8 * count
 
 
-def _image(content: bytes, at: int) -> tuple[list[Any], int]:
+def _image(content: bytes, at: int) -> Found:
     end = content.index(0, at + 64)  # of its name
     (keypoints,) = struct.unpack_from("<Q", content, end + 1)
     words = struct.unpack_from("<7dI", content, at + 4)
     return [*words, content[at + 64 : end].decode(errors="replace")], end + 9 + 24 * keypoints
 
 
-def _point(content: bytes, at: int) -> tuple[list[Any], int]:
+def _point(content: bytes, at: int) -> Found:
     (track,) = struct.unpack_from("<Q", content, at + 43)
     return [*struct.unpack_from("<3d", content, at + 8)], at + 51 + 8 * track

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bench.cameras import scale_camera
 from bench.errors import unexpected
+from bench.kinds import AnyPath
 from bench.records import read_json
 from bench.scenes.assemble import Box, assemble, box_of_cameras, describe_splits, space_of, tight
 from bench.scenes.files import (
@@ -60,7 +61,7 @@ KNOWN = {*OTHER_TERMS, *READ.split(), *HARMLESS.split()}
 
 
 def load(
-    path: str | Path,
+    path: AnyPath,
     *,
     split: str | None = None,
     split_every: int = 8,

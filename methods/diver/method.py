@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from bench.kinds import Sizes
 from bench.study import Axis, Study, Variant, turned
 from bench.types import Budget, Probe, Rays, Scene
 from methods.diver.kernels.segments import Corners, Layers, render_segments
@@ -17,7 +18,7 @@ from methods.kernels.corner_gather import CORNERS
 from methods.kernels.settings import Fraction, multiple
 from methods.kernels.types import Occupancy, Pixels
 from methods.rendering.compaction import to_host
-from methods.rendering.frame import Render
+from methods.rendering.frame import Renderer
 from methods.students.method import IN_FP32, Student
 from methods.students.networks import encode_directions
 from methods.training.checkpoint import Tensors
@@ -53,7 +54,7 @@ class Baked:
         )
         self.across, self.view_bias = across.clone(), decoder.view.bias + along @ bias[1:]
 
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         """Bytes of the features, of a bit per cell that marks voxels, and of the decoder."""
         decoder = (*vars(self.layers).values(), self.across, self.view_bias)
         return {
@@ -119,11 +120,11 @@ class Diver(Student):
         model.restore(tensors)
         self.baked = Baked(model, self.stored)
 
-    def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
+    def renderer(self, probe: Probe) -> Renderer:
         def render(_: Tensor, rays: Rays) -> Pixels:
             return self.baked.render_rays(rays, probe, self.stop, self.faint)
 
         return self.baked.occupancy, render
 
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         return self.baked.sizes()

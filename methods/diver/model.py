@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.types import Rays
+from bench.types import Rays, TwoTensors
 from methods.diver.kernels.segments import segment_weights
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.corner_gather import corner_gather
@@ -16,6 +16,7 @@ from methods.kernels.voxel_walk import Crossings, Voxels
 from methods.students.networks import DIRECTION_CHANNELS, Dense
 from methods.students.voxels import corners_of, occupied_voxels
 from methods.training import checkpoint
+from methods.training.checkpoint import Tensors
 
 CHANNELS = 32  # features of a corner, and width of every layer between input and output
 
@@ -33,14 +34,14 @@ class Decoder(nn.Module):
         self.view = Dense(CHANNELS + DIRECTION_CHANNELS, CHANNELS, "fp32", generator)
         self.colour = Dense(CHANNELS, 3, "fp32", generator)
 
-    def density(self, features: Tensor) -> tuple[Tensor, Tensor]:
+    def density(self, features: Tensor) -> TwoTensors:
         """Density [S], integrated over the segment, before its ReLU; and what `colours` needs
         [S, 32]."""
         hidden = self.second(self.first(features).relu()).relu()
         sigma, geometry = self.third(hidden).split((1, CHANNELS), dim=1)
         return sigma.squeeze(1), geometry
 
-    def view_parts(self) -> tuple[Tensor, Tensor]:
+    def view_parts(self) -> TwoTensors:
         """Weights of the geometry [32, 32] and of the direction [32, 27] in the layer `view`."""
         return self.view.weight.split((CHANNELS, DIRECTION_CHANNELS), dim=1)
 
@@ -105,12 +106,12 @@ class CornerModel(nn.Module):
             self.table, self.corners, voxel, weights, grad_buffer=grad_buffer, backend=self.backend
         )
 
-    def tensors(self) -> checkpoint.Tensors:
+    def tensors(self) -> Tensors:
         """Everything that was trained."""
         own = {"coordinates": self.voxels.coordinates, "table": self.table.detach()}
         return self.decoder.state_dict(prefix="decoder.") | own
 
-    def restore(self, tensors: checkpoint.Tensors) -> None:
+    def restore(self, tensors: Tensors) -> None:
         """Restore what `tensors` returned."""
         self.decoder.load_state_dict(checkpoint.part(tensors, "decoder."))
         device = self.table.device

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from bench.kinds import Numbers
 from bench.types import Budget, Rays, Scene
 from methods.diver.kernels.segments import as_intervals
 from methods.diver.model import CornerModel
@@ -12,12 +13,12 @@ from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import STOP, composite, visibility
 from methods.kernels.settings import Count, Fraction, NotNegative, Positive, Share
-from methods.kernels.types import Pixels
+from methods.kernels.types import Composited
 from methods.kernels.voxel_walk import Crossings, walk
 from methods.rendering.field import pad
 from methods.students.networks import encode_directions
 from methods.students.voxels import largest_weights
-from methods.training import checkpoint
+from methods.training.checkpoint import Optimisers, Tensors
 from methods.training.loop import step_at
 
 
@@ -48,12 +49,12 @@ class DiverTraining(PixelTraining):
         self.moments = AdamState.like(model.table.detach())
         self.grad = torch.zeros_like(model.table)
 
-    def advance(self) -> dict[str, float]:
+    def advance(self) -> Numbers:
         if self.step == max(int(self.options.prune_at * self.steps), 1):
             self._prune()
         return super().advance()
 
-    def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
+    def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> Composited:
         # A segment is integrated exactly: there is nothing to jitter.
         model, backend = self.model, self.model.backend
         crossings = walk(rays, model.voxels, backend=backend)
@@ -107,7 +108,7 @@ class DiverTraining(PixelTraining):
         self.moments = AdamState(moments.first[rows], moments.second[rows], moments.steps[rows])
         self.grad = torch.zeros_like(model.table)
 
-    def optimisers(self) -> checkpoint.Optimisers:
+    def optimisers(self) -> Optimisers:
         return {"adam": self.networks, "moments": self.moments}
 
     def _update(self) -> None:
@@ -117,14 +118,14 @@ class DiverTraining(PixelTraining):
         table = self.model.table.detach()
         sparse_adam_(table, self.grad, self.moments, corner_rate, backend=self.model.backend)
 
-    def watched(self) -> checkpoint.Tensors:
+    def watched(self) -> Tensors:
         moments = self.moments.first + self.moments.second
         decoder = dict(self.model.decoder.named_parameters())
         return {"corner features": self.model.table, "their moments": moments, **decoder}
 
-    def result(self) -> checkpoint.Tensors:
+    def result(self) -> Tensors:
         return self.model.tensors()
 
-    def restore_result(self, tensors: checkpoint.Tensors) -> None:
+    def restore_result(self, tensors: Tensors) -> None:
         self.model.restore(tensors)
         self.grad = torch.zeros_like(self.model.table)

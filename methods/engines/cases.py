@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.case import Case, Cell, Random
+from bench.case import Case, Cases, Cell, Random
 from bench.console import ConsoleLog
 from methods.engines import Engine
 from methods.engines.openvino_engine import OpenVino
@@ -49,7 +49,7 @@ class _Hourglass(nn.Module):
         return self.leave(torch.cat((wide, full), 1).relu())
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """Constant inputs, values far outside the calibration range, a pixel of NaN."""
     shares = {cell: TOLERANCE[cell[1]] for cell in CELLS}
     exact = dict.fromkeys(CELLS, 0.0)

@@ -4,7 +4,7 @@ import contextlib
 import logging
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from bench.errors import Unavailable
-from bench.types import Log
+from bench.types import Log, SomeTensors
 from methods import engines
 from methods.engines import Built, Calibration, Engine, Folder, Precision, Samples
 
@@ -65,7 +65,7 @@ class OpenVino(Engine):
         size = sum(op.data.nbytes for op in weights)
         return Built(_compiled(self._openvino, model, self._dtype), size, self._dtype)
 
-    def _convert(self, network: nn.Module, samples: Sequence[Tensor]) -> Any:
+    def _convert(self, network: nn.Module, samples: SomeTensors) -> Any:
         # Only C is fixed: frames may have another size than the samples.
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # from the tracer, and about argument checks
@@ -101,7 +101,7 @@ class OpenVino(Engine):
         outside.input().tensor().set_element_type(kind)
         return outside.build()
 
-    def _quantised(self, model: Any, samples: Sequence[Tensor], nncf: Any) -> Any:
+    def _quantised(self, model: Any, samples: SomeTensors, nncf: Any) -> Any:
         logging.getLogger("nncf").setLevel(logging.ERROR)
         frames = nncf.Dataset(samples, Tensor.numpy)
         options = {

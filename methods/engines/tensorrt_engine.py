@@ -7,7 +7,6 @@ leave the bias in float32 (https://docs.nvidia.com/deeplearning/tensorrt, "Expli
 """
 
 import warnings
-from collections.abc import Sequence
 from copy import deepcopy
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,7 +17,8 @@ import torch
 from torch import Tensor, nn
 
 from bench.errors import SteerbenchError, Unavailable
-from bench.types import Log
+from bench.kinds import Json, Values
+from bench.types import Log, SomeTensors
 from methods import engines
 from methods.engines import Built, Calibration, Engine, Folder, Precision, Samples
 
@@ -56,9 +56,9 @@ class TensorRt(Engine):
                 "device=cuda, and CUDA_VISIBLE_DEVICES to choose among several"
             )
 
-    def key(self) -> dict[str, object]:
+    def key(self) -> Json:
         """As of any engine, and the model of the GPU: plans are valid for one."""
-        return super().key() | {"gpu": torch.cuda.get_device_name()}
+        return {**super().key(), "gpu": torch.cuda.get_device_name()}
 
     def build(self, network: nn.Module, samples: Samples, folder: Folder, log: Log) -> Built:
         import onnx
@@ -114,7 +114,7 @@ def _export(module: nn.Module, sample: Tensor, path: Path) -> None:
     onnx.save(model, path)
 
 
-def _quantise(exported: Path, samples: Sequence[Tensor], path: Path, *, uncalibrated: bool) -> None:
+def _quantise(exported: Path, samples: SomeTensors, path: Path, *, uncalibrated: bool) -> None:
     """Quantise the products of a model to 8 bits, with ranges from `samples` or with fixed ones."""
     from onnxruntime import quantization
     from onnxruntime.quantization import shape_inference
@@ -134,7 +134,7 @@ def _quantise(exported: Path, samples: Sequence[Tensor], path: Path, *, uncalibr
     )
 
 
-def _fixed_ranges(prepared: Path) -> dict[str, Any]:
+def _fixed_ranges(prepared: Path) -> Values:
     """Options of the quantiser that set the ranges of `engines.largest`, whatever the samples
     contain. A tensor padded with zeros keeps its range."""
     import onnx

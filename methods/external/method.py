@@ -21,8 +21,9 @@ import numpy as np
 import torch
 
 from bench.errors import SteerbenchError, explained, some, unexpected
+from bench.kinds import Json, Labels, Named, Size, Sizes, Texts, Values
 from bench.provenance import code_sha256, computed_by, files_at, sums_of
-from bench.records import read_record
+from bench.records import read_record, without
 from bench.results import content_key
 from bench.scenes.export import data_camera, picture_file, write_blender
 from bench.sharing import check_sums, missing, whole, write_sums
@@ -32,7 +33,7 @@ from methods.external.worker import Header, Worker
 
 WORKERS = Path(__file__).with_name("workers")  # those that come with steerbench
 
-UNTOLD: dict[str, Any] = {
+UNTOLD: Values = {
     **{"device": "cpu", "precision": "unknown", "memory": 0},
     **{"can": [], "knobs": {}, "files": [], "packages": {}},
 }
@@ -46,9 +47,9 @@ class External:
 
     command: str
     python: str | None
-    options: Mapping[str, Any]
+    options: Named
     files: list[str]
-    environment: Mapping[str, str]
+    environment: Labels
     lock: str | None
     folders: list[str]
     start_s: float
@@ -122,7 +123,7 @@ class External:
         return [*given, *words, *map(Path, self._about["files"])]
 
     @cached_property
-    def _packages(self) -> dict[str, object]:
+    def _packages(self) -> Json:
         """The versions of what its environment holds."""
         if self.lock is None:
             return self._about["packages"]
@@ -134,7 +135,7 @@ class External:
             raise SteerbenchError(f"method.lock: {self.lock}: {why}") from error
         return {"lock": done.stdout}
 
-    def settings(self) -> dict[str, str]:
+    def settings(self) -> Texts:
         """What rows show, and a hash of its environment for the key of a run."""
         device, precision = self._about["device"], self._about["precision"]
         if device != "cpu" and not (device.startswith("cuda") and torch.cuda.is_available()):
@@ -178,7 +179,7 @@ class External:
         if "load" in can:
             self._load({**job, "state": str(folder / "state")}, log)
 
-    def _load(self, job: Mapping[str, object], log: Log) -> None:
+    def _load(self, job: Json, log: Log) -> None:
         told, _ = self._worker.ask("load", self.start_s, job)
         for note in told.get("notes") or ():
             log.info(f"{self.name}: {note}")
@@ -189,13 +190,13 @@ class External:
         del self._worker
         self._worker.ask("settings", self.start_s, {"options": self.options})
 
-    def _key(self, job: Mapping[str, object]) -> dict[str, object]:
+    def _key(self, job: Json) -> Json:
         knobs = self._about["knobs"]
         return {
             **job,
             "scene": self._scene.digest,
             "name": self.name,
-            "options": {name: value for name, value in self.options.items() if name not in knobs},
+            "options": without(self.options, knobs),
             "command": [
                 code_sha256(Path(word)) if Path(word).is_file() else word for word in self._typed
             ],
@@ -205,7 +206,7 @@ class External:
             **computed_by(write_blender),
         }
 
-    def _train(self, folder: Path, job: Mapping[str, object], log: Log) -> float:
+    def _train(self, folder: Path, job: Json, log: Log) -> float:
         """Let it train on the scene as files, and put what it stores into `folder`; the seconds."""
         pictures = [
             {"file": picture_file("train", number), **self._described(camera)}
@@ -238,7 +239,7 @@ class External:
         write_sums(folder)
         return seconds
 
-    def _described(self, camera: Camera) -> dict[str, object]:
+    def _described(self, camera: Camera) -> Json:
         """A camera in scene units, as the protocol has it."""
         names = ("width", "height", "fx", "fy", "cx", "cy")
         pose = data_camera(self._scene, camera).c2w.tolist()
@@ -268,7 +269,7 @@ class External:
             raise self._worker.fault(f"answered 'render' with a wrong {error}") from error
         return frame
 
-    def _frame(self, arrays: Mapping[str, np.ndarray], size: tuple[int, int]) -> Frame:
+    def _frame(self, arrays: Mapping[str, np.ndarray], size: Size) -> Frame:
         """What has arrived as a frame; its values are checked where they are used."""
         shapes = {"rgb": [*size, 3], "depth": [*size], "alpha": [*size]}
         self._expect("rgb" in arrays, f"rgb {shapes['rgb']}", "rgb none")
@@ -290,7 +291,7 @@ class External:
     def _expect(self, holds: bool, expected: str, got: object) -> None:
         self._worker.expect(holds, "render", expected, got)
 
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         """The bytes of its components. Asked last: what it has loaded meanwhile is known now."""
         told, _ = self._worker.ask("sizes", self.frame_s, {})
         sizes: Any = told.get("sizes")

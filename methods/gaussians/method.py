@@ -7,6 +7,7 @@ from typing import Literal
 import torch
 
 from bench.cameras import place_camera
+from bench.kinds import Sizes, Texts
 from bench.provenance import computed_by
 from bench.study import Axis, Study, Variant, turned
 from bench.threads import torch_threads
@@ -101,9 +102,9 @@ class GaussianSplatting(OnField):
         with probe.stage("finish"):
             return FeatureFrame.of(camera, pixels, self.background).picture()
 
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         plain = sum(4 * x.numel() for x in self.gaussians.parameters())
         return {"gaussians": plain if self.stored == "fp32" else stored_bytes(self.gaussians)}
 
-    def settings(self) -> dict[str, str]:
+    def settings(self) -> Texts:
         return super().settings() | {"field_precision": "fp32"}

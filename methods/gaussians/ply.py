@@ -11,7 +11,6 @@ or no scale_2 (2DGS), flat; filter_3D (Mip-Splatting).
 
 import math
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +19,9 @@ from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
 from bench.errors import not_there
+from bench.kinds import Say
 from bench.sharing import whole
-from bench.types import Scene, SteerbenchError
+from bench.types import Scene, SteerbenchError, TwoTensors
 from methods.gaussians.model import Gaussians
 
 POSITION, NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
@@ -67,7 +67,7 @@ def write(gaussians: Gaussians, scene: Scene, path: Path) -> None:
         PlyData([PlyElement.describe(rows, "vertex")]).write(new)
 
 
-def read(path: Path, scene: Scene, say: Callable[[str], object]) -> Gaussians:
+def read(path: Path, scene: Scene, say: Say) -> Gaussians:
     """Read the Gaussians of a file in the coordinates of the data set of `scene`. Those that cannot
     be drawn are left out; `say` gets a line about these, and about what is not read as it stands.
 
@@ -141,7 +141,7 @@ def read(path: Path, scene: Scene, say: Callable[[str], object]) -> Gaussians:
     return Gaussians(*(part[drawn].contiguous() for part in parts))
 
 
-def _fused(logits: Tensor, log_scales: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
+def _fused(logits: Tensor, log_scales: Tensor, width: Tensor) -> TwoTensors:
     """Logits and log scales with the 3D filter of Mip-Splatting (Yu et al. 2024), a Gaussian of
     `width` [N, 1]: variances are added, what is spread is as much fainter."""
     scales = log_scales.double().exp()

@@ -15,7 +15,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from bench.cameras import place_camera, scale_camera
-from bench.types import Camera, NullProbe, Scene, composite
+from bench.kinds import Numbers
+from bench.types import Camera, NullProbe, Scene, TwoTensors, composite
 from methods.gaussians.kernels.projection import covariances
 from methods.gaussians.kernels.ssim import ssim
 from methods.gaussians.model import Gaussians
@@ -25,7 +26,8 @@ from methods.kernels.composite import STOP
 from methods.kernels.march.contraction import HALF
 from methods.kernels.settings import Checked, Count, Only, Positive
 from methods.rendering.frame import render_rays
-from methods.training import checkpoint, loop
+from methods.training import loop
+from methods.training.checkpoint import Optimisers, Tensors
 
 SOLID = 0.5  # opacity above which a ray counts as ending at a surface
 
@@ -92,7 +94,7 @@ class GaussianTraining(loop.Training):
         groups = [{"params": [parameter], "lr": rate} for parameter, rate in rates]
         return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
-    def advance(self) -> dict[str, float]:
+    def advance(self) -> Numbers:
         options = self.options
         gaussians = self.gaussians
         share = self.step / self.steps
@@ -118,7 +120,7 @@ class GaussianTraining(loop.Training):
         costs = costs + options.scale_cost * scales.mean()
         (loss + costs).backward()
 
-        def error() -> checkpoint.Tensors:
+        def error() -> Tensors:
             return {"": functional.mse_loss(picture, target)}
 
         errors = loop.look(self, error, {"picture": picture})
@@ -163,29 +165,29 @@ class GaussianTraining(loop.Training):
             picture = shrunk[0].movedim(0, -1).contiguous()
         return place_camera(camera, device), picture
 
-    def optimisers(self) -> checkpoint.Optimisers:
+    def optimisers(self) -> Optimisers:
         return {"adam": self.optimiser}
 
-    def watched(self) -> checkpoint.Tensors:
+    def watched(self) -> Tensors:
         return dict(self.gaussians.named_parameters())
 
-    def result(self) -> checkpoint.Tensors:
+    def result(self) -> Tensors:
         return {name: value.detach() for name, value in self.gaussians.named_parameters()}
 
-    def restore_result(self, tensors: checkpoint.Tensors) -> None:
+    def restore_result(self, tensors: Tensors) -> None:
         self.gaussians.load_state_dict({name: tensors[name] for name in self.result()})
 
-    def state(self) -> checkpoint.Tensors:
+    def state(self) -> Tensors:
         return super().state() | {"views": torch.tensor(self.views, dtype=torch.int64)}
 
-    def restore(self, tensors: checkpoint.Tensors) -> None:
+    def restore(self, tensors: Tensors) -> None:
         super().restore(tensors)
         self.views = tensors["views"].tolist()
 
 
 def on_surfaces(
     teacher: TrainedField, scene: Scene, count: int, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
+) -> TwoTensors:
     """Choose `count` points where rays of random training pixels end, and their colours: [count, 3]
     each. If the pictures show too little matter, points are taken more than once."""
     field = teacher.field
@@ -207,7 +209,7 @@ def on_surfaces(
     return torch.cat(points)[index], torch.cat(colours)[index].clamp(0, 1)
 
 
-def anywhere(scene: Scene, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def anywhere(scene: Scene, count: int, generator: torch.Generator) -> TwoTensors:
     """Draw `count` points uniformly inside the bounds of `scene`, with random colours."""
     low, high = scene.bounds.to(generator.device)
     unit, colours = torch.rand(2, count, 3, generator=generator, device=generator.device)
@@ -251,7 +253,7 @@ def relocate(
     return len(dead)
 
 
-def shared_between(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
+def shared_between(opacities: Tensor, copies: Tensor) -> TwoTensors:
     """Opacity of each of `copies` [N] Gaussians that replace one of `opacities` [N], and the factor
     on its scales (Eq. 9): 1 - (1 - o_new)^n = o, and the factor keeps the integral of the opacity
     along a ray through the centre."""

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from bench.cameras import look_at
-from bench.case import U16, U32, Case, Property
+from bench.case import U16, U32, Cases, Property
 from bench.types import Budget, Camera, Scene, Split, SteerbenchError, Unavailable
 from methods.instant_ngp.field import LOG_DENSITY_CLAMP, FieldPrecision, HashField
 from methods.instant_ngp.training import MIN_RAYS, FieldTraining, TrainingOptions
@@ -44,7 +44,7 @@ FORGOTTEN_AFTER = math.ceil((LOG_DENSITY_CLAMP - math.log(THRESHOLD)) / -math.lo
 """Visits after which a cell of the largest possible density counts as empty again."""
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """Constant data; extreme rates, weights and gradients."""
     pictures = {
         "nothing but background": partial(_scene, 0, alpha=0),

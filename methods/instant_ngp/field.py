@@ -7,7 +7,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.types import Probe
+from bench.kinds import Sizes
+from bench.types import Probe, TwoTensors
 from methods.kernels import multiplies_bf16
 from methods.kernels.encode import HashGrid, SampleGradients, collect, encode, pack
 from methods.kernels.mlp import mlp
@@ -102,7 +103,7 @@ class HashField(nn.Module):
             backend=self.backend,
         )
 
-    def density(self, positions: Tensor, encoded: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def density(self, positions: Tensor, encoded: Tensor | None = None) -> TwoTensors:
         """As of any `Encoder`: density [S] float32 and geometry channels [S, 16]."""
         weights = self._weights("density_in", "density_out")
         size = self._part(positions)
@@ -140,7 +141,7 @@ class HashField(nn.Module):
         probe.count("table_reads", 8 * self.grid.levels * samples)
         probe.count("products", density * samples + features * shaded)
 
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         """Bytes of table and networks at the precision at which they are read."""
         width = 2 if self.precision == "bf16" else 4
         networks = sum(layer.numel() for layer in self.layers.values())

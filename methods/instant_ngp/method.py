@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 import torch
 
 from bench.cameras import place_camera
-from bench.study import Study, turned
+from bench.kinds import Sizes
+from bench.study import turned
 from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
-from methods.instant_ngp.stage1 import OnField, train_field
+from methods.instant_ngp.stage1 import MARCHED, OnField, train_field
 from methods.kernels.compilation import compile_kernels
 from methods.kernels.settings import Stop
 from methods.rendering.frame import everywhere, render_frame
@@ -22,8 +23,8 @@ class InstantNgp(OnField):
     stop: Stop
 
     name = "ngp"
-    study = Study(
-        knobs={"stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3"))},
+    study = replace(
+        MARCHED,
         trained={
             "log2 T, trained": turned("log2 T", "method.grid.log2_table", (17, 18, 19)),
             "step, trained": turned("trained step", "method.training.march_step", (1, 2, 4)),
@@ -31,9 +32,6 @@ class InstantNgp(OnField):
             "thin, trained": turned("thin", "method.training.thin", (0,)),
             "error, trained": turned("by error", "method.training.by_error", (0,)),
         },
-        exact=("method.stop=1e-4",),
-        parts=dict.fromkeys(("rays", "march", "composite"), "field"),
-        chosen=("stop",),
     )
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
@@ -52,5 +50,5 @@ class InstantNgp(OnField):
         render = everywhere(field, occupancy, probe, sampling)
         return render_frame(camera, occupancy, self.background, probe, render).picture()
 
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         return self.trained.sizes()

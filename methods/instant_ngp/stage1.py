@@ -2,11 +2,13 @@
 
 import math
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Self
+from typing import Self
 
 import torch
 
+from bench.kinds import Json, Sizes, Texts, Values
 from bench.provenance import computed_by
+from bench.study import Study, turned
 from bench.types import DEVICE, Budget, Log, Scene
 from methods.instant_ngp.field import FieldPrecision, HashField
 from methods.instant_ngp.table import SuitedGrid
@@ -19,6 +21,14 @@ from methods.kernels.types import Occupancy
 from methods.rendering.occupancy import STEP, DensityGrid
 from methods.rendering.sampling import Sampling
 from methods.training import checkpoint, loop
+
+MARCHED = Study(
+    knobs={"stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3"))},
+    exact=("method.stop=1e-4",),
+    parts=dict.fromkeys(("rays", "march", "composite"), "field"),
+    chosen=("stop",),
+)
+"""The study of a field that rays are marched through."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +69,7 @@ class Setup:
         """Random numbers of the seed."""
         return torch.Generator(device).manual_seed(self.seed)
 
-    def settings(self, method: type) -> dict[str, str]:
+    def settings(self, method: type) -> Texts:
         """What a row of `method` shows of how it ran, of one without a 2D network."""
         multiplied = self.precision == "fp32" or multiplies_bf16(self.device.type)
         return {
@@ -75,7 +85,7 @@ class Setup:
         grid = self.grid.of(scene) if isinstance(self.grid, SuitedGrid) else self.grid
         return replace(self, grid=grid)
 
-    def key(self, scene: Scene, budget: Budget) -> dict[str, object]:
+    def key(self, scene: Scene, budget: Budget) -> Json:
         """Everything the trained field depends on."""
         march_step = self.training.sampling(budget).step / STEP
         return {
@@ -113,10 +123,10 @@ class OnField(Checked):
     def reset(self) -> None:
         """Do nothing: every frame stands alone."""
 
-    def settings(self) -> dict[str, str]:
+    def settings(self) -> Texts:
         return self.setup.settings(type(self))
 
-    def decided(self, scene: Scene) -> dict[str, Any]:
+    def decided(self, scene: Scene) -> Values:
         """What settings that are left to the scene become for it, by the names that one types."""
         return {"method.grid.log2_table": self.setup.suited(scene).grid.log2_table}
 
@@ -137,7 +147,7 @@ class TrainedField:
         """Where the field may hold matter."""
         return self.grid.occupancy
 
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         """Bytes of table, networks and occupancy bits."""
         return self.field.sizes() | {"occupancy": self.occupancy.cells.numel() // 8}
 

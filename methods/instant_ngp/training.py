@@ -9,7 +9,8 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from bench.types import Budget, Rays, Scene, SteerbenchError
+from bench.kinds import Numbers
+from bench.types import Budget, Rays, Scene, SteerbenchError, TwoTensors
 from methods.instant_ngp.field import HashField
 from methods.instant_ngp.pixels import REFRESHED, ErrorMap, PixelBatches
 from methods.kernels.adam import AdamState, hash_adam_
@@ -24,11 +25,12 @@ from methods.kernels.settings import (
     SomeShare,
     Stop,
 )
-from methods.kernels.types import Pixels
+from methods.kernels.types import Composited
 from methods.rendering.batch import opacity_entropy, render_batch
 from methods.rendering.occupancy import EVERY, MIN_VIEWS, STEP, DensityGrid, learnable_cells
 from methods.rendering.sampling import Sampling, suitable_step
 from methods.training import checkpoint, loop
+from methods.training.checkpoint import Optimisers, Tensors
 
 MIN_RAYS = 64  # minimum number of rays in a step
 Enough = Annotated[int, Only(f"{MIN_RAYS} or more", lambda x: x >= MIN_RAYS)]
@@ -107,7 +109,7 @@ class PixelTraining(loop.Training, ABC):
         self.generator = torch.Generator(device).manual_seed(seed)
 
     @abstractmethod
-    def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
+    def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> Composited:
         """Render R `rays` on `background` [3] or [R, 3], differentiably; also return the number of
         samples that were composited. `jitter` [R] in [0, 1) is the phase of the samples."""
 
@@ -119,7 +121,7 @@ class PixelTraining(loop.Training, ABC):
         """The learning rate of the next step."""
         return self.options.rate * loop.cosine(self.step / self.steps, self.options.final_rate)
 
-    def advance(self) -> dict[str, float]:
+    def advance(self) -> Numbers:
         numbers, alike = self._numbers()
         rays, colours = self.batches.at(numbers)
         target, background = self._target(colours)
@@ -131,7 +133,7 @@ class PixelTraining(loop.Training, ABC):
         if self.errors is not None:
             self.errors.learn(numbers, each.detach())
 
-        def shown() -> checkpoint.Tensors:
+        def shown() -> Tensors:
             return {"": each[:alike].mean() + 0 * loss}  # not finite if any error is not
 
         errors = loop.look(self, shown, {"loss": loss, "rendered pixels": pixels.values})
@@ -151,7 +153,7 @@ class PixelTraining(loop.Training, ABC):
         alike = self.batches.choose(self.rays - wrong, self.generator)
         return torch.cat((alike, self.errors.draw(wrong, self.generator))), len(alike)
 
-    def _target(self, colours: Tensor) -> tuple[Tensor, Tensor]:
+    def _target(self, colours: Tensor) -> TwoTensors:
         """Composite colours on a background; also return that background, [3] or [R, 3]."""
         background, generator = self.background, self.generator
         solid = colours.shape[-1] == 3
@@ -168,13 +170,13 @@ class PixelTraining(loop.Training, ABC):
         change = min(max(self.samples / max(samples, 1), 0.5), 1.25)
         self.rays = min(max(int(self.rays * change), MIN_RAYS), self.options.max_rays)
 
-    def state(self) -> checkpoint.Tensors:
+    def state(self) -> Tensors:
         tensors = super().state() | {"rays": torch.tensor(self.rays)}
         if self.errors is not None:
             tensors |= {"errors": self.errors.errors, "error_ends": self.errors.ends}
         return tensors
 
-    def restore(self, tensors: checkpoint.Tensors) -> None:
+    def restore(self, tensors: Tensors) -> None:
         super().restore(tensors)
         self.rays = int(tensors["rays"])
         if self.errors is not None:
@@ -197,17 +199,17 @@ class FieldTraining(PixelTraining):
         self.rays = options.rays or self.rays
         self.optimiser = FieldOptimiser(field)
 
-    def advance(self) -> dict[str, float]:
+    def advance(self) -> Numbers:
         if self.step % EVERY == 0:
             times = 4 if self.step < GRID_YOUTH_STEPS else 1
             self.grid.update(self.field, self.generator, times * self.options.grid_samples)
         return super().advance()
 
-    def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
+    def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> Composited:
         field, cells, how = self.field, self.grid.occupancy, self.sampling
         return render_batch(field, rays, cells, how, jitter=jitter, background=background)
 
-    def optimisers(self) -> checkpoint.Optimisers:
+    def optimisers(self) -> Optimisers:
         return self.optimiser.parts
 
     def _update(self) -> None:
@@ -217,19 +219,19 @@ class FieldTraining(PixelTraining):
         if self.options.rays is None:
             super()._fit_batch(samples)
 
-    def watched(self) -> checkpoint.Tensors:
+    def watched(self) -> Tensors:
         moments = self.optimiser.table
         both = moments.first + moments.second
         return {"table": self.field.table, "table moments": both, **self.field.layers}
 
-    def result(self) -> checkpoint.Tensors:
+    def result(self) -> Tensors:
         return self.field.state_dict(prefix="field.") | {"grid.density": self.grid.density}
 
-    def restore_result(self, tensors: checkpoint.Tensors) -> None:
+    def restore_result(self, tensors: Tensors) -> None:
         restore_field(self.field, self.grid, tensors)
 
 
-def restore_field(field: HashField, grid: DensityGrid, tensors: checkpoint.Tensors) -> None:
+def restore_field(field: HashField, grid: DensityGrid, tensors: Tensors) -> None:
     """Restore what `FieldTraining.result` returned."""
     field.load_state_dict(checkpoint.part(tensors, "field."))
     field.repack()
@@ -260,6 +262,6 @@ class FieldOptimiser:
         hash_adam_(*given, packed=field.packed, backend=field.backend)
 
     @property
-    def parts(self) -> checkpoint.Optimisers:
+    def parts(self) -> Optimisers:
         """Both, for a checkpoint."""
         return {"table": self.table, "networks": self._networks}

@@ -13,13 +13,14 @@ from typing import Any
 import torch
 
 from bench.errors import Unavailable
+from bench.kinds import Names, Texts
 from bench.provenance import sources
 
 BACKENDS = ("reference", "cpu", "gpu")
 
 
 @cache
-def availability() -> dict[str, str]:
+def availability() -> Texts:
     """For each backend, "" if it can be used here, otherwise why not and how to get it."""
     reasons = dict.fromkeys(BACKENDS, "")
     if importlib.util.find_spec("triton") is None:
@@ -106,7 +107,7 @@ def _computing(kernel: str, backend: str, device: torch.device) -> str:
 
 
 @cache
-def served(kernel: str) -> tuple[str, ...]:
+def served(kernel: str) -> Names:
     """The backends that implement `kernel`, a package."""
     folder = Path(*importlib.import_module(kernel).__path__)
     return tuple(name for name in BACKENDS if (folder / f"{name}.py").exists())

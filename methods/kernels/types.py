@@ -6,7 +6,7 @@ An `Occupancy` says where samples may lie, `Samples` are `Intervals` on rays wit
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar, Self
@@ -16,7 +16,8 @@ from scipy.ndimage import distance_transform_cdt
 from torch import Tensor
 from torch.nn import functional
 
-from bench.types import Rays, check_shape, rows
+from bench.kinds import Names
+from bench.types import Rays, SomeTensors, ThreeTensors, check_shape, rows
 
 BRICK = 4  # cells along the side of a brick; its 64 cells are one word of `Occupancy.words`
 
@@ -113,12 +114,12 @@ def clearance(used: Tensor) -> Tensor:
     return apart.where(apart >= 0, len(used)).clamp(max=255).to(used.device, torch.uint8)
 
 
-def cat(parts: Sequence[Tensor]) -> Tensor:
+def cat(parts: SomeTensors) -> Tensor:
     """`torch.cat` of one or more tensors; a single one is not copied."""
     return parts[0] if len(parts) == 1 else torch.cat(tuple(parts))
 
 
-def joined(parts: Iterable[Sequence[Tensor]]) -> tuple[Tensor, ...]:
+def joined(parts: Iterable[SomeTensors]) -> tuple[Tensor, ...]:
     """The first tensors of all `parts` as one, see `cat`; the second ones; and so on."""
     return tuple(map(cat, zip(*parts, strict=True)))
 
@@ -143,7 +144,7 @@ class Intervals:
     offsets: Tensor  # [R + 1] int64, ray r owns samples offsets[r] to offsets[r + 1]
     # Samples of the ray that has the most, or more than that; None: unknown, as `offsets` say.
     longest: int | None = field(default=None, kw_only=True)
-    of_a_sample: ClassVar[tuple[str, ...]] = "t", "delta"  # what has a row for each sample
+    of_a_sample: ClassVar[Names] = "t", "delta"  # what has a row for each sample
 
     def __len__(self) -> int:
         return len(self.t)
@@ -172,7 +173,7 @@ class Samples(Intervals):
     positions: Tensor  # [S, 3] in the unit cube
     resume: Tensor  # [R] int32, the step to resume from; -1 if the ray has no more samples
     encoded: Tensor | None = field(default=None, kw_only=True)  # [S, E] positions, by a field
-    of_a_sample: ClassVar[tuple[str, ...]] = "t", "delta", "ray", "positions", "encoded"
+    of_a_sample: ClassVar[Names] = "t", "delta", "ray", "positions", "encoded"
 
     def chosen(self, index: Tensor, offsets: Tensor, longest: int | None) -> Self:
         """As of `Intervals`, with no more to follow."""
@@ -208,7 +209,7 @@ class Pixels:
             column.index_copy_(0, index, new)  # a row at a time; `x[index]` goes number by number
 
     @property
-    def columns(self) -> tuple[Tensor, Tensor, Tensor]:
+    def columns(self) -> ThreeTensors:
         """Values, depth sums and opacities."""
         return self.values, self.depth_sum, self.alpha
 
@@ -216,3 +217,6 @@ class Pixels:
         """Composite the rays onto a `background` [K] or [R, K], whose weight is 1 - alpha."""
         shine = (1 - self.alpha)[:, None] * background
         return Pixels(self.values + shine, self.depth_sum, self.alpha)
+
+
+Composited = tuple[Pixels, int]  # and of how many samples

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.types import Probe
+from bench.kinds import Sizes
+from bench.types import Probe, TwoTensors
 from methods.kernels.types import Occupancy, joined, offsets_of
 from methods.kilonerf.kernels.grouped_mlp import (
     DIRECTION_FREQUENCIES,
@@ -113,13 +114,13 @@ class KiloField(StudentField):
                 values = torch.empty(*shape).uniform_(-bound, bound, generator=generator)
                 kind[name] = nn.Parameter(values.repeat(grid.count, *[1] * len(shape)))
 
-    def raw_density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+    def raw_density(self, positions: Tensor) -> TwoTensors:
         """Density [S] times `REACH` before its activation, and what `features` needs [S, 33]."""
         grid = self.networks, self.corner, self.side
         numbers, local = locate(positions, *grid, backend=self.backend)
         return densities(local, numbers, self._layers, backend=self.backend)
 
-    def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+    def density(self, positions: Tensor) -> TwoTensors:
         raw, geometry = self.raw_density(positions)
         return raw.relu() / REACH, geometry
 
@@ -136,7 +137,7 @@ class KiloField(StudentField):
         density = sum(products[name] for name in ("in", "mid", "density"))
         probe.count("products", density * samples + (sum(products.values()) - density) * shaded)
 
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         """Bytes of the networks, and of the grid that holds their numbers."""
         parameters = sum(parameter.numel() for parameter in self.parameters())
         return {"networks": 4 * parameters, "network_grid": 2 * self.networks.numel()}

@@ -8,13 +8,14 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench.types import Budget, Scene
+from bench.types import Budget, Scene, TwoTensors
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.settings import Count, NotNegative, between
 from methods.kilonerf.field import Grid, KiloField, Pieces, place_networks
 from methods.students.fields import FieldLessons, FieldStudent, StudentTraining
 from methods.students.method import IN_FP32
 from methods.training import checkpoint
+from methods.training.checkpoint import Tensors
 
 MOST = 32  # maximum number of networks along an axis: they are numbered in int16
 
@@ -40,7 +41,7 @@ class KiloTraining(StudentTraining):
     def _places(self) -> Tensor:
         return self.pieces.draw(self.options.points_each, self.generator)
 
-    def _learned(self, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    def _learned(self, positions: Tensor, directions: Tensor) -> TwoTensors:
         """As in the base class, with a density that may fall below 0."""
         thickness, geometry = self.field.raw_density(positions)
         encoded = self.field.encode_directions(directions)
@@ -86,7 +87,7 @@ class KiloNerf(FieldStudent):
         training.pieces = pieces
         return training
 
-    def restore(self, tensors: checkpoint.Tensors) -> None:
+    def restore(self, tensors: Tensors) -> None:
         parts = checkpoint.part(tensors, "field.")
         self.grid = Grid(parts["networks"], parts["corner"], parts["side"])
         super().restore(tensors)

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from bench.types import Probe
+from bench.types import Probe, TwoTensors
 from methods.instant_ngp.field import FieldPrecision
 from methods.students.fields import REACH
 from methods.students.networks import (
@@ -46,7 +46,7 @@ class NerfField(NetworkField):
         self.view = Dense(WIDTH + DIRECTION_CHANNELS, VIEW_WIDTH, precision, generator)
         self.colour = Dense(VIEW_WIDTH, 3, precision, generator)
 
-    def density_together(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+    def density_together(self, positions: Tensor) -> TwoTensors:
         encoded = positional(2 * positions - 1, POSITION_FREQUENCIES)
         hidden = encoded
         for number, layer in enumerate(self.trunk):

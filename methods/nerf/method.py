@@ -11,7 +11,7 @@ from methods.kernels.march import march
 from methods.kernels.types import Occupancy, Pixels
 from methods.nerf.field import NerfField
 from methods.rendering.field import query
-from methods.rendering.frame import Render
+from methods.rendering.frame import Renderer
 from methods.students.fields import FieldLessons, FieldStudent
 
 CHUNK_RAYS = 1 << 9
@@ -35,7 +35,7 @@ class Nerf(FieldStudent):
         field = NerfField(teacher.precision, teacher.backend, teacher.generator())
         return field.to(teacher.device)
 
-    def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
+    def renderer(self, probe: Probe) -> Renderer:
         """The occupied cells and a march through them, or the whole cube and every sample."""
         if self.skip:
             return super().renderer(probe)

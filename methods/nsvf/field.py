@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.types import Probe
+from bench.kinds import Sizes
+from bench.types import Probe, TwoTensors
 from methods.instant_ngp.field import FieldPrecision
 from methods.kernels.corner_gather import CORNERS, corner_gather, trilinear
 from methods.kernels.types import Occupancy
@@ -79,14 +80,14 @@ class NsvfField(NetworkField):
             Dense(WIDTH, 3, precision, generator),
         )
 
-    def density_together(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+    def density_together(self, positions: Tensor) -> TwoTensors:
         """As of any network; the density is 0 outside all voxels."""
         embedding, inside = self.embedding(positions)
         hidden = self.trunk(positional(embedding, EMBEDDING_FREQUENCIES))
         raw = self.opacity(hidden)[:, 0].to(embedding.dtype)
         return FREE_ENERGY * ACROSS * torch.where(inside, density_of(raw), 0), hidden
 
-    def embedding(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+    def embedding(self, positions: Tensor) -> TwoTensors:
         """Trilinearly interpolated embeddings [S, 32], and whether there is a voxel [S]."""
         size = len(self.index)
         scaled = positions * size
@@ -114,6 +115,6 @@ class NsvfField(NetworkField):
         probe.count("table_reads", CORNERS * samples)
         probe.count("products", density * samples + colour * shaded)
 
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         embeddings = self.embeddings.numel() * self.embeddings.element_size()
         return {"embeddings": embeddings, "network": super().sizes()["network"] - embeddings}

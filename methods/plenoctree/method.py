@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from bench.kinds import Sizes
 from bench.study import Axis, Study, Variant, turned
 from bench.types import Budget, Probe, Rays, Scene
 from methods.instant_ngp.pixels import PixelBatches
@@ -16,15 +17,15 @@ from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import STOP, composite, visibility
 from methods.kernels.settings import Count, NotNegative
-from methods.kernels.types import Occupancy, Pixels
+from methods.kernels.types import Composited, Pixels
 from methods.kernels.voxel_walk import walk
 from methods.plenoctree.kernels.voxel_light import render_voxels, shade_voxels
 from methods.plenoctree.octree import Extraction, Octree, extract
 from methods.rendering.compaction import to_host
-from methods.rendering.frame import Render
+from methods.rendering.frame import Renderer
 from methods.rendering.sampling import Sampling
 from methods.students.method import IN_FP32, Student
-from methods.training import checkpoint
+from methods.training.checkpoint import Optimisers, Tensors
 
 SIDE = "method.extraction.resolution"
 
@@ -59,7 +60,7 @@ class OctreeTraining(PixelTraining):
         self.gradients = {name: torch.zeros_like(table) for name, table in self.tables.items()}
         self.moments = {name: AdamState.like(table) for name, table in self.tables.items()}
 
-    def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
+    def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> Composited:
         # `jitter` moves samples; where a ray crosses a voxel is fixed.
         light, backend = self.octree.light, self.backend
         crossings = walk(rays, self.octree.voxels, backend=backend)
@@ -74,7 +75,7 @@ class OctreeTraining(PixelTraining):
         pixels = composite(self._sigma.relu(), colours, crossings, stop=STOP, backend=backend)
         return pixels.over(background), len(crossings)
 
-    def optimisers(self) -> checkpoint.Optimisers:
+    def optimisers(self) -> Optimisers:
         return self.moments
 
     def _update(self) -> None:
@@ -89,13 +90,13 @@ class OctreeTraining(PixelTraining):
             given = table, self.gradients[name], self.moments[name], rates[name]
             sparse_adam_(*given, backend=self.backend)
 
-    def watched(self) -> checkpoint.Tensors:
+    def watched(self) -> Tensors:
         return self.tables
 
-    def result(self) -> checkpoint.Tensors:
+    def result(self) -> Tensors:
         return self.octree.tensors()
 
-    def restore_result(self, tensors: checkpoint.Tensors) -> None:
+    def restore_result(self, tensors: Tensors) -> None:
         self._take(Octree.of(tensors, self.octree.light.density.device))
 
 
@@ -128,10 +129,10 @@ class PlenOctree(Student):
         octree = extract(teacher, batches, self.extraction, setup.generator(setup.device))
         return OctreeTraining(octree, scene, budget, self.training, setup)
 
-    def restore(self, tensors: checkpoint.Tensors) -> None:
+    def restore(self, tensors: Tensors) -> None:
         self.octree = Octree.of(tensors, self.teacher.device).visible(self.stored)
 
-    def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
+    def renderer(self, probe: Probe) -> Renderer:
         octree, stop, backend = self.octree, self.stop, self.teacher.backend
         faint = Sampling(stop=stop).least_weight
 
@@ -147,7 +148,7 @@ class PlenOctree(Student):
 
         return octree.occupancy, render
 
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         return self.octree.sizes(2 if self.stored == "fp16" else 4)
 
 

@@ -9,7 +9,7 @@ from bench.types import Rays
 from methods.kernels.composite import composite, visibility
 from methods.kernels.march import march
 from methods.kernels.march.contraction import HALF
-from methods.kernels.types import Occupancy, Pixels, Samples, cat, offsets_of
+from methods.kernels.types import Composited, Occupancy, Samples, cat, offsets_of
 from methods.rendering.compaction import compacts
 from methods.rendering.field import CACHED_SAMPLES, CHUNK_SAMPLES, Encoder, Field, pad, query
 from methods.rendering.sampling import Sampling
@@ -34,7 +34,7 @@ def render_batch(
     jitter: Tensor | None = None,
     background: Tensor | None = None,
     teacher: Field | None = None,
-) -> tuple[Pixels, int]:
+) -> Composited:
     """Render R `rays` differentiably; also return the number of samples that were composited.
 
     Samples behind the early stop, more than half of all once surfaces have formed, have neither

@@ -4,10 +4,10 @@ On a GPU the host would wait for the length of such a list until all earlier wor
 everything is computed, in a way that leaves the result unchanged.
 """
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
+
+from bench.types import SomeTensors
 
 
 def compacts(device: torch.device) -> bool:
@@ -15,12 +15,12 @@ def compacts(device: torch.device) -> bool:
     return device.type == "cpu"
 
 
-def to_host(numbers: Sequence[Tensor]) -> list[int]:
+def to_host(numbers: SomeTensors) -> list[int]:
     """Copy all integers in `numbers`, of any shapes, to the host, which waits for a GPU once."""
     return torch.cat([number.flatten() for number in numbers]).tolist()
 
 
-def indices_where(masks: Sequence[Tensor]) -> list[Tensor]:
+def indices_where(masks: SomeTensors) -> list[Tensor]:
     """Indices where each of `masks` is true, in order; the host waits for a GPU, once for all."""
     if not masks:
         return []

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench.types import Probe
+from bench.types import Probe, TwoTensors
 
 BATCH_QUANTUM = 1 << 11  # samples are handed to a field in multiples of this
 
@@ -36,7 +36,7 @@ class Field(Protocol):
     def device(self) -> torch.device:
         """The device of its parameters."""
 
-    def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+    def density(self, positions: Tensor) -> TwoTensors:
         """Density [S] at `positions` [S, 3], and the geometry [S, G] that `features` needs."""
 
     def encode_directions(self, directions: Tensor) -> Tensor:
@@ -56,14 +56,14 @@ class Encoder(Field, Protocol):
     def encode(self, positions: Tensor) -> Tensor:
         """Encoding [S, E] of `positions` [S, 3]."""
 
-    def density(self, positions: Tensor, encoded: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def density(self, positions: Tensor, encoded: Tensor | None = None) -> TwoTensors:
         """As of any field; `encoded` is what `encode` returned for `positions`, which may lack a
         gradient; None: it is computed here."""
 
 
 def query(
     field: Field, positions: Tensor, ray: Tensor, directions: Tensor, encoded: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+) -> TwoTensors:
     """Density [S] and features [S, K] at `positions` [S, 3] on rays `ray` [S], whose encoded
     directions are `directions` [R, D]; evaluated as a padded batch. `encoded` is the encoding
     [S, E] of the positions by `field`, an `Encoder`, if it is known."""

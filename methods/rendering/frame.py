@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from bench.cameras import cast, project
-from bench.types import EMPTY_ALPHA, Camera, Frame, Probe, Rays
+from bench.types import EMPTY_ALPHA, Camera, Frame, Probe, Rays, TwoTensors
 from methods.kernels.composite import composite, visibility
 from methods.kernels.march import march
 from methods.kernels.types import BRICK, Occupancy, Pixels, Samples, joined
@@ -28,6 +28,9 @@ samples for each visible one in 6 rounds; from 2 on 1.47, from 4 1.52."""
 
 Render = Callable[[Tensor, Rays], Pixels]
 """Renders some pixels of a frame, given their row-major indices [P] and their rays."""
+
+Renderer = tuple[Occupancy, Render]
+"""The cells that may show anything, and what renders the pixels that may see them."""
 
 
 @dataclass(frozen=True)
@@ -197,7 +200,7 @@ def _render_chunk(
 
 def _evaluated(
     field: Field, samples: Samples, encoded: Tensor, front: Pixels, how: Sampling, probe: Probe
-) -> tuple[Tensor, Tensor]:
+) -> TwoTensors:
     """Density [S] and features [S, K] of `samples` behind the pixels in `front`; features of faint
     samples are 0. `encoded` [R, D] are the directions of the rays."""
 

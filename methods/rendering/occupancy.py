@@ -10,13 +10,12 @@ see can be occupied, and none close to a camera (`learnable_cells`).
 """
 
 import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from bench.cameras import place_camera, project, within
-from bench.types import Camera
+from bench.types import Cameras
 from methods.kernels.march import MAX_SAMPLES
 from methods.kernels.march.contraction import contract, expand, stretch
 from methods.kernels.types import BRICK, Occupancy
@@ -44,7 +43,7 @@ DISTANT = 0.375  # from the middle of the cube: two half sides of the box
 MIN_VIEWS = 2  # training cameras that must see a place before it may count as occupied
 
 
-def learnable_cells(bounds: Tensor, cameras: Sequence[Camera], contracted: bool = False) -> Tensor:
+def learnable_cells(bounds: Tensor, cameras: Cameras, contracted: bool = False) -> Tensor:
     """Cells [G, G, G] that the pictures of `cameras` can show to be empty or not.
 
     They overlap `bounds` [2, 3] and lie in a brick of 4^3 cells that at least `MIN_VIEWS` cameras

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from bench.cameras import pixel_grid, project, unproject
-from bench.types import Camera
+from bench.types import Camera, TwoTensors
 from methods.rendering.frame import FeatureFrame
 from methods.steernerf.splat import splat
 
@@ -70,7 +70,7 @@ class PointCloud:
         """The features that the camera `full`, at full resolution, shows of this frame (Eq. 10)."""
         return Points(self.values, self._reprojected(full)[0])
 
-    def _reprojected(self, camera: Camera) -> tuple[Tensor, Tensor]:
+    def _reprojected(self, camera: Camera) -> TwoTensors:
         """The pixel of `camera` that shows each point, and the z-depth of each point there."""
         pixels, depth = project(camera, self.points)  # Eq. 7 at low resolution, Eq. 9 at full
         # + 0.5: corners are rounded to the nearest one

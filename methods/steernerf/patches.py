@@ -26,6 +26,7 @@ from methods.steernerf.options import JointOptions
 from methods.steernerf.pipeline import Pipeline, TwoScales
 from methods.steernerf.unet import Observation
 from methods.training import checkpoint
+from methods.training.checkpoint import Tensors
 
 Rendered = Iterator[tuple[Tensor, Pixels]]
 """Indices of pixels of a frame, and those pixels, frame by frame."""
@@ -189,7 +190,7 @@ class Patches:
             points = [_renewed(old, *next(rendered), background) for old in points]
         return Observation(replace(frame, depth=frame.depth.detach()), points)
 
-    def state(self) -> checkpoint.Tensors:
+    def state(self) -> Tensors:
         """All examples, to be kept in a file."""
         tensors = {}
         for place, example in enumerate(self._pool):
@@ -199,7 +200,7 @@ class Patches:
                 tensors |= {f"{place}.{age}.{name}": x for name, x in parts.items()}
         return tensors
 
-    def restore(self, tensors: checkpoint.Tensors) -> None:
+    def restore(self, tensors: Tensors) -> None:
         """Restore the examples that `state` returned, with the same views and options."""
         self._pool = []
         device = self.pipeline.background.device

@@ -7,6 +7,7 @@ import torch
 from torch.nn import functional
 
 from bench.errors import SteerbenchError
+from bench.kinds import Json, Numbers
 from bench.memory import MemoryMeter
 from bench.provenance import digest, libraries
 from bench.types import Budget, Log, Scene
@@ -21,6 +22,7 @@ from methods.steernerf.patches import Patches
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.unet import UNet
 from methods.training import checkpoint, loop
+from methods.training.checkpoint import Optimisers, Tensors
 from methods.training.muon import Muon
 
 MUON = 5
@@ -36,7 +38,7 @@ class Stage2:
     renderer: partial[UNet]  # makes the 2D renderer for K, L and s
     joint: JointOptions  # how it is trained
 
-    def key(self, budget: Budget) -> dict[str, object]:
+    def key(self, budget: Budget) -> Json:
         """Everything that the training depends on, besides the field of stage 1."""
         return {
             "renderer_steps": budget.renderer_steps,
@@ -56,7 +58,7 @@ class Stage2:
 
 def train_stage2(
     trained: TrainedField, setup: Setup, stage2: Stage2, scene: Scene, budget: Budget, log: Log
-) -> tuple[Pipeline, dict[str, object], float, float]:
+) -> tuple[Pipeline, Json, float, float]:
     """Train `stage2` on the field that `setup` made for `scene`, or load the result of the same
     training. The field is widened to K features and changed in place. Returns the pipeline, the
     key of its weights, and the seconds and the peak memory of stage 2 up to them."""
@@ -106,7 +108,7 @@ class JointTraining(loop.Training):
             seed = self.generator.initial_seed()
             self._visits = torch.Generator(trained.field.device).manual_seed(seed)
 
-    def optimisers(self) -> checkpoint.Optimisers:
+    def optimisers(self) -> Optimisers:
         return {**self._of_renderer, **(self.field_optimiser.parts if self.trained else {})}
 
     @cached_property
@@ -119,7 +121,7 @@ class JointTraining(loop.Training):
         others = [x for x in parameters if x.dim() != 4]
         return {"adam": torch.optim.Adam(others, lr=rate, fused=True), "muon": Muon(weights, rate)}
 
-    def advance(self) -> dict[str, float]:
+    def advance(self) -> Numbers:
         """Take one step; return the error of the pictures. The density grid follows the field."""
         if self.trained and self.options.grid_samples and self.step % EVERY == 0:
             grid = self.trained.grid
@@ -150,31 +152,31 @@ class JointTraining(loop.Training):
         final, waves = self.options.final_rate / first, self.options.half_waves
         return first * loop.cosine(self.step / self.steps, final, waves)
 
-    def watched(self) -> checkpoint.Tensors:
+    def watched(self) -> Tensors:
         field = self.trained.field.named_parameters("field") if self.trained else ()
         return dict([*self.renderer.named_parameters("renderer"), *field])
 
-    def result(self) -> checkpoint.Tensors:
+    def result(self) -> Tensors:
         result = self.renderer.state_dict(prefix="renderer.")
         if self.trained:
             result |= self.trained.field.state_dict(prefix="field.")
             result["grid.density"] = self.trained.grid.density
         return result
 
-    def restore_result(self, tensors: checkpoint.Tensors) -> None:
+    def restore_result(self, tensors: Tensors) -> None:
         self.renderer.load_state_dict(checkpoint.part(tensors, "renderer."))
         if self.trained:
             restore_field(self.trained.field, self.trained.grid, tensors)
             self.patches.pipeline.occupancy = self.trained.grid.occupancy
 
-    def state(self) -> checkpoint.Tensors:
+    def state(self) -> Tensors:
         tensors = super().state()
         tensors |= {f"patches.{name}": x for name, x in self.patches.state().items()}
         if self.trained:
             tensors["visits"] = self._visits.get_state()
         return tensors
 
-    def restore(self, tensors: checkpoint.Tensors) -> None:
+    def restore(self, tensors: Tensors) -> None:
         super().restore(tensors)
         self.patches.restore(checkpoint.part(tensors, "patches."))
         if self.trained:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.functional import max_pool2d, pixel_shuffle
 
-from bench.types import NullProbe, Probe
+from bench.types import NullProbe, Probe, SomeTensors
 from methods.engines.network import Built
 from methods.kernels.types import expect
 from methods.rendering.frame import FeatureFrame
@@ -171,7 +171,7 @@ class _Residual(nn.Module):
         return (x + self.second(self.first(x).relu())).relu()
 
 
-def _stacked(pictures: Sequence[Tensor]) -> Tensor:
+def _stacked(pictures: SomeTensors) -> Tensor:
     """A batch of pictures; one alone is not copied."""
     return pictures[0][None] if len(pictures) == 1 else torch.stack(tuple(pictures))
 

@@ -11,18 +11,20 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.types import Budget, Log, Probe, Rays, Scene
+from bench.kinds import Numbers, Sizes
+from bench.types import Budget, Log, Probe, Rays, Scene, TwoTensors
 from methods.instant_ngp.stage1 import TrainedField
 from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.settings import Share, SomeShare
-from methods.kernels.types import Occupancy, Pixels
+from methods.kernels.types import Composited, Occupancy
 from methods.rendering.batch import render_batch
 from methods.rendering.field import ROUND_SAMPLES, Field
-from methods.rendering.frame import Render, everywhere
+from methods.rendering.frame import Renderer, everywhere
 from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import Sampling
 from methods.students.method import Student
 from methods.training import checkpoint, loop
+from methods.training.checkpoint import Optimisers, Tensors
 
 REACH = 5 * STEP
 """Length over which densities become the opacities that are compared: about the 0.0211 of KiloNeRF,
@@ -55,7 +57,7 @@ class StudentField(nn.Module, Field):
         return next(self.parameters()).device
 
     @abstractmethod
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         """Bytes by component."""
 
 
@@ -81,7 +83,7 @@ class FieldStudent(Student):
         self.occupancy = self.occupied(teacher)
         return StudentTraining(self, teacher, scene, budget)
 
-    def restore(self, tensors: checkpoint.Tensors) -> None:
+    def restore(self, tensors: Tensors) -> None:
         self.occupancy = Occupancy(tensors["cells"].to(self.teacher.device), self.contracted)
         self.field = self.new_field()
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
@@ -91,10 +93,10 @@ class FieldStudent(Student):
         super().fit(scene, budget, log)
         self.how = replace(self.sampling(budget), stop=self.stop)
 
-    def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
+    def renderer(self, probe: Probe) -> Renderer:
         return self.occupancy, everywhere(self.field, self.occupancy, probe, self.how)
 
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         return self.field.sizes() | {"occupancy": self.occupancy.cells.numel() // 8}
 
 
@@ -116,7 +118,7 @@ class StudentTraining(PixelTraining):
         parameters = self.field.parameters()
         self.optimiser = torch.optim.Adam(parameters, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
-    def advance(self) -> dict[str, float]:
+    def advance(self) -> Numbers:
         """Take one step; return its mean squared error, of opacities and colours or of pixels."""
         if self.step >= self.points_until:
             return super().advance()
@@ -146,33 +148,33 @@ class StudentTraining(PixelTraining):
         apart = (colour - shown).square().sum(dim=1)
         return functional.mse_loss(opacity, wanted) + (wanted * apart).mean()
 
-    def _learned(self, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    def _learned(self, positions: Tensor, directions: Tensor) -> TwoTensors:
         """The opacity [S] over `REACH` and colour [S, 3] that are compared with the teacher's."""
         return _seen(self.field, positions, directions)
 
-    def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
+    def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> Composited:
         field, cells, how, teacher = self.field, self.occupancy, self.sampling, self.teacher
         return render_batch(
             field, rays, cells, how, jitter=jitter, background=background, teacher=teacher
         )
 
-    def optimisers(self) -> checkpoint.Optimisers:
+    def optimisers(self) -> Optimisers:
         return {"adam": self.optimiser}
 
     def _update(self) -> None:
         loop.step_at(self.optimiser, self.learning_rate())
 
-    def watched(self) -> checkpoint.Tensors:
+    def watched(self) -> Tensors:
         return dict(self.field.named_parameters())
 
-    def result(self) -> checkpoint.Tensors:
+    def result(self) -> Tensors:
         return self.field.state_dict(prefix="field.") | {"cells": self.occupancy.cells}
 
-    def restore_result(self, tensors: checkpoint.Tensors) -> None:
+    def restore_result(self, tensors: Tensors) -> None:
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
 
 
-def _seen(field: Field, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+def _seen(field: Field, positions: Tensor, directions: Tensor) -> TwoTensors:
     """Opacity [S] over `REACH` and colour [S, 3] of points."""
     sigma, geometry = field.density(positions)
     colour = field.features(geometry, field.encode_directions(directions))[:, :3]

@@ -1,7 +1,6 @@
 """A method whose model starts from a trained field, then learns from the photos."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import ClassVar
@@ -10,17 +9,17 @@ import torch
 
 from bench.cameras import place_camera
 from bench.errors import unexpected
+from bench.kinds import Labels, Names, Sizes, Texts
 from bench.provenance import computed_by
-from bench.study import Study, turned
 from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
-from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
+from methods.instant_ngp.stage1 import MARCHED, Setup, TrainedField, train_field
 from methods.instant_ngp.training import PixelOptions
 from methods.kernels.compilation import compile_kernels
 from methods.kernels.settings import Checked, Steps, Stop
-from methods.kernels.types import Occupancy
-from methods.rendering.frame import Render, render_frame
+from methods.rendering.frame import Renderer, render_frame
 from methods.training import checkpoint, loop
+from methods.training.checkpoint import Tensors
 
 IN_FP32 = {"field_precision": "fp32"}
 """`Student.computed` of a model whose products are of float32, whatever those of its teacher."""
@@ -39,30 +38,25 @@ class Student(Checked, ABC):
 
     memory, train_s = 0, 0.0
     kind: ClassVar[str]  # name of its trained stage, for example "nerf"
-    model: ClassVar[tuple[str, ...]] = ()  # its settings that its training depends on
-    computed: ClassVar[Mapping[str, str]] = {}  # what rows say of it but not of its teacher
+    model: ClassVar[Names] = ()  # its settings that its training depends on
+    computed: ClassVar[Labels] = {}  # what rows say of it but not of its teacher
     contracts: ClassVar[bool] = True  # whether it can be trained in contracted space
-    study = Study(
-        knobs={"stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3"))},
-        exact=("method.stop=1e-4",),
-        parts=dict.fromkeys(("rays", "march", "composite"), "field"),
-        chosen=("stop",),
-    )
+    study = MARCHED
 
     @abstractmethod
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> loop.Training:
         """Make the training of the model, as it is before its first step."""
 
     @abstractmethod
-    def restore(self, tensors: checkpoint.Tensors) -> None:
+    def restore(self, tensors: Tensors) -> None:
         """Load the `result` of a training, to render it."""
 
     @abstractmethod
-    def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
+    def renderer(self, probe: Probe) -> Renderer:
         """The cells that may show anything, and what renders the pixels that may see them."""
 
     @abstractmethod
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         """Bytes of what is rendered, by component."""
 
     @torch.no_grad()
@@ -101,5 +95,5 @@ class Student(Checked, ABC):
     def reset(self) -> None:
         """Do nothing: every frame stands alone."""
 
-    def settings(self) -> dict[str, str]:
+    def settings(self) -> Texts:
         return {**self.teacher.settings(type(self)), **self.computed}

@@ -7,6 +7,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from bench.kinds import Sizes
+from bench.types import TwoTensors
 from methods.instant_ngp.field import FieldPrecision
 from methods.kernels import multiplies_bf16
 from methods.kernels.types import joined
@@ -78,14 +80,14 @@ class NetworkField(StudentField):
     round_samples = 2  # a sample costs half a million products
 
     @abstractmethod
-    def density_together(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+    def density_together(self, positions: Tensor) -> TwoTensors:
         """Density [S], and the output of the trunk as the geometry, of a few samples."""
 
     @abstractmethod
     def colours_together(self, geometry: Tensor, encoded: Tensor) -> Tensor:
         """Colours [S, 3] of a few samples."""
 
-    def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+    def density(self, positions: Tensor) -> TwoTensors:
         parts = [self.density_together(part) for part in positions.split(CHUNK)]
         sigma, geometry = joined(parts)
         return sigma, geometry
@@ -94,7 +96,7 @@ class NetworkField(StudentField):
         pairs = zip(geometry.split(CHUNK), encoded.split(CHUNK), strict=True)
         return torch.cat([self.colours_together(*pair) for pair in pairs])
 
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> Sizes:
         return {"network": sum(x.numel() * x.element_size() for x in self.parameters())}
 
 

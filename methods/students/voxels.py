@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench.types import Rays
+from bench.types import Rays, TwoTensors
 from methods.instant_ngp.pixels import PixelBatches
 from methods.kernels.corner_gather import OFFSETS
 from methods.kernels.types import Occupancy
@@ -15,7 +15,7 @@ from methods.kernels.voxel_walk import Crossings, Voxels, walk
 CHUNK_RAYS = 1 << 15  # rays that are traced together: bounds the memory
 
 
-def corners_of(coordinates: Tensor) -> tuple[Tensor, Tensor]:
+def corners_of(coordinates: Tensor) -> TwoTensors:
     """The corners of V voxels at `coordinates` [V, 3], from 0 to 2^20: [V, 8] int32, which vertices
     each has, and [C, 3] int32, the coordinates of all vertices, ordered by x, then y, then z."""
     offsets = OFFSETS.to(coordinates.device)

@@ -12,6 +12,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from bench.errors import reason
+from bench.kinds import Numbers
 from bench.sharing import whole
 from bench.types import SteerbenchError
 from methods.kernels.adam import AdamState
@@ -33,7 +35,7 @@ def write(path: Path, tensors: Tensors, figures: Mapping[str, float]) -> None:
         raise SteerbenchError(f"{path}: cannot write the checkpoint: {error}") from error
 
 
-def read(path: Path) -> tuple[Tensors, dict[str, float]]:
+def read(path: Path) -> tuple[Tensors, Numbers]:
     """Read the tensors and figures of a file; raise `SteerbenchError` if it is damaged, or was not
     written by `write`."""
     try:
@@ -68,7 +70,7 @@ def restoring(path: Path) -> Iterator[None]:
     except (KeyError, RuntimeError) as error:
         raise SteerbenchError(
             f"{path}: expected the file of this training, its content does not fit "
-            f"({' '.join(str(error).split())}); remove it to train again"
+            f"({reason(error)}); remove it to train again"
         ) from error
 
 

@@ -10,18 +10,20 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor
 
+from bench.kinds import Numbers
 from bench.memory import MemoryMeter
 from bench.provenance import digest
 from bench.sharing import missing
-from bench.types import Log, SteerbenchError
+from bench.types import Log, SteerbenchError, TwoTensors
 from methods.training import checkpoint
+from methods.training.checkpoint import Optimisers, Tensors
 
 LOOK_EVERY = 10
 """On a GPU, errors are read back only every so many steps, because reading takes time."""
 
 CHECKPOINT_S = 20.0  # seconds between checkpoints: the most that a killed training loses
 
-Asked = Callable[[], dict[str, float]]
+Asked = Callable[[], Numbers]
 """Tells the errors of a step, by label; the host waits if they have not arrived yet."""
 
 
@@ -41,24 +43,24 @@ class Training(Protocol):
         """Take one step; return what `look` returns, the mean squared errors to show by label (""
         for the main one)."""
 
-    def optimisers(self) -> checkpoint.Optimisers:
+    def optimisers(self) -> Optimisers:
         """The optimisers, which a checkpoint keeps."""
 
-    def watched(self) -> checkpoint.Tensors:
+    def watched(self) -> Tensors:
         """The tensors that must be finite in a good state, by name."""
 
-    def result(self) -> checkpoint.Tensors:
+    def result(self) -> Tensors:
         """The tensors that the training is for."""
 
-    def restore_result(self, tensors: checkpoint.Tensors) -> None:
+    def restore_result(self, tensors: Tensors) -> None:
         """Restore what `result` returned."""
 
-    def state(self) -> checkpoint.Tensors:
+    def state(self) -> Tensors:
         """What a checkpoint must hold, besides the result, to go on as if never stopped."""
         tensors = checkpoint.of_optimisers(self.optimisers())
         return tensors | {"generator": self.generator.get_state()}
 
-    def restore(self, tensors: checkpoint.Tensors) -> None:
+    def restore(self, tensors: Tensors) -> None:
         """Restore result and state."""
         self.restore_result(tensors)
         checkpoint.restore_optimisers(self.optimisers(), tensors)
@@ -67,7 +69,7 @@ class Training(Protocol):
 
 def trained(
     begin: Callable[[], Training], finished: Path, label: str, device: torch.device, log: Log
-) -> tuple[checkpoint.Tensors, float, float]:
+) -> tuple[Tensors, float, float]:
     """The result of the training on `device` that `begin` makes, seconds and peak memory, of making
     it and of all its steps: read from `finished`, after a `train` if that is missing."""
     if finished.exists():
@@ -107,7 +109,7 @@ def _drive(training: Training, finished: Path, label: str, log: Log) -> None:
         log.info(f"going on from step {training.step} of {unfinished}")
     saved = time.monotonic()
     began = saved - training.seconds
-    means: dict[str, float] = {}
+    means: Numbers = {}
     with log.progress(label, training.steps) as progress:
         progress.advance(training.step)
         while training.step < training.steps:
@@ -151,9 +153,7 @@ def load(training: Training, path: Path, done: bool = False) -> None:
         training.peak_bytes = figures["peak_bytes"]
 
 
-def look(
-    training: Training, errors: Callable[[], checkpoint.Tensors], tensors: checkpoint.Tensors
-) -> dict[str, float]:
+def look(training: Training, errors: Callable[[], Tensors], tensors: Tensors) -> Numbers:
     """Return the `errors` of a step as numbers; raise `SteerbenchError` if one is not finite, with
     the names of the `tensors` that are not. On a GPU this happens every `LOOK_EVERY` steps, with
     the errors that were requested the time before, which have arrived meanwhile; in all other steps
@@ -171,7 +171,7 @@ def look(
     return told
 
 
-def _ask(errors: checkpoint.Tensors) -> Asked:
+def _ask(errors: Tensors) -> Asked:
     """Send the errors to the host, which does not wait for them."""
     together = torch.stack([error.detach() for error in errors.values()])
     labels = list(errors)
@@ -180,7 +180,7 @@ def _ask(errors: checkpoint.Tensors) -> Asked:
     if together.device.type == "cuda":
         arrived = torch.cuda.current_stream(together.device).record_event()
 
-    def tell() -> dict[str, float]:
+    def tell() -> Numbers:
         if arrived is not None:
             arrived.synchronize()
         return dict(zip(labels, values.tolist(), strict=True))
@@ -188,7 +188,7 @@ def _ask(errors: checkpoint.Tensors) -> Asked:
     return tell
 
 
-def check_finite(training: Training, more: checkpoint.Tensors | None = None) -> None:
+def check_finite(training: Training, more: Tensors | None = None) -> None:
     """Raise `SteerbenchError` naming the step and the tensors that are not finite, if any are."""
     tensors = {**training.watched(), **(more or {})}
     bad = [name for name, tensor in tensors.items() if not tensor.isfinite().all()]
@@ -199,7 +199,7 @@ def check_finite(training: Training, more: checkpoint.Tensors | None = None) -> 
         )
 
 
-def as_known(picture: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+def as_known(picture: Tensor, truth: Tensor) -> TwoTensors:
     """Both, alike and without a gradient where the truth is NaN: there, pixels do not count."""
     unknown, shown = truth.isnan(), picture.detach()
     return shown.where(unknown, picture), shown.where(unknown, truth)

@@ -24,10 +24,11 @@ from markdown_it import MarkdownIt
 from PIL import Image
 
 from bench.errors import explained
+from bench.kinds import Texts, Values
 from bench.sharing import whole
 from reports.comparison import COST, shown_as, written
 from reports.images import ZOOM, ComparedFrame, Part, Picture, still_images
-from reports.runs import Repeated, Run
+from reports.runs import Repeated, Run, Runs
 from reports.tables import QUALITY, Table
 
 PICTURE = re.compile(r".+-[0-9a-f]{12}\.png")
@@ -46,7 +47,7 @@ PARSER = MarkdownIt("commonmark", {"html": False}).disable("image")
 TEMPLATES.filters["inline"] = PARSER.renderInline
 
 
-def publish(parts: Sequence[Part], folder: Path, runs: Sequence[Run] = ()) -> Path:
+def publish(parts: Sequence[Part], folder: Path, runs: Runs = ()) -> Path:
     """Write `parts` as `report.md` and `report.html`, each atomically; return the former.
 
     The first part begins with the title of the page as a heading. `runs` are those behind the
@@ -98,13 +99,13 @@ def _drawn(picture: Picture, form: str) -> bytes:
         return drawn.read_bytes()
 
 
-def html_page(parts: Sequence[Part], runs: Sequence[Run]) -> str:
+def html_page(parts: Sequence[Part], runs: Runs) -> str:
     """The page of `parts` as HTML; the first begins with the title as a heading.
 
     `runs` are those whose keys occur in tables and marks.
     """
     origins = {run.key: _origin(run) for run in runs}
-    headings: dict[str, str] = {}
+    headings: Texts = {}
     return TEMPLATES.get_template("page.html").render(
         title=str(parts[0]).partition("\n")[0].lstrip("# "),
         parts=[_html(part, origins, headings) for part in parts],
@@ -114,7 +115,7 @@ def html_page(parts: Sequence[Part], runs: Sequence[Run]) -> str:
     )
 
 
-def _origin(run: Run) -> dict[str, str]:
+def _origin(run: Run) -> Texts:
     line = Repeated(run.label, [run])
     figures = [
         f"{shown_as(metric).name} {written(line, metric)}"
@@ -125,13 +126,13 @@ def _origin(run: Run) -> dict[str, str]:
     return {
         "method": str(run.facts["method"]),
         "figures": "; ".join(figures),
-        "command": run.record["command"],
+        "command": run.command,
         **run.provenance,
         **({"settings": chosen} if chosen else {}),
     }
 
 
-def _html(part: Part, origins: dict[str, dict[str, str]], headings: dict[str, str]) -> str:
+def _html(part: Part, origins: dict[str, Texts], headings: Texts) -> str:
     """A part of the page as HTML; adds its second-level headings to `headings`, by id."""
     match part:
         case Table():
@@ -193,7 +194,7 @@ def _uri(picture: np.ndarray) -> str:
     content = io.BytesIO()
     large = picture.shape[0] * picture.shape[1] > LOSSLESS_PIXELS
     quick = {"lossless": True, "method": 1}  # twice as fast as the default, 5 % larger
-    how: dict[str, Any] = {"quality": LOSSY_QUALITY} if large else quick
+    how: Values = {"quality": LOSSY_QUALITY} if large else quick
     Image.fromarray(picture).save(content, "webp", **how)
     return f"data:image/webp;base64,{base64.b64encode(content.getvalue()).decode()}"
 

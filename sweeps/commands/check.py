@@ -11,10 +11,10 @@ from pathlib import Path
 
 from bench.errors import SteerbenchError, explained
 from bench.results import existing_store
-from reports.regression import Assertion, Figures, change_table, changes
+from reports.regression import Figures, change_table, changes
 from reports.runs import load_runs
 from reports.tables import decimal
-from sweeps.baseline import checked, record
+from sweeps.baseline import Checks, checked, record
 from sweeps.terminal import finite, say, show
 
 
@@ -51,7 +51,7 @@ def _compare(options: argparse.Namespace) -> int:
     return int(any(row.verdict for row in rows))
 
 
-def _verdict(found: list[list[Assertion]]) -> str:
+def _verdict(found: Checks) -> str:
     """One line: what is worse, by how much, against which limit, what is missing; how many figures
     were compared, and what else to know."""
     rows = list(chain(*found))
@@ -67,14 +67,14 @@ def _verdict(found: list[list[Assertion]]) -> str:
     return "; ".join((*(parts or ["as good as the baseline"]), told, *notes))
 
 
-def _markdown(found: list[list[Assertion]]) -> str:
+def _markdown(found: Checks) -> str:
     parts = ["## steerbench check", _verdict(found)]
     for run in found:
         parts += [f"### {run[0].run}", change_table("", run).markdown(), run[0].note]
     return "\n\n".join(filter(None, parts)) + "\n"
 
 
-def _junit(found: list[list[Assertion]]) -> str:
+def _junit(found: Checks) -> str:
     suite = ET.Element("testsuite", name="steerbench check")
     for each in chain(*found):
         case = ET.SubElement(suite, "testcase", classname=each.run, name=each.metric)
@@ -85,7 +85,7 @@ def _junit(found: list[list[Assertion]]) -> str:
     return ET.tostring(suite, encoding="unicode", xml_declaration=True) + "\n"
 
 
-def _json(found: list[list[Assertion]]) -> str:
+def _json(found: Checks) -> str:
     return json.dumps(finite([asdict(each) for each in chain(*found)]), indent=1) + "\n"
 
 

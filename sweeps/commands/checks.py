@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -18,6 +17,7 @@ from bench.case import failed, run_cases, timed_rows
 from bench.console import ConsoleLog
 from bench.convergence import experiment_rows
 from bench.errors import SteerbenchError
+from bench.kinds import Row, Rows
 from methods import checks
 from methods.kernels import compiled
 from methods.trial import tried_again
@@ -39,7 +39,7 @@ NEAREST = 5  # cases of `stress` that are also shown by themselves
 
 EXPERIMENTS = ("computed", "knob", "setting", "largest error ↓", "ms ↓", "observed order")
 
-Row = dict[str, Any]
+Cells = tuple[str, ...]  # of a line of a table
 
 
 def main(options: argparse.Namespace) -> int:
@@ -63,10 +63,10 @@ def _kernels(options: argparse.Namespace, log: ConsoleLog) -> int:
     return int(any(row["status"] != "ok" for row in rows))
 
 
-def _saving_most_first(rows: Sequence[Row]) -> list[Row]:
+def _saving_most_first(rows: Sequence[Row]) -> Rows:
     """What is wrong, then the fast versions, each with the time of its reference."""
 
-    def computed(row: Row) -> tuple[str, ...]:
+    def computed(row: Row) -> Cells:
         return row["kernel"], row["case"], row["dtype"]
 
     reference_ms = {computed(row): row.get("ms") for row in rows if row["backend"] == "reference"}
@@ -75,7 +75,7 @@ def _saving_most_first(rows: Sequence[Row]) -> list[Row]:
     return sorted(compared, key=lambda row: row.get("ms", -math.inf) - (row["reference_ms"] or 0.0))
 
 
-def _of_kernel(row: Row) -> tuple[str, ...]:
+def _of_kernel(row: Row) -> Cells:
     labels = (row["kernel"], row["case"], row["backend"], row["dtype"], *_errors(row))
     if row["status"] != "ok":
         return (*labels, "", row["status"], "", "")
@@ -107,7 +107,7 @@ def _stress(options: argparse.Namespace, log: ConsoleLog) -> int:
     return int(wrong > 0)
 
 
-def _of_case(row: Row) -> tuple[str, ...]:
+def _of_case(row: Row) -> Cells:
     labels = ("subject", "case", "holds", "backend", "device", "precision")
     seen, at_most = _errors(row)
     worst = "" if row["status"].startswith("unavailable") else seen
@@ -132,7 +132,7 @@ def _experiments(options: argparse.Namespace, log: ConsoleLog) -> int:
     return 0
 
 
-def _of_experiment(first: Row, *others: Row) -> tuple[str, ...]:
+def _of_experiment(first: Row, *others: Row) -> Cells:
     """Its first and last setting, and the observed order."""
     order = ""
     if first["order"] is not None:

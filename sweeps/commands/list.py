@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.errors import SteerbenchError
+from bench.kinds import Words
 from reports.tables import Table
 from sweeps.overrides import choices, described, engine_kinds, plug_ins
 from sweeps.terminal import console, show
@@ -47,7 +48,7 @@ def _show(title: str, columns: tuple[str, str], lines: Sequence[tuple[str, str]]
         show(Table(title, columns, lines))
 
 
-def _brings(folder: Path | str, words: Sequence[str]) -> str:
+def _brings(folder: Path | str, words: Words) -> str:
     """The choices of a plug-in's folder, or why it has none."""
     if isinstance(folder, str):
         return f"cannot be used: {folder}"

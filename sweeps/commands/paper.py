@@ -8,11 +8,12 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from bench.errors import SteerbenchError, some
+from bench.kinds import Words
 from bench.results import Store, existing_store
 from reports import export
 from reports.paper_page import write_paper_page
 from reports.paper_tables import Place
-from reports.runs import Repeated, Run, grouped, over_common_frames, over_scenes
+from reports.runs import Repeated, Run, Runs, grouped, over_common_frames, over_scenes
 from sweeps.data_sets import DataSet, data_sets, find
 from sweeps.execute import divided, run_all
 from sweeps.measurement import of_scene
@@ -55,7 +56,7 @@ def main(options: argparse.Namespace) -> int:
     return int(any(each.failed for each in ended))
 
 
-def data_set(words: Sequence[str]) -> tuple[list[str], DataSet | None]:
+def data_set(words: Words) -> tuple[list[str], DataSet | None]:
     """The settings among `words`, and the data set if one of them names it (data=DIR).
 
     SteerbenchError if another word names a scene, or the data set has no scenes.
@@ -77,7 +78,7 @@ class Outcome(NamedTuple):
     gap: str | None
 
 
-def gather(jobs: Sequence[Planned], runs: Mapping[str, Sequence[Run]]) -> dict[Place, Repeated]:
+def gather(jobs: Sequence[Planned], runs: Mapping[str, Runs]) -> dict[Place, Repeated]:
     """The line of every job, with its runs and the reasons why others are missing.
 
     With several scenes, a run of a line is the mean of one seed over the scenes that all lines of
@@ -88,7 +89,7 @@ def gather(jobs: Sequence[Planned], runs: Mapping[str, Sequence[Run]]) -> dict[P
     return {place: line for block in blocks for place, line in _lines(block).items()}
 
 
-def _outcome(job: Planned, runs: Sequence[Run]) -> Outcome:
+def _outcome(job: Planned, runs: Runs) -> Outcome:
     failure = job.failure
     run = next((run for run in runs if of_scene(run, job.config)), None)
     if failure and not (run and failure.unavailable):  # no earlier run stands for it

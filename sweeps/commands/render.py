@@ -17,6 +17,7 @@ from PIL import Image
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, explained, optional
 from bench.isolation import lent
+from bench.kinds import Words
 from bench.metrics import as_bytes, quantise
 from bench.paths import write_path
 from bench.results import existing_store
@@ -73,7 +74,7 @@ def main(options: argparse.Namespace) -> int:
     return 0
 
 
-def seen(path: Path | None, words: Sequence[str], configs: Sequence[DictConfig]) -> Scene | None:
+def seen(path: Path | None, words: Words, configs: Sequence[DictConfig]) -> Scene | None:
     """A scene without pictures, in the coordinates of files: for a `path` of its own and methods
     that are trained already, unless `words` name a scene, which may take minutes to make."""
     named = any(re.match(r"[+~]*scene(\.name)?=", word) for word in words)
@@ -125,7 +126,7 @@ def recorded(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
         raise SteerbenchError(f"{path}: cannot write the video: {error}") from error
 
 
-def words_of_run(key: str | None, words: Sequence[str]) -> list[str]:
+def words_of_run(key: str | None, words: Words) -> list[str]:
     """The words of the command that measured the run `key` of the store, and `words` after them."""
     if key is None:
         return list(words)

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
+from bench.errors import reason
+from bench.kinds import Labels, Texts, Words
 from sweeps.hydra_runs import run_hydra
 
 if TYPE_CHECKING:
-    from reports.runs import Run
+    from reports.runs import Runs
     from sweeps.execute import Ended
     from sweeps.measurement import Job
 
 
-def main(argv: Sequence[str]) -> int:
+def main(argv: Words) -> int:
     """Run what the overrides and flags in `argv` say.
 
     The table at the end lists all jobs of a sweep. Raises the error of a job, or SteerbenchError
@@ -33,7 +35,7 @@ def main(argv: Sequence[str]) -> int:
 # These load torch, which --help and completion do not need.
 
 
-def _alone(config: DictConfig, command: Sequence[str], form: str | None) -> None:
+def _alone(config: DictConfig, command: Words, form: str | None) -> None:
     """Obtain the run that `config` describes, print its tables, write the page it asks for."""
     from reports.runs import load_runs
     from sweeps.measurement import Job, obtain
@@ -55,10 +57,9 @@ def _alone(config: DictConfig, command: Sequence[str], form: str | None) -> None
 def _finish(ended: Sequence[tuple[Job, Ended]], form: str | None) -> None:
     """Print one table of all jobs that have ended, and write the pages that they requested."""
     from reports.runs import grouped, load_runs
-    from sweeps.measurement import reason
     from sweeps.terminal import say_missing, write_page
 
-    def of(jobs: Sequence[tuple[Job, Ended]]) -> tuple[list[str], dict[str, str]]:
+    def of(jobs: Sequence[tuple[Job, Ended]]) -> tuple[list[str], Texts]:
         """Keys of the runs, equal ones once, and reasons of failed jobs by name."""
         failed = {job.name: reason(end.error) for job, end in jobs if end.error}
         return list(dict.fromkeys(end.run for _, end in jobs if end.run)), failed
@@ -72,7 +73,7 @@ def _finish(ended: Sequence[tuple[Job, Ended]], form: str | None) -> None:
         write_page(report, store, *of(some))
 
 
-def _show(runs: Sequence[Run], failed: Mapping[str, str], form: str | None) -> None:
+def _show(runs: Runs, failed: Labels, form: str | None) -> None:
     from reports.comparison import columns_of, comparison
     from reports.lines import as_lines, seedless
     from sweeps.terminal import note, show
@@ -89,7 +90,7 @@ def _show(runs: Sequence[Run], failed: Mapping[str, str], form: str | None) -> N
         show(table)
 
 
-def _without_form(argv: Sequence[str]) -> tuple[list[str], str | None]:
+def _without_form(argv: Words) -> tuple[list[str], str | None]:
     """The words that are Hydra's, and the form of tables that --format asks for."""
     from sweeps.cli import TYPES, Parser
 

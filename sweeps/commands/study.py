@@ -10,10 +10,10 @@ from collections.abc import Iterator, Sequence
 
 from bench.errors import unexpected
 from bench.provenance import commit, machine
-from reports.images import Part
+from reports.images import Part, Parts
 from reports.publish import publish
 from reports.runs import load_runs
-from reports.studies import VIEWS, Measured, by_method
+from reports.studies import VIEWS, Measured, MeasuredLines, by_method
 from reports.tables import Table
 from sweeps.execute import divided, run_all
 from sweeps.studies import StudyJob, jobs_of, subjects
@@ -49,7 +49,7 @@ def main(options: argparse.Namespace) -> int:
     return int(any(each.failed for each in ended))
 
 
-def _page(options: argparse.Namespace, parts: Sequence[Part]) -> Iterator[Part]:
+def _page(options: argparse.Namespace, parts: Sequence[Part]) -> Parts:
     typed = shlex.join(["steerbench", *options.typed])
     yield f"# {options.command.capitalize()}"
     yield f"```sh\n{typed}\n```\n\nCommit {commit()}, {machine()['cpu']}."
@@ -67,9 +67,7 @@ def decibels(text: str) -> float:
     return float(number[1])
 
 
-def _recommended(
-    lines: Sequence[Measured], jobs: Sequence[StudyJob], limit: float
-) -> Iterator[str]:
+def _recommended(lines: MeasuredLines, jobs: Sequence[StudyJob], limit: float) -> Iterator[str]:
     """For each method, the fastest setting that loses at most `limit` dB, as a command."""
     commands = {job.line: job.command for job in jobs}
     for method, of_method in by_method(lines).items():

@@ -6,7 +6,7 @@ The page is built on viser; it also has the knobs of the methods, and their figu
 from __future__ import annotations
 
 import argparse
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from functools import partial
@@ -23,11 +23,13 @@ from torch.nn import functional
 from bench.cameras import pack_camera
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, optional
+from bench.kinds import Names, Words
 from bench.metrics import as_bytes, psnr
 from bench.paths import write_path
 from bench.study import study_of
 from bench.types import Camera, composite
 from bench.viewing import Ask, Drawn, Painter, Turns, difference, divided, seen_from
+from reports.lines import Settings
 from sweeps.commands.render import words_of_run
 from sweeps.configured import build, scene_of, trained
 from sweeps.overrides import beside, composed
@@ -87,7 +89,7 @@ class Viewer:
     viser is not installed, or the address cannot be served.
     """
 
-    def __init__(self, wanted: Sequence[Sequence[str]], host: str, port: int) -> None:
+    def __init__(self, wanted: Sequence[Words], host: str, port: int) -> None:
         viser = optional("viser", "viewer", "view")  # before any training
         configs = [composed(words) for words in wanted]
         outputs = Path(configs[0].outputs)
@@ -96,8 +98,8 @@ class Viewer:
         self.first: Camera = build(configs[0], "trajectory", self.scene).steps[0].camera
         self.painter = Painter([trained(config, self.log) for config in configs])
         self.turns, self.browsers = Turns(), dict[Hashable, Browser]()
-        self._asked: list[tuple[int, str, Sequence[str]]] = []
-        self._turned: list[Mapping[str, Sequence[str]]] = [{} for _ in wanted]
+        self._asked: list[tuple[int, str, Words]] = []
+        self._turned: list[Settings] = [{} for _ in wanted]
         self.server = _serve(viser, host, port)
         cameras = self.scene.splits["train"].cameras
         up = -torch.stack([camera.c2w[:, 1] for camera in cameras]).sum(dim=0)
@@ -171,14 +173,12 @@ class Viewer:
                     choice = gui.add_dropdown(knob, tuple(settings))
                     choice.on_update(partial(self._note, place, knob, settings))
 
-    def _note(
-        self, place: int, knob: str, settings: Mapping[str, Sequence[str]], event: Any
-    ) -> None:
+    def _note(self, place: int, knob: str, settings: Settings, event: Any) -> None:
         self._asked.append((place, knob, settings[event.target.value]))
         for who in list(self.browsers):
             self._want(who)
 
-    def _turn(self, place: int, knob: str, settings: Sequence[str]) -> None:
+    def _turn(self, place: int, knob: str, settings: Words) -> None:
         now = {**self._turned[place], knob: settings}
         try:
             words = [*self.wanted[place], *chain(*now.values())]
@@ -277,9 +277,7 @@ def _same(one: Camera, other: Camera) -> bool:
     return torch.equal(pack_camera(one), pack_camera(other))
 
 
-def _figures(
-    painter: Painter, drawn: Sequence[Drawn], truth: Tensor | None, sides: Sequence[str]
-) -> str:
+def _figures(painter: Painter, drawn: Sequence[Drawn], truth: Tensor | None, sides: Names) -> str:
     lines = []
     for side, method, picture in zip(sides, painter.methods, drawn, strict=False):
         quality = "" if truth is None else f", {psnr(picture.rgb, truth):.2f} dB"

@@ -17,7 +17,7 @@ from torch import Tensor
 from bench.cameras import project
 from bench.scenes.embedded.solids import Carved, Shape, Triple, ball_interval, box_corners, unit
 from bench.scenes.embedded.textures import Colour, Texture
-from bench.types import EMPTY_ALPHA, Camera, Frame
+from bench.types import EMPTY_ALPHA, Camera, Frame, ThreeTensors
 
 BAND_RAYS = 1 << 18  # enough to hide the cost of calls, few enough to stay in the cache
 
@@ -42,7 +42,12 @@ class Band:
     x: Tensor  # [1, W, S] on the image plane
     y: Tensor  # [rows, 1, S]
 
-    def directions(self, frame: Tensor, columns: slice) -> tuple[Tensor, Tensor, Tensor]:
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of a number for each ray."""
+        return self.y.shape[0], *self.x.shape[1:]
+
+    def directions(self, frame: Tensor, columns: slice) -> ThreeTensors:
         """Directions of the rays in `columns`, as components along the axes of `frame` [3, 3]."""
         matrix = (frame.T @ self.rotation).tolist()
         x = self.x[:, columns]
@@ -57,7 +62,7 @@ class SceneModel(Protocol):
     def boxes(self) -> Tensor:
         """Corners of a box around each part, [P, 8, 3]."""
 
-    def trace(self, band: Band, spans: Sequence[Span]) -> tuple[Tensor, Tensor, Tensor]:
+    def trace(self, band: Band, spans: Sequence[Span]) -> ThreeTensors:
         """What the rays [rows, W, S] see of the parts in `spans`: rgb and depth, premultiplied by
         alpha, which comes between them. A part is never seen outside its span."""
 
@@ -146,9 +151,9 @@ class Solids:
         placed = ((box_corners(p.shape.extent()) @ p.frame.T, p.centre) for p in self.parts)
         return torch.stack([corners + torch.tensor(centre) for corners, centre in placed])
 
-    def trace(self, band: Band, spans: Sequence[Span]) -> tuple[Tensor, Tensor, Tensor]:
+    def trace(self, band: Band, spans: Sequence[Span]) -> ThreeTensors:
         """Find the nearest surface over all parts, then shade only that."""
-        shape = (band.y.shape[0], *band.x.shape[1:])
+        shape = band.shape
         depth = band.x.new_full(shape, math.inf)
         owner = torch.full(shape, -1, dtype=torch.int16)
         # From front to back, so that a part whose box lies behind all that was met can be left out.
@@ -261,9 +266,9 @@ class Media:
         balls = self.balls
         return torch.stack([torch.tensor(b.centre) + box_corners((b.radius,) * 3) for b in balls])
 
-    def trace(self, band: Band, spans: Sequence[Span]) -> tuple[Tensor, Tensor, Tensor]:
+    def trace(self, band: Band, spans: Sequence[Span]) -> ThreeTensors:
         """Integrate all balls in `spans` together, for the rays that hit any of them."""
-        shape = (band.y.shape[0], *band.x.shape[1:])
+        shape = band.shape
         balls = [self.balls[number] for number, _, _ in spans]
         directions = band.directions(torch.eye(3), slice(None))
         enter, leave = band.x.new_zeros(2, len(balls), *shape)
@@ -286,7 +291,7 @@ class Media:
 
 def integrate(
     enter: Tensor, leave: Tensor, speed: Tensor, density: Tensor, colour: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> ThreeTensors:
     """rgb [N, 3], opacity [N] and depth times opacity [N] of rays through B overlapping media.
 
     `enter` and `leave` [B, N] are the interval of each medium along each ray, equal where the ray

@@ -14,10 +14,12 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from bench.types import SomeTensors, ThreeTensors, TwoTensors
+
 Triple = tuple[float, float, float]
 Origin = tuple[Any, Any, Any]  # floats or tensors
-Directions = tuple[Tensor, Tensor, Tensor]
-Interval = tuple[Tensor, Tensor]
+Directions = ThreeTensors
+Interval = TwoTensors
 
 
 class Shape(Protocol):
@@ -116,7 +118,7 @@ class Cylinder(Convex):
         cap = points.sign() * points.new_tensor((0, 0, 1))
         return torch.where((beyond_wall > beyond_cap)[:, None], wall, cap)
 
-    def _beyond(self, points: Tensor) -> tuple[Tensor, Tensor]:
+    def _beyond(self, points: Tensor) -> TwoTensors:
         return points[:, :2].norm(dim=1) - self.radius, points[:, 2].abs() - self.half
 
 
@@ -242,7 +244,7 @@ class Carved(Shape):
         return normal
 
 
-def ball_interval(origin: Sequence, directions: Sequence[Tensor], radius: float) -> Interval:
+def ball_interval(origin: Sequence, directions: SomeTensors, radius: float) -> Interval:
     """Where rays are within `radius` of 0, in as many dimensions as there are components.
 
     Computed from the ray's nearest point to 0: with the textbook's b^2 - 4 a c, rounding loses a

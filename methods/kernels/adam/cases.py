@@ -10,7 +10,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from bench.case import U32, Bound, Case, Given, Operation, Property, Random, on_backends
+from bench.case import U32, Bound, Cases, Given, Operation, Property, Random, on_backends
+from bench.types import SomeTensors, TwoTensors
 from methods.kernels.adam import BETAS, AdamState, hash_adam_, sparse_adam_
 from methods.kernels.dispatch import served
 from methods.kernels.encode import HashGrid, SampleGradients, encode, pack
@@ -54,7 +55,7 @@ PACKED = Bound(
 )
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """Tables in which none, some or all entries have a gradient; tiny and huge gradients."""
     dense = Operation("adam", served(__package__), _dense_steps, BOUNDS)
     bounds = {**BOUNDS, "packed": PACKED}
@@ -90,7 +91,7 @@ def _dense(count: int, share: float, features: int) -> Given:
 
 
 def _dense_steps(
-    table: Tensor, grads: Sequence[Tensor], most: float, backend: str
+    table: Tensor, grads: SomeTensors, most: float, backend: str
 ) -> tuple[Tensor, ...]:
     table, state = table.clone(), AdamState.like(table)
     for grad in grads:
@@ -117,7 +118,7 @@ def _hashed(samples: int, features: int) -> Given:
 
 def _hash_steps(
     table: Tensor,
-    steps: Sequence[tuple[Tensor, Tensor]],
+    steps: Sequence[TwoTensors],
     grid: HashGrid,
     most: float,
     backend: str,

@@ -11,7 +11,7 @@ from torch.nn.functional import pad
 from bench.case import (
     U32,
     Bound,
-    Case,
+    Cases,
     Given,
     Operation,
     Property,
@@ -20,6 +20,7 @@ from bench.case import (
     on_backends,
     placed,
 )
+from bench.kinds import Values
 from methods.kernels.composite import Visibility, composite, visibility
 from methods.kernels.dispatch import served
 from methods.kernels.types import Intervals, Pixels, offsets_of
@@ -28,7 +29,7 @@ INF = math.inf
 
 DEPTH = 2.0  # largest t of the samples; values and gradients of pixels are at most 1
 
-KINDS: dict[str, dict[str, Any]] = {
+KINDS: dict[str, Values] = {
     "no ray": {"rays": 0, "most": 0},
     "rays without samples": {"rays": 5, "most": 0},
     "one sample a ray": {"rays": 7, "most": 1},
@@ -136,7 +137,7 @@ WEIGHTS = Operation(
 )
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """Agreements; one extreme sample among ordinary ones; sums of weights on long rays."""
     pixels = Property(
         "composite",

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from bench.types import ThreeTensors, TwoTensors
 from methods.kernels.types import Intervals, Pixels
 
 
@@ -21,9 +22,7 @@ def composite(
     return Pixels(*(sums if carry is None else map(torch.add, carry.columns, sums)))
 
 
-def visibility(
-    sigma: Tensor, intervals: Intervals, stop: float, front: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def visibility(sigma: Tensor, intervals: Intervals, stop: float, front: Tensor) -> ThreeTensors:
     slots, starts = _padded_rays(intervals), intervals.offsets[:-1]
     weight, lit, tau = _padded_weights(sigma, intervals.delta, slots, stop, front)
     ray = torch.arange(len(starts), device=sigma.device).repeat_interleave(
@@ -35,7 +34,7 @@ def visibility(
     return weights, seen.sum(dim=1), left
 
 
-def _padded_rays(intervals: Intervals) -> tuple[Tensor, Tensor]:
+def _padded_rays(intervals: Intervals) -> TwoTensors:
     """Mask of the [R, N] slots that hold a sample (N: longest ray), and its index, 0 elsewhere."""
     offsets, longest = intervals.offsets, intervals.longest
     counts = offsets.diff()
@@ -46,7 +45,7 @@ def _padded_rays(intervals: Intervals) -> tuple[Tensor, Tensor]:
     return present, torch.where(present, offsets[:-1, None] + slot, 0)
 
 
-def _padded(samples: Tensor, slots: tuple[Tensor, Tensor]) -> Tensor:
+def _padded(samples: Tensor, slots: TwoTensors) -> Tensor:
     """Samples [S, ...] as [R, N, ...], 0 in empty slots."""
     present, index = slots
     mask = present.reshape(*present.shape, *(1,) * (samples.dim() - 1))
@@ -54,8 +53,8 @@ def _padded(samples: Tensor, slots: tuple[Tensor, Tensor]) -> Tensor:
 
 
 def _padded_weights(
-    sigma: Tensor, delta: Tensor, slots: tuple[Tensor, Tensor], stop: float, front: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+    sigma: Tensor, delta: Tensor, slots: TwoTensors, stop: float, front: Tensor
+) -> ThreeTensors:
     """Weights [R, N] of samples, which of them get light, and their optical thickness."""
     # A sample of length 0 has thickness 0 even at infinite density (avoids inf * 0).
     tau = _padded(torch.where(delta > 0, sigma * delta, 0), slots)

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from bench.case import U32, Bound, Case, Given, Operation, Random
+from bench.case import U32, Bound, Cases, Given, Operation, Random
 from methods.kernels.corner_gather import CORNERS, OFFSETS, corner_gather
 from methods.kernels.dispatch import served
 
@@ -41,7 +41,7 @@ GATHER = Operation(
 )
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """Few and many samples, wide and narrow tables, NaN."""
     found = []
     for count, channels in ((0, 32), (1, 32), (257, 1), (257, 27), (257, 32), (VIEW, 32)):

@@ -16,7 +16,7 @@ from itertools import accumulate
 import torch
 from torch import Tensor
 
-from bench.types import check_shape
+from bench.types import TwoTensors, check_shape
 from methods.kernels.dispatch import implementation
 from methods.kernels.types import expect
 
@@ -85,7 +85,7 @@ class SampleGradients(list[tuple[Tensor, Tensor]]):
     `adam.hash_adam_` computes it, on a CPU level by level, and uses that of a level while it is in
     the cache."""
 
-    def joined(self) -> tuple[Tensor, Tensor]:
+    def joined(self) -> TwoTensors:
         """All positions and gradients; there must be some."""
         positions, gradients = zip(*self, strict=True)
         return self[0] if len(self) == 1 else (torch.cat(positions), torch.cat(gradients))

@@ -10,7 +10,7 @@ from bench.case import (
     U16,
     U32,
     Bound,
-    Case,
+    Cases,
     Given,
     Operation,
     Property,
@@ -77,7 +77,7 @@ ENCODE = Operation(
 )
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """Awkward shapes; one view; positions at borders, on grid lines and outside."""
     found = []
     for name, grid, positions, packed in (
@@ -120,7 +120,7 @@ def _view(count: int) -> Tensor:
     return (origin[..., None, :] + t[:, None] * direction[..., None, :]).reshape(-1, 3)
 
 
-def _extremes() -> list[Case]:
+def _extremes() -> Cases:
     packed = {(backend, "bf16"): _units(GRID.n_max) * U32 + U16 for backend in ("reference", "cpu")}
     kinds = {
         "at 0, at 1 and next to them": _product(0.0, 2.0**-149, 1e-30, 0.5, BELOW_1, 1.0),

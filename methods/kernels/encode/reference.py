@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from bench.types import TwoTensors
 from methods.kernels.encode import PRIMES, HashGrid
 
 
@@ -21,7 +22,7 @@ def encode(positions: Tensor, table: Tensor, grid: HashGrid, packed: Tensor | No
     return features if packed is None else features.to(torch.bfloat16)
 
 
-def corners(positions: Tensor, grid: HashGrid, level: int) -> tuple[Tensor, Tensor]:
+def corners(positions: Tensor, grid: HashGrid, level: int) -> TwoTensors:
     """Table entries [N, 8] of the corners around `positions` in [0, 1]^3, and their weights."""
     scaled = positions * grid.scales[level] + 0.5  # [N, 3]
     cell = scaled.detach().floor()

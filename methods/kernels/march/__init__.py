@@ -17,7 +17,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from bench.types import Rays, check_shape
+from bench.types import Rays, ThreeTensors, check_shape
 from methods.kernels.dispatch import implementation
 from methods.kernels.types import Occupancy, Samples, check_rays, expect
 
@@ -86,7 +86,7 @@ def longest_ray(step: float) -> int:
 
 
 @cache
-def _usual(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+def _usual(device: torch.device, dtype: torch.dtype) -> ThreeTensors:
     """Window, phase and first step of a ray for which none is given."""
     window, jitter = (torch.tensor(x, dtype=dtype, device=device) for x in ([0, math.inf], [0.5]))
     return window, jitter, torch.zeros(1, dtype=torch.int32, device=device)

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from bench.case import U32, Bound, Case, Operation, Property, Random, placed
+from bench.case import U32, Bound, Case, Cases, Operation, Property, Random, placed
+from bench.kinds import Values
 from bench.types import Rays
 from methods.kernels.dispatch import served
 from methods.kernels.march import LEAST_STEP, MAX_SAMPLES, march
@@ -136,18 +137,18 @@ EQUAL = Bound("the same operations in the same order: 0", 0.0)
 MARCH = Operation("march", served(__package__), _march, dict.fromkeys(OUTPUTS, EQUAL))
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """Every kind of ray, grid, window, phase and limit."""
     return [*_agreements(), *_ways()]
 
 
-def _agreements() -> list[Case]:
+def _agreements() -> Cases:
     """Rays from inside and outside through a grid of scattered cells; with windows and limits."""
     random = Random(4)
     near = random.share(129)
     everywhere = torch.tensor([-torch.inf, torch.inf]).expand(129, 2)
     start = random.whole(-1, 100, 129).int()
-    kinds: dict[str, tuple[Rays, str, dict[str, Any]]] = {
+    kinds: dict[str, tuple[Rays, str, Values]] = {
         "no ray": (some_rays(0), "dust", {}),
         "one ray": (some_rays(1), "dust", {}),
         "inside and outside": (some_rays(129), "dust", {}),

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from bench.types import ThreeTensors, TwoTensors
 from methods.kernels.march import LEAST_STEP, Segments, longest_ray
 from methods.kernels.march.contraction import Course, contract
 from methods.kernels.types import (
@@ -47,7 +48,7 @@ class _Steps:
             count = torch.where(self.alive, (self.far - self.near) / self.length, 0).ceil()
             self.most = int(functional.pad(count, (0, 1)).max().clamp(max=self.most))
 
-    def at(self, ray: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
+    def at(self, ray: Tensor, k: Tensor) -> TwoTensors:
         """t [...] and positions [..., 3] of the steps `k` of the rays `ray`."""
         rays, phased = self.segments.rays, k + self.segments.jitter[ray]
         if self.course is None:
@@ -56,7 +57,7 @@ class _Steps:
         t = self.course.at(ray, phased)
         return t, contract(rays.origins[ray] + t[..., None] * rays.directions[ray])
 
-    def taken(self, occupancy: Occupancy) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    def taken(self, occupancy: Occupancy) -> Iterator[ThreeTensors]:
         """For each batch of rays: which steps are samples [R, most], counts [R], resume [R]."""
         rays = torch.arange(len(self.near), device=self.near.device)[:, None]
         k, limit = torch.arange(self.most, device=self.near.device), self.segments.limit
@@ -99,16 +100,14 @@ def lengths(directions: Tensor) -> Tensor:
     return directions.double().norm(dim=-1).to(directions.dtype)
 
 
-def slopes(directions: Tensor) -> tuple[Tensor, Tensor]:
+def slopes(directions: Tensor) -> TwoTensors:
     """Change of t per length along each axis [R, 3], 0 for a ray that does not move along it, and
     whether it does not."""
     parallel = directions.abs() < PARALLEL
     return torch.where(parallel, 0, 1 / torch.where(parallel, 1, directions)), parallel
 
 
-def crossed(
-    origins: Tensor, parallel: Tensor, first: Tensor, second: Tensor
-) -> tuple[Tensor, Tensor]:
+def crossed(origins: Tensor, parallel: Tensor, first: Tensor, second: Tensor) -> TwoTensors:
     """Where rays enter and leave [0, 1]^3, given the t [R, 3] at which they cross its two planes of
     each axis; enter > leave if they miss it (slab test)."""
     outside = torch.where((origins >= 0) & (origins <= 1), -torch.inf, torch.inf)

@@ -4,16 +4,14 @@ Such networks follow the encoding in Instant-NGP (Müller et al. 2022, Section 5
 "fully fused" (Müller et al. 2021, Section 4.1).
 """
 
-from collections.abc import Sequence
-
 from torch import Tensor
 
-from bench.types import check_shape
+from bench.types import SomeTensors, check_shape
 from methods.kernels.dispatch import implementation
 from methods.kernels.types import expect
 
 
-def mlp(inputs: Sequence[Tensor], weights: Sequence[Tensor], *, backend: str = "auto") -> Tensor:
+def mlp(inputs: SomeTensors, weights: SomeTensors, *, backend: str = "auto") -> Tensor:
     """The outputs W_n relu(... relu(W_1 x)) [S, O_n] of a network with a ReLU between its layers.
 
     Differentiable in inputs and weights; NaN stays NaN. `inputs` are one or two tensors [S, I]; x

@@ -8,7 +8,7 @@ import math
 
 from torch import Tensor
 
-from bench.case import Bound, Case, Given, Operation, Random, placed
+from bench.case import Bound, Cases, Given, Operation, Random, placed
 from methods.kernels.dispatch import served
 from methods.kernels.mlp import mlp
 
@@ -36,7 +36,7 @@ MLP = Operation(
 )
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """No sample, one, more than go together; a sample of NaN; many, timed; bfloat16."""
     kinds: list[tuple[int, Network, str]] = [
         (0, DENSITY, "fp32"),

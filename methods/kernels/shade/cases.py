@@ -2,7 +2,7 @@
 
 from torch.nn.functional import normalize
 
-from bench.case import U32, Bound, Case, Given, Operation, Random
+from bench.case import U32, Bound, Cases, Given, Operation, Random
 from methods.kernels.dispatch import served
 from methods.kernels.shade import SIZES, shade
 
@@ -25,7 +25,7 @@ SHADE = Operation(
 )
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """Colours of all degrees, of no, one and many directions, forward and backward."""
     found = []
     for count in (0, 1, 131, 1 << 16):

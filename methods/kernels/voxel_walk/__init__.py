@@ -13,6 +13,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from bench.kinds import Names
 from bench.types import Rays, check_shape
 from methods.kernels.dispatch import implementation
 from methods.kernels.types import Intervals, check_rays, clearance, expect
@@ -87,7 +88,7 @@ class Crossings(Intervals):
     far: Tensor  # [S] t where it leaves; for touching voxels it equals `near` of the next one
     ray: Tensor  # [S] int32, the ray that a crossing belongs to
     voxel: Tensor  # [S] int32 row of `Voxels.coordinates`
-    of_a_sample: ClassVar[tuple[str, ...]] = "t", "delta", "near", "far", "ray", "voxel"
+    of_a_sample: ClassVar[Names] = "t", "delta", "near", "far", "ray", "voxel"
 
 
 def walk(rays: Rays, voxels: Voxels, *, backend: str = "auto") -> Crossings:

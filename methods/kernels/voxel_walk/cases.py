@@ -4,11 +4,11 @@ voxel; rays that hit faces, edges and corners, or come from far."""
 import math
 from collections.abc import Iterator
 from functools import partial
-from typing import Any
 
 import torch
 
-from bench.case import Bound, Case, Given, Operation, Property, Random, on_backends, placed
+from bench.case import Bound, Case, Cases, Given, Operation, Property, Random, on_backends, placed
+from bench.kinds import Values
 from bench.types import Rays
 from methods.kernels.dispatch import served
 from methods.kernels.march.cases import SPECIAL, cells, slab_lengths, some_rays, special_rays
@@ -22,13 +22,13 @@ SAME = Bound("t of planes by the same operations, cells by comparing them: 0", 0
 WALK = Operation("voxel_walk", served(__package__), walk, dict.fromkeys(RESULTS, SAME))
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """Every kind of grid and ray."""
     return [*_agreements(), *_lengths()]
 
 
 def _agreements() -> Iterator[Case]:
-    kinds: dict[str, dict[str, Any]] = {
+    kinds: dict[str, Values] = {
         "no ray": {"count": 0},
         "one ray": {"count": 1},
         "inside and outside": {},

@@ -10,7 +10,7 @@ from torch import Tensor
 from bench.case import (
     U32,
     Bound,
-    Case,
+    Cases,
     Given,
     Operation,
     Property,
@@ -78,7 +78,7 @@ RENDER = Operation(
 )
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """Segments of every kind; few and many rays, both types of tables, rays that end early, NaN."""
     exact = Property(
         WEIGH.subject,

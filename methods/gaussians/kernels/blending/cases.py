@@ -9,7 +9,7 @@ from bench.cameras import pixel_grid
 from bench.case import (
     U32,
     Bound,
-    Case,
+    Cases,
     Given,
     Operation,
     Property,
@@ -18,6 +18,7 @@ from bench.case import (
     on_backends,
     placed,
 )
+from bench.kinds import Values
 from methods.gaussians.kernels.blending import LARGEST_ALPHA, blend
 from methods.gaussians.kernels.projection import LEAST_ALPHA, Ellipses
 from methods.kernels.composite import STOP
@@ -71,7 +72,7 @@ SIZES = {
 """Number of Gaussians, width and height of the picture, factor on the size of the Gaussians."""
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """No, some and crowded Gaussians; a plain loop; stop."""
     found = BLEND.cases("crowded, to a stop", draw, *SIZES["crowded"], STOP)
     for name, size in SIZES.items():
@@ -97,7 +98,7 @@ def draw(count: int, width: int, height: int, size: int = 1, stop: float = 0.0) 
     conics = torch.stack((variances[:, 1], -tilt, variances[:, 0]), dim=1) / area[:, None]
     opacities = 0.9 * rand(count)
     reach = 2 * (opacities / LEAST_ALPHA).clamp(min=1).log()
-    drawn: dict[str, Any] = {
+    drawn: Values = {
         "centres": centres,
         "conics": conics,
         "depth": 1 + rand(count),

@@ -11,7 +11,7 @@ from bench.cameras import project
 from bench.case import (
     U32,
     Bound,
-    Case,
+    Cases,
     Given,
     Operation,
     Property,
@@ -21,6 +21,7 @@ from bench.case import (
     placed,
 )
 from bench.cases import CAMERAS
+from bench.kinds import Numbers
 from bench.types import Camera
 from methods.gaussians.kernels.projection import (
     BLUR,
@@ -61,7 +62,7 @@ PROJECT = Operation(
 )
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """No, one and many Gaussians, some behind the camera; circles; slopes by autograd."""
     found = []
     for count in (0, 1, 1000, 1 << 16):
@@ -123,7 +124,7 @@ def _slopes_error(backend: str, device: str, precision: str) -> float:
     return largest_error(got, (exact / width, conics, z, extents / width))
 
 
-HIDDEN: dict[str, dict[str, float]] = {
+HIDDEN: dict[str, Numbers] = {
     "behind the camera": {"depth": -1.0},
     "at the camera": {"depth": 0.0},
     "too faint": {"opacity": LEAST_ALPHA / 2},
@@ -134,7 +135,7 @@ HIDDEN: dict[str, dict[str, float]] = {
 }
 
 
-def _shown(changed: dict[str, float], backend: str, device: str, precision: str) -> float:
+def _shown(changed: Numbers, backend: str, device: str, precision: str) -> float:
     """How many numbers are shown, or have a gradient that is not finite."""
     depth = changed.get("depth", 1.0)
     shape = {

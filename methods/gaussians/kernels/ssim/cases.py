@@ -1,6 +1,6 @@
 """Cases of SSIM: agreement of the backends."""
 
-from bench.case import U32, Bound, Case, Given, Operation, Random
+from bench.case import U32, Bound, Cases, Given, Operation, Random
 from methods.gaussians.kernels.ssim import ssim
 from methods.kernels.dispatch import served
 
@@ -26,7 +26,7 @@ SSIM = Operation(
 )
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """Sizes from one pixel to larger than the window; noise, a noisy patch, equal, half black."""
     found = []
     for height, width in ((40, 33), (1, 1), (3, 20), (400, 400)):

@@ -15,7 +15,7 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
-from bench.types import check_shape
+from bench.types import TwoTensors, check_shape
 from methods.kernels.dispatch import implementation
 
 HIDDEN = 32  # outputs of every layer except density and colour
@@ -32,13 +32,13 @@ SHAPES = {
 }
 """Inputs and outputs of a layer: 6,212 parameters a network."""
 
-Networks = Mapping[str, tuple[Tensor, Tensor]]
+Networks = Mapping[str, TwoTensors]
 """Weights [N, I, O], from I inputs to O outputs, and biases [N, O] of each layer of N networks."""
 
 
 def locate(
     positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor, *, backend: str = "auto"
-) -> tuple[Tensor, Tensor]:
+) -> TwoTensors:
     """The networks [S] int16 of `positions` [S, 3], -1 for none, and where these are in the cubes
     of their networks [S, 3], -1 to 1 along each axis. No gradient. `cubes` [X, Y, Z] int16 are the
     networks of a grid of cubes of a `side` [], -1 for none; the first one has the lower `corner`
@@ -50,7 +50,7 @@ def locate(
     return kernel.locate(positions, cubes, corner, side)
 
 
-def order(networks: Tensor, count: int, *, backend: str = "auto") -> tuple[Tensor, Tensor]:
+def order(networks: Tensor, count: int, *, backend: str = "auto") -> TwoTensors:
     """Sort samples by their `networks` [S], integers below `count`, which is not checked, negative
     for none; within a network they keep their order. Returns the samples [M] int64 that have a
     network, and offsets [N + 1] int64: network n owns offsets[n] to offsets[n + 1] of them."""
@@ -92,7 +92,7 @@ def grouped_linear(
 
 def densities(
     positions: Tensor, numbers: Tensor, networks: Networks, *, backend: str = "auto"
-) -> tuple[Tensor, Tensor]:
+) -> TwoTensors:
     """Densities [S] before their activation, and the input [S, 33] of `colours`, of samples at
     `positions` [S, 3] in the cubes of their networks, by their `numbers` [S] as for `order`.
     `colours` takes the hidden channels, then the number, which is exact in float32. Densities and

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from bench.case import LEAST_TIMED, U32, Bound, Case, Given, Operation, Random
+from bench.case import LEAST_TIMED, U32, Bound, Cases, Given, Operation, Random
 from methods.kernels.dispatch import served
 from methods.kilonerf.kernels.grouped_mlp import (
     HIDDEN,
@@ -124,7 +124,7 @@ COLOURS = Operation(
 )
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """Sorting, encoding, single layers forward and backward, and whole networks."""
     found = []
     for count in (0, 1, 1000, 1 << 18):

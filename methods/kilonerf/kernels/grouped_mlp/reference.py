@@ -3,8 +3,10 @@
 import torch
 from torch import Tensor
 
+from bench.types import TwoTensors
 
-def locate(positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
+
+def locate(positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor) -> TwoTensors:
     scaled = (positions.detach() - corner) / side
     cell = scaled.floor()
     sizes = [cell.new_full((), size) for size in cubes.shape]  # filled: no wait for a GPU
@@ -13,7 +15,7 @@ def locate(positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor) -> tu
     return torch.where(inside, cubes[x, y, z], -1), 2 * (scaled - cell) - 1
 
 
-def order(networks: Tensor, count: int) -> tuple[Tensor, Tensor]:
+def order(networks: Tensor, count: int) -> TwoTensors:
     sorted_, permutation = networks.long().sort(stable=True)
     offsets = torch.searchsorted(sorted_, torch.arange(count + 1, device=networks.device))
     return permutation[int(offsets[0]) :], offsets - offsets[0]

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from bench.case import U32, Bound, Case, Given, Operation, Random
+from bench.case import U32, Bound, Cases, Given, Operation, Random
 from methods.kernels.dispatch import served
 from methods.kernels.march.cases import cells, some_rays
 from methods.kernels.voxel_walk import Voxels
@@ -72,7 +72,7 @@ SHADE = Operation(
 )
 
 
-def cases() -> list[Case]:
+def cases() -> Cases:
     """Rays of every kind of light; no, one and many samples of all degrees."""
     found = []
     scenes: dict[str, tuple[Any, ...]] = {
