@@ -16,12 +16,12 @@ import torch
 from torch import Tensor
 
 from bench.clock import times_ms
-from bench.kinds import Named, Names, Row, Rows
+from bench.kinds import Row, Rows
 from bench.types import Log, SomeTensors, Unavailable
 
 Cell = tuple[str, str]  # a backend or an engine, and a precision
 Computation = Callable[[str], tuple[Tensor, ...]]  # computes the outputs with a backend
-Given = Named  # the inputs of an operation, by name
+Given = Mapping[str, Any]  # the inputs of an operation, by name
 Tolerance = float | Tensor  # the largest allowed error of a result, or of each of its numbers
 
 DTYPES = {
@@ -166,7 +166,7 @@ class Operation:
     """An operation; all its `backends` agree with the reference, forward and backward."""
 
     subject: str
-    backends: Names
+    backends: Sequence[str]
     compute: Callable[..., Any]  # its results, of the inputs by name and a `backend`
     outputs: Mapping[str, Bound]  # of each result, by its name, in their order
     gradients: Mapping[str, Bound] = field(default_factory=dict)  # of an input or a list of them
@@ -204,7 +204,9 @@ class Operation:
             found.append(case)
         return found
 
-    def _prepare(self, make: Callable[[], Given], learned: Names, device: str) -> Computation:
+    def _prepare(
+        self, make: Callable[[], Given], learned: Sequence[str], device: str
+    ) -> Computation:
         """Computes the outputs, then the gradients of the inputs `learned`."""
         given = placed(make(), device)
         wanted = [x.requires_grad_() for name in learned for x in _several(given[name])]
@@ -275,7 +277,7 @@ def placed(value: Any, device: str, precision: str = "") -> Any:
 
 
 def on_backends(
-    units: float, *precisions: str, backends: Names = ("reference", "cpu")
+    units: float, *precisions: str, backends: Sequence[str] = ("reference", "cpu")
 ) -> dict[Cell, float]:
     """Tolerances of `units` u: of `backends` in fp32, of the reference alone in `precisions`."""
     cells = [*product(backends, ("fp32",)), *product(("reference",), precisions)]
@@ -317,7 +319,7 @@ def _errors(got: Tensor, want: Tensor) -> Tensor:
     return torch.where(error.isnan(), torch.inf, error)
 
 
-def run_cases(cases: Sequence[Case], devices: Names, log: Log) -> Iterator[Row]:
+def run_cases(cases: Sequence[Case], devices: Sequence[str], log: Log) -> Iterator[Row]:
     """Check all cells of `cases` on all `devices`, and yield their rows; see `Case.check`."""
     cells = sum(len(case.tolerances) for case in cases)
     with log.progress("stress", cells * len(devices)) as progress:
@@ -328,7 +330,7 @@ def run_cases(cases: Sequence[Case], devices: Names, log: Log) -> Iterator[Row]:
                 progress.advance(note="")
 
 
-def failed(row: Named) -> bool:
+def failed(row: Mapping[str, Any]) -> bool:
     return row["status"].startswith("failed")
 
 
@@ -367,7 +369,7 @@ def timed_rows(
     return rows
 
 
-def _row(case: Case, check: Named, times: Mapping[str, float]) -> Row:
+def _row(case: Case, check: Mapping[str, Any], times: Mapping[str, float]) -> Row:
     backend = check["backend"]
     row = {
         "kernel": case.subject,

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from bench.errors import SteerbenchError, unexpected
-from bench.kinds import Values
 from bench.types import DEVICE
 
 MOST = 2**63  # from here on a number is none that was measured
@@ -131,7 +130,7 @@ class StageClock:
         self._ns: defaultdict[str, int] = defaultdict(int, {OTHER: 0})
         self._done: defaultdict[str, int | Tensor] = defaultdict(int)
         self._dense: defaultdict[str, int] = defaultdict(int)
-        self._told: Values = {}  # what another process has told of this frame
+        self._told: dict[str, Any] = {}  # what another process has told of this frame
 
     def _now(self) -> int:
         if self.device.type == "cuda":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
@@ -12,7 +12,7 @@ from rich import progress
 from rich.console import Console
 
 from bench.errors import explained
-from bench.kinds import Json, Say
+from bench.kinds import Say
 from bench.results import content_key
 
 PLAIN_INTERVAL_S = 10.0  # between two progress lines without a terminal to draw a bar on
@@ -62,7 +62,7 @@ class ConsoleLog:
             if not self._bars.tasks:
                 self._bars.stop()
 
-    def stage_dir(self, kind: str, key: Json) -> Path:
+    def stage_dir(self, kind: str, key: Mapping[str, object]) -> Path:
         """`stages/<kind>-<hash of key>`, created if missing; SteerbenchError if it cannot be."""
         folder = self._root / "stages" / f"{kind}-{content_key(key)[:12]}"
         with explained(folder):

@@ -6,13 +6,13 @@
 import tempfile
 import tomllib
 import zipfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 from bench.download import fetch
 from bench.errors import unexpected
-from bench.kinds import AnyPath, Labels, Names, Texts
 from bench.scenes.files import data_folder
 from bench.sharing import file_sha256, locked
 from bench.threads import in_parallel
@@ -33,7 +33,7 @@ class Published:
     folder: str | None = None  # URL of the folder with all files
 
     @cached_property
-    def hashes(self) -> Labels:
+    def hashes(self) -> Mapping[str, str]:
         """SHA-256 of each file, by its path, which starts with the scene's name."""
         text = (LISTS / f"{self.name}.registry.txt").read_text(encoding="utf-8")
         return dict(line.split() for line in text.splitlines())
@@ -42,7 +42,7 @@ class Published:
     def scenes(self) -> set[str]:
         return {name.split("/")[0] for name in self.hashes}
 
-    def of(self, scene: str) -> Texts:
+    def of(self, scene: str) -> dict[str, str]:
         return {name: d for name, d in self.hashes.items() if name.startswith(f"{scene}/")}
 
 
@@ -70,7 +70,7 @@ def get(data: Published, scene: str, folder: Path, log: Log) -> Path:
     return folder / scene
 
 
-def _unpack(archive: Path, wanted: Labels, folder: Path) -> None:
+def _unpack(archive: Path, wanted: Mapping[str, str], folder: Path) -> None:
     """Extract the `wanted` files, if they are correct, from the zip file into `folder`."""
     with tempfile.TemporaryDirectory(dir=folder) as new:
         try:
@@ -89,7 +89,7 @@ def _unpack(archive: Path, wanted: Labels, folder: Path) -> None:
             (Path(new) / name).replace(folder / name)
 
 
-def _wrong(folder: Path, wanted: Labels) -> list[str]:
+def _wrong(folder: Path, wanted: Mapping[str, str]) -> list[str]:
     """The `wanted` files that are present but differ, or missing although a loader needs them."""
     needed = [n for n in wanted if (folder / n).exists() or not any(m in n for m in GROUND_TRUTH)]
     return [name for name in needed if file_sha256(folder / name) != wanted[name]]
@@ -99,10 +99,10 @@ def _wrong(folder: Path, wanted: Labels) -> list[str]:
 class VerifyReport:
     """A copy of a data set, compared with its registry: files by their path in the release."""
 
-    ok: Names
-    wrong: Names  # of other content, or cannot be read
-    missing: Names
-    extra: Names  # not on the list
+    ok: Sequence[str]
+    wrong: Sequence[str]  # of other content, or cannot be read
+    missing: Sequence[str]
+    extra: Sequence[str]  # not on the list
 
     @property
     def passed(self) -> bool:
@@ -113,7 +113,7 @@ class VerifyReport:
         return ", ".join(f"{len(names)} {kind}" for kind, names in vars(self).items())
 
 
-def verify(path: AnyPath, log: Log) -> VerifyReport:
+def verify(path: str | Path, log: Log) -> VerifyReport:
     """Check the whole release, or one scene of it, by its name; raises if `path` is neither."""
     root = data_folder(path)
     base, expected = _expected(root)
@@ -131,7 +131,7 @@ def verify(path: AnyPath, log: Log) -> VerifyReport:
     )
 
 
-def _expected(root: Path) -> tuple[Path, Labels]:
+def _expected(root: Path) -> tuple[Path, Mapping[str, str]]:
     """The folder that the listed paths are relative to, and the list of hashes."""
     known = published()
     for data in known:

@@ -2,13 +2,11 @@
 
 import importlib
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
-
-from bench.kinds import AnyPath, Names
 
 NAMED = 5  # an error names at most this many things and gives the number of the rest
 
@@ -24,7 +22,7 @@ class Unavailable(SteerbenchError):
     """Something asked for by name cannot be used here; the message says why and how to get it."""
 
 
-def unexpected(where: AnyPath, expected: str, got: object) -> SteerbenchError:
+def unexpected(where: str | Path, expected: str, got: object) -> SteerbenchError:
     """The error that says what was expected at `where` (an option; a file and its field)."""
     return SteerbenchError(f"{where}: expected {expected}, got {got}")
 
@@ -64,7 +62,7 @@ def nearest(name: str, there: Iterable[str]) -> str:
     return names[near[0]] if near else some([*names.values()]) or "nothing"
 
 
-def some(names: Names) -> str:
+def some(names: Sequence[str]) -> str:
     """The first of `names`, and how many more there are."""
     further = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return ", ".join(names[:NAMED]) + further

@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from PIL import ImageFile
 
-from bench.kinds import Json, Say, Texts, Values
+from bench.kinds import Say
 from bench.provenance import is_edited
 from bench.threads import in_parallel
 from bench.types import Budget, Camera, Log, Method, Scene, SteerbenchError
@@ -134,7 +134,7 @@ OF_IMPORTS = ("the environment", "filters of warnings")
 """Parts that libraries change when they are first imported; no line is said of these."""
 
 
-def _state() -> Values:
+def _state() -> dict[str, Any]:
     """The global state that is put back, but for random numbers, by what it is called."""
     device = torch.get_default_device()
     return {
@@ -169,7 +169,7 @@ def _folder() -> str:
         return ""
 
 
-def _set_environment(variables: Texts) -> None:
+def _set_environment(variables: dict[str, str]) -> None:
     os.environ.clear()
     os.environ.update(variables)
 
@@ -227,7 +227,7 @@ SETTERS: Mapping[str, Callable[[Any], object]] = {
 }
 """What sets each part of `_state` again."""
 
-USUAL: Json = {
+USUAL: Mapping[str, object] = {
     "torch's default type": torch.float32,
     "torch's default device": None,
     "torch's recording of gradients": True,

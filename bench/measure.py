@@ -12,6 +12,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,7 +22,7 @@ from torch import Tensor
 from bench.clock import FrameRecord, StageClock, counted
 from bench.errors import unexpected
 from bench.isolation import Guard, Isolated, check_originals, fit, lent, moved, sees_scored
-from bench.kinds import Labels, Names, Numbers, Rows, Values
+from bench.kinds import Rows
 from bench.memory import MemoryMeter, give_back
 from bench.metrics import Lpips, psnr_of_mse
 from bench.neighbours import Neighbours, Watch
@@ -229,7 +230,7 @@ def _shown(task: Task) -> set[int]:
 
 
 def _measurement(
-    take: _Take, task: Task, missing: Labels, neighbours: Neighbours, in_turns: int
+    take: _Take, task: Task, missing: Mapping[str, str], neighbours: Neighbours, in_turns: int
 ) -> Measurement:
     """What was measured of one of `in_turns` methods."""
     scene, trajectory, protocol = task.scene, task.trajectory, task.protocol
@@ -243,7 +244,7 @@ def _measurement(
         of_phase = frames[frames["phase"] == phase]
         if len(of_phase):
             summary += [row | {"phase": phase} for row in phase_rows(of_phase)]
-    whole: Numbers = {}
+    whole: dict[str, float] = {}
     if protocol.rounds > 1:
         whole |= {"frame_ms.fastest": min(means), "frame_ms.slowest": max(means)}
     if take.apart:  # the PSNR from the MSE over all frames, inf if they are equal
@@ -269,7 +270,7 @@ def _measurement(
         **facts,
     )
     known = [row["metric"] for row in summary if row["n"]]
-    record: Values = {
+    record: dict[str, Any] = {
         "protocol": asdict(protocol),
         "budget": asdict(task.budget),
         "scene": {"name": scene.name, "digest": scene.digest, "unit_length": scene.unit_length},
@@ -285,18 +286,18 @@ def _measurement(
     return Measurement(rows, frames, scoring.images, record)
 
 
-def _sizes(method: Method) -> Numbers:
+def _sizes(method: Method) -> dict[str, float]:
     """The bytes of each component of `method`, and of all; none if it tells none."""
-    found: Numbers = {
+    found: dict[str, float] = {
         f"size_bytes.{part}": counted(f"{method.name}: size of {part}", size)
         for part, size in method.sizes().items()
     }
     return found | {"size_bytes.total": sum(found.values())} if found else {}
 
 
-def _costs_of_training(method: Method) -> Numbers:
+def _costs_of_training(method: Method) -> dict[str, float]:
     """Seconds and peak memory of the training, and the seconds of compiling if that was needed."""
-    found: Numbers = {
+    found: dict[str, float] = {
         "train_s": method.train_s,
         "train_peak_bytes": getattr(method, "train_peak_bytes", math.nan),
     }
@@ -442,7 +443,7 @@ def _score(
     protocol = task.protocol
     if index == len(task.trajectory.steps) // 2:
         take.middle = frame.rgb.cpu()
-    figures: Values = {"frame": index, "phase": phase}
+    figures: dict[str, Any] = {"frame": index, "phase": phase}
     scored = step.truth is not None
     truth: Tensor | None = None
     mask: Tensor | None = None
@@ -471,7 +472,7 @@ def _score(
     take.rows.append(figures | scores)
 
 
-def _costs(record: FrameRecord) -> Numbers:
+def _costs(record: FrameRecord) -> dict[str, float]:
     return {
         "frame_ms": record.total_ns / 1e6,
         **({} if record.wall_ns is None else {"wall_ms": record.wall_ns / 1e6}),
@@ -481,7 +482,7 @@ def _costs(record: FrameRecord) -> Numbers:
     }
 
 
-def _frame_table(table: Rows, scores: Names) -> pd.DataFrame:
+def _frame_table(table: Rows, scores: Sequence[str]) -> pd.DataFrame:
     """One row per frame; missing stages and counters are 0, missing scores NaN."""
     frames = pd.DataFrame(table)
     touched = [name for name in map(str, frames) if name.startswith(("stage_ms.", "work."))]

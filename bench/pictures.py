@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from glob import glob
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 from unicodedata import normalize
 
 import pandas as pd
@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from bench.errors import not_there, some, unexpected
-from bench.kinds import Named, Names, Rows, Size
+from bench.kinds import Rows, Size
 from bench.metrics import Lpips, check_size
 from bench.protocol import EvaluationProtocol
 from bench.results import STEADY, Measurement, read_table
@@ -69,7 +69,7 @@ def pairs_with_split(pictures: Path, split: Split, match: Match = "name") -> lis
     return [Pair(*pair) for pair in pairs]
 
 
-def matched(folder: Path, names: Names, match: Match) -> list[Path]:
+def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
     """The file of `folder` for each of `names`, without ending: by its path below the folder, or by
     its name if all are in the folder. Raises if one is missing, surplus or ambiguous."""
     files = listed(folder)
@@ -97,7 +97,7 @@ def matched(folder: Path, names: Names, match: Match) -> list[Path]:
     return [known[name] for name in names]
 
 
-def _keys(names: Names) -> list[str]:
+def _keys(names: Sequence[str]) -> list[str]:
     """`names` without ending, and without the folders that all of them are in."""
     names = [normalize("NFC", name.lstrip("/")) for name in names]  # not as macOS writes accents
     paths = [Path(name).with_suffix("") for name in names]
@@ -105,7 +105,7 @@ def _keys(names: Names) -> list[str]:
     return [str(path.relative_to(shared)) for path in paths]
 
 
-def below(folder: Path, pattern: str, endings: Names = ()) -> list[Path]:
+def below(folder: Path, pattern: str, endings: Sequence[str] = ()) -> list[Path]:
     """What is in a folder by a `pattern`, with one of the `endings` if there are any, 10 after 9:
     unlike what Path finds, without what is hidden, and through links."""
     names = sorted(glob(pattern, root_dir=folder, recursive=True), key=natural)  # noqa: PTH207
@@ -166,7 +166,7 @@ def score(
     pairs: Sequence[Pair],
     protocol: EvaluationProtocol,
     lpips: Mapping[str, Lpips],
-    facts: Named,
+    facts: Mapping[str, Any],
     log: Log,
     *,
     sequence: bool = False,
@@ -233,5 +233,5 @@ def _check(
         raise SteerbenchError(f"{path}: {error}") from error
 
 
-def _repeated(names: Names) -> list[str]:
+def _repeated(names: Sequence[str]) -> list[str]:
     return sorted((name for name, count in Counter(names).items() if count > 1), key=natural)

@@ -1,7 +1,7 @@
 """The protocol: the rules of a fair measurement. Its name is in every row."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +11,6 @@ from torch import Tensor
 
 from bench import metrics, video_metrics
 from bench.errors import unexpected
-from bench.kinds import Names, Numbers, Texts
 from bench.provenance import sha256
 from bench.trajectories import Trajectory
 from bench.types import BACKGROUNDS, Log, Scene, SteerbenchError, Unavailable
@@ -63,7 +62,7 @@ class EvaluationProtocol:
             raise unexpected("protocol.columns", f"some of {', '.join(COLUMNS)}", [*self.columns])
 
     @property
-    def metric_names(self) -> Names:
+    def metric_names(self) -> Sequence[str]:
         """Names of the metrics that `score` returns, in the order of the table."""
         plain = ("psnr", "ssim", *(f"lpips_{net}" for net in self.lpips))
         corrected = [f"cc_{name}" for name in plain if self.colour_correction != "none"]
@@ -103,7 +102,7 @@ class EvaluationProtocol:
 
     def load_lpips(
         self, weights_dir: Path | None, log: Log
-    ) -> tuple[dict[str, metrics.Lpips], Texts]:
+    ) -> tuple[dict[str, metrics.Lpips], dict[str, str]]:
         """LPIPS by backbone; by metric, why it is missing, which is also logged."""
         loaded, missing = {}, {}
         for net in self.lpips:
@@ -124,7 +123,7 @@ class EvaluationProtocol:
         truth: Tensor,
         lpips: Mapping[str, metrics.Lpips],
         mask: Tensor | None = None,
-    ) -> Numbers:
+    ) -> dict[str, float]:
         """Every metric of a prediction against its ground truth, both [H, W, 3] in [0, 1], and
         equal where a `mask` bool [H, W] says that pixels do not count.
 

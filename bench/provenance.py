@@ -16,7 +16,7 @@ import struct
 import subprocess
 import sys
 import sysconfig
-from collections.abc import Collection, Iterable, Iterator, Sized
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import suppress
 from functools import cache
 from importlib import metadata
@@ -26,7 +26,6 @@ from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 from bench.errors import SteerbenchError, unexpected
-from bench.kinds import Json, Named, Names, Texts
 from bench.records import without
 
 Stamp = tuple[int, ...]  # of a file, see `stamp`
@@ -60,7 +59,7 @@ def commit() -> str:
     return _commit_of(Path(__file__)) or metadata.version("steerbench")
 
 
-def repositories(*things: Any) -> Texts:
+def repositories(*things: Any) -> dict[str, str]:
     """The commits of the git checkouts that files of others among the `sources` of `things` lie in,
     with `-dirty` if changed, by their top-level package."""
     first = {name.partition("/")[0]: path for name, path in sorted(sources(*things).items())}
@@ -83,7 +82,7 @@ def _commit_of(file: Path) -> str | None:
         return None
 
 
-def machine() -> Json:
+def machine() -> Mapping[str, object]:
     """The machine and its system, for the record of a run."""
     import torch  # imported here, because reading the store needs no torch
 
@@ -103,7 +102,7 @@ def machine() -> Json:
     }
 
 
-def computed_by(*things: Any) -> Json:
+def computed_by(*things: Any) -> Mapping[str, object]:
     """What decides the results of `things` (classes or functions) beside their inputs, for keys."""
     record = machine()
     return {
@@ -115,11 +114,11 @@ def computed_by(*things: Any) -> Json:
     }
 
 
-def _tuning() -> Texts:
+def _tuning() -> dict[str, str]:
     return {name: of for name, of in sorted(os.environ.items()) if TUNING.match(name)}
 
 
-def conditions_apart(then: Named) -> str:
+def conditions_apart(then: Mapping[str, Any]) -> str:
     """What may change times since a run with `then` as record of its machine, although it changes
     no result; empty if nothing."""
     cores = len(os.sched_getaffinity(0))
@@ -193,7 +192,7 @@ class _Module(NamedTuple):
     """What is known of a file of Python: the modules, and names from modules, that it imports
     anywhere in its code; SHA-256 of its syntax tree; whether it reads docstrings."""
 
-    imports: Names
+    imports: Sequence[str]
     sha256: str
     documented: bool = False
 
@@ -252,7 +251,7 @@ def _is_text(node: object) -> bool:
     return alone and isinstance(node.value.value, str)  # type: ignore[attr-defined]
 
 
-def libraries(*things: Any) -> Texts:
+def libraries(*things: Any) -> dict[str, str]:
     """Versions of all installed distributions that the `sources` of `things` import.
 
     A class that loads libraries by name lists them in its attribute `libraries`.
@@ -498,7 +497,7 @@ def _ours(name: str) -> list[Path]:
     return []
 
 
-def _imports(path: Path) -> Names:
+def _imports(path: Path) -> Sequence[str]:
     return _module(path, stamp(path)).imports if path.suffix == ".py" else ()
 
 

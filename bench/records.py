@@ -1,7 +1,7 @@
 """Files of JSON: what is wrong with one is said in one line, with the file and the place in it."""
 
 import json
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from functools import partial
 from pathlib import Path
@@ -9,7 +9,6 @@ from types import UnionType
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from bench.errors import nearest, not_there, unexpected
-from bench.kinds import Named, Values
 
 T = TypeVar("T")
 
@@ -63,7 +62,7 @@ def read_record(path: Path) -> Any:
     return read_json(path, partial(Record, path=path))
 
 
-def without(values: Named, names: Collection[str]) -> Values:
+def without(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
     """The `values` by name, but for those of `names`."""
     return {name: value for name, value in values.items() if name not in names}
 

@@ -14,7 +14,7 @@ import os
 import shutil
 import time
 import uuid
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from glob import escape
@@ -26,7 +26,7 @@ import pandas as pd
 from PIL import Image
 
 from bench.errors import SteerbenchError, explained, not_there, reason, some, unexpected
-from bench.kinds import Json, Say
+from bench.kinds import Say
 from bench.provenance import commit, machine
 from bench.records import Record, read_record
 from bench.sharing import check_sums, whole, write_sums
@@ -55,7 +55,7 @@ PARTIAL = ".partial-"
 STALE_S = 24 * 3600.0
 
 
-def content_key(parts: Json) -> str:
+def content_key(parts: Mapping[str, object]) -> str:
     """SHA-256 of `parts`, regardless of their order; they must be JSON values without NaN."""
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
@@ -68,7 +68,7 @@ class Measurement:
     rows: pd.DataFrame  # one metric per row, `COLUMNS` without `run` and `commit`
     frames: pd.DataFrame  # one frame per row; NaN where a figure does not exist for that frame
     pictures: dict[str, np.ndarray]  # uint8 [H, W, 3] by file name without `.png`
-    record: Json  # what the figures mean; JSON values only
+    record: Mapping[str, object]  # what the figures mean; JSON values only
 
 
 class Store:
@@ -77,7 +77,7 @@ class Store:
     def __init__(self, root: Path) -> None:
         self.folder = root / "runs"
 
-    def key(self, parts: Json) -> str:
+    def key(self, parts: Mapping[str, object]) -> str:
         """The key of a run, made of `parts`: everything that can change its rows."""
         return content_key(parts)[:16]
 
@@ -103,7 +103,7 @@ class Store:
             raise unexpected(f"run {beginning!r}", "the beginning of one key", got)
         return keys[0]
 
-    def save(self, parts: Json, measurement: Measurement) -> str:
+    def save(self, parts: Mapping[str, object], measurement: Measurement) -> str:
         """Write the run made of `parts`, unless it is there, and return its key; raises as `write`
         does."""
         key = self.key(parts)

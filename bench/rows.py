@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from scipy import fft, special
 
-from bench.kinds import Names, Row, Rows
+from bench.kinds import Row, Rows
 from bench.results import WHOLE
 
 CONFIDENCE = 0.95
@@ -49,7 +49,7 @@ def phase_rows(frames: pd.DataFrame) -> Rows:
     ]
 
 
-def score_rows(frames: pd.DataFrame, scores: Names) -> Rows:
+def score_rows(frames: pd.DataFrame, scores: Sequence[str]) -> Rows:
     """Mean and interval of each of `scores`; of the flicker only where a frame has one."""
     named = [name for name in scores if name != "flicker" or frames[name].notna().any()]
     return [mean_row(name, frames[name]) for name in named]

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from bench import metrics, video_metrics
 from bench.errors import unexpected
-from bench.kinds import Numbers, Texts
 from bench.protocol import EvaluationProtocol
 from bench.types import ByCamera, Camera, Frame, SteerbenchError, composite
 
@@ -128,14 +127,14 @@ class Scoring:
         camera: Camera | None = None,
         depth: Tensor | None = None,
         mask: Tensor | None = None,
-    ) -> Numbers:
+    ) -> dict[str, float]:
         """The figures of frame `index`, rendered as `rgb` [H, W, 3].
 
         `truth` is uint8 [H, W, 3 or 4]; that of a frame which is not `scored` serves the path
         alone. `depth` [H, W] is the method's own, `mask` bool [H, W] says which pixels count.
         Frames before a `cut`, or of another size, are not compared with.
         """
-        figures: Numbers = {}
+        figures: dict[str, float] = {}
         true = None if truth is None else composite(truth.to(rgb.device), self._background)
         shown, mask = rgb, mask if self._protocol.mask == "scene" else None
         if mask is not None and true is not None:
@@ -155,9 +154,9 @@ class Scoring:
         kept = self._protocol.rounded(rgb).cpu(), None if true is None else true.cpu()
         return figures | self._path(Shot(*kept, view), cut, rgb.device)
 
-    def _path(self, shot: Shot, cut: bool, device: torch.device) -> Numbers:
+    def _path(self, shot: Shot, cut: bool, device: torch.device) -> dict[str, float]:
         """The figures of the next frame against those before it, LPIPS computed on `device`."""
-        figures: Numbers = {}
+        figures: dict[str, float] = {}
         if cut or (self._last and self._last[-1].image.shape != shot.image.shape):
             self._last.clear()
         before = self._last[-1] if self._last else None
@@ -175,7 +174,7 @@ class Scoring:
                     figures[f"{name}_true"] = error
         return figures
 
-    def _step(self, now: Tensor, true: Tensor, old: Tensor, true_old: Tensor) -> Numbers:
+    def _step(self, now: Tensor, true: Tensor, old: Tensor, true_old: Tensor) -> dict[str, float]:
         """The figures of a frame and its truth, and those of the frame before.
 
         tPSNR is the PSNR of the change from frame to frame, tLPIPS the absolute difference of its
@@ -188,7 +187,7 @@ class Scoring:
             figures[f"tlpips_{net}"] = abs(lpips(old, now) - lpips(true_old, true))
         return figures
 
-    def missing(self, found: Collection[str]) -> Texts:
+    def missing(self, found: Collection[str]) -> dict[str, str]:
         """Why wanted metrics are not among those `found`, but for networks that are not there."""
         needs = {name: video_metrics.NEEDS[name.split("_")[0]] for name in self._of_path}
         why = {name: f"needs {what}" for name, what in needs.items() if name not in found}

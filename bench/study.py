@@ -4,15 +4,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from bench.kinds import Labels, Names
-
 
 @dataclass(frozen=True)
 class Variant:
     """A variant of a run: its `name`, and the `settings` of `steerbench run` that make it."""
 
     name: str
-    settings: Names = ()
+    settings: Sequence[str] = ()
 
 
 def turned(label: str, setting: str, values: Iterable[object], *more: str) -> list[Variant]:
@@ -44,19 +42,19 @@ class Study:
     # and those that need a training of their own.
     knobs: Mapping[str, Sequence[Variant]] = field(default_factory=dict)
     trained: Mapping[str, Sequence[Variant]] = field(default_factory=dict)
-    exact: Names = ()  # settings that give up no accuracy of the trained model for speed
+    exact: Sequence[str] = ()  # settings that give up no accuracy of the trained model for speed
     # By what is skipped, the setting that switches this skipping off with `false`; further savings,
     # each on top of all skips.
-    skips: Labels = field(default_factory=dict)
+    skips: Mapping[str, str] = field(default_factory=dict)
     savings: Sequence[Variant] = ()
     axes: Mapping[str, Axis] = field(default_factory=dict)  # by name, beside pixels and threads
     # By stage, the part of a frame that it counts towards, with all stages nested in it; "network"
     # is the part that an engine computes. Other stages are parts of their own.
-    parts: Labels = field(default_factory=dict)
-    chosen: Names = ()  # the method's own settings that no training depends on
+    parts: Mapping[str, str] = field(default_factory=dict)
+    chosen: Sequence[str] = ()  # the method's own settings that no training depends on
 
 
-def part_of(stage: str, parts: Labels) -> str:
+def part_of(stage: str, parts: Mapping[str, str]) -> str:
     """The part of a frame that `stage` (for example "field/march") counts towards."""
     outer = stage
     while outer and outer not in parts:

@@ -35,7 +35,7 @@ from torch import Tensor
 from bench.errors import SteerbenchError as SteerbenchError
 from bench.errors import Unavailable as Unavailable
 from bench.errors import unexpected
-from bench.kinds import Json, Names, Size, Sizes, Texts
+from bench.kinds import Size
 
 TwoTensors = tuple[Tensor, Tensor]
 SomeTensors = Sequence[Tensor]
@@ -140,7 +140,7 @@ class Split:
 
     cameras: Cameras
     images: SomeTensors
-    names: Names
+    names: Sequence[str]
     masks: Sequence[Tensor | None] = ()
 
     def __len__(self) -> int:
@@ -215,7 +215,7 @@ class Log(Protocol):
     def progress(self, label: str, total: int) -> AbstractContextManager[Progress]:
         """A progress bar with the time left, for work of `total` steps."""
 
-    def stage_dir(self, kind: str, key: Json) -> Path:
+    def stage_dir(self, kind: str, key: Mapping[str, object]) -> Path:
         """The folder of a trained stage, `outputs/stages/<kind>-<hash of key>`; made if missing."""
 
 
@@ -278,10 +278,10 @@ class Method(Protocol):
     def render(self, camera: Camera, probe: Probe) -> Frame:
         """Render one frame of the current sequence."""
 
-    def sizes(self) -> Sizes:
+    def sizes(self) -> dict[str, int]:
         """Bytes by component, as stored in a file of the model."""
 
-    def settings(self) -> Texts:
+    def settings(self) -> dict[str, str]:
         """The resolved `device`, `backend`, `engine`, `precision` and `field_precision`, which rows
         show as docs/protocol.md explains."""
 

@@ -11,7 +11,6 @@ from torch import Tensor
 from bench.cameras import scale_camera
 from bench.clock import OTHER, StageClock
 from bench.isolation import lent
-from bench.kinds import Numbers
 from bench.metrics import quantise
 from bench.scoring import taken
 from bench.types import Camera, Method
@@ -64,7 +63,7 @@ class Turns:
 class Drawn:
     rgb: Tensor  # [H, W, 3] in [0, 1], on the CPU, rounded to 8 bits
     ms: float  # of the frame
-    stages_ms: Numbers  # of each stage without nested stages, longest first
+    stages_ms: dict[str, float]  # of each stage without nested stages, longest first
 
 
 class Painter:

@@ -23,7 +23,7 @@ import torch
 from bench.case import Case, Difference, failed
 from bench.clock import times_ms
 from bench.console import ConsoleLog
-from bench.kinds import Names, Words
+from bench.kinds import Words
 from bench.provenance import ROOT, libraries
 from bench.sharing import locked, whole
 from bench.types import Log
@@ -85,7 +85,7 @@ def _file(device: str) -> Path:
     return folder / f"{sha256(key).hexdigest()[:16]}.json"
 
 
-def tried(kernels: Names, command: Words, limit_s: float) -> dict[str, Verdict]:
+def tried(kernels: Sequence[str], command: Words, limit_s: float) -> dict[str, Verdict]:
     """The verdicts of children, `command` with the name of one of the `kernels` each, which have
     `limit_s` seconds."""
     return {kernel: _answer([*command, kernel], limit_s) for kernel in kernels}

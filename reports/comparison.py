@@ -1,14 +1,13 @@
 """Tables of several runs, a line for each of their settings, with the best figures in bold."""
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
 import pandas as pd
 
 from bench.errors import SteerbenchError
-from bench.kinds import Labels, Names
 from bench.rows import UNITS, half_interval
 from reports.lines import COMMON, Lines, Settings
 from reports.runs import Repeated, Runs, TableLines, conditions, grouped, joined, listed
@@ -29,7 +28,7 @@ COLD_FRAMES = (
 )
 
 
-def comparison(lines: Lines, failures: Labels) -> list[Table]:
+def comparison(lines: Lines, failures: Mapping[str, str]) -> list[Table]:
     """The figures of `lines`, then those of their cold frames if they have any.
 
     Figures are ranked only among lines under the same conditions, if there are at least two; the
@@ -59,7 +58,7 @@ def _table(
     title: str,
     settings: Settings,
     lines: TableLines,
-    metrics: Names,
+    metrics: Sequence[str],
 ) -> Table:
     columns = dict(settings)
     phases = [str(line.runs[0].headline["phase"].iloc[0]) for line in lines]
@@ -73,7 +72,7 @@ def _table(
     return line_table(title, columns, lines)
 
 
-def line_table(title: str, columns: Mapping[str, Names], lines: TableLines) -> Table:
+def line_table(title: str, columns: Mapping[str, Sequence[str]], lines: TableLines) -> Table:
     """A table of `lines` from its `columns`, by their headings."""
     cells = list(zip(*columns.values(), strict=True))
     return Table(title, tuple(columns), cells, [line.keys for line in lines])
@@ -109,7 +108,9 @@ def written(line: Repeated, metric: str, write: Write = usual) -> str | None:
     return f"{write(metric, mean)} ± {write(metric, half)}" if half > 0 else write(metric, mean)
 
 
-def marked(lines: TableLines, metric: str, marks: Names, write: Write = usual) -> list[str | None]:
+def marked(
+    lines: TableLines, metric: str, marks: Sequence[str], write: Write = usual
+) -> list[str | None]:
     """A column: what `written` returns for each line, the best and the second best with `marks`.
 
     The second of two gets no mark (see `ranks`), and no stage does.

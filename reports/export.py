@@ -5,7 +5,6 @@ from collections.abc import Sequence
 
 import pandas as pd
 
-from bench.kinds import Names
 from reports.comparison import conditions_of, marked, shown_as, usual
 from reports.paper_tables import Measured, PaperTable, Shown, figure_table
 from reports.tables import Rows, Table, decimal
@@ -84,7 +83,7 @@ def _tabular(
     caption: str,
     name: str,
     sides: str,
-    heads: Names,
+    heads: Sequence[str],
     rows: Rows,
 ) -> str:
     """A table for the package booktabs; the cells of `rows` are LaTeX already."""

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import cycle
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -18,7 +19,6 @@ from matplotlib.transforms import Bbox
 from numpy.typing import ArrayLike
 
 from bench.clock import OTHER
-from bench.kinds import Named, Values
 from bench.results import COLD
 from reports.comparison import written
 from reports.images import Picture
@@ -103,7 +103,7 @@ def quality_against(
     _, unit, label = COSTS[metric]
     figure, axes = _of_quality(label)
     first = next(iter(settings.values()), range(len(lines)))  # methods
-    styles: Sequence[Named] = [_style(number) for number in range(len(lines))]
+    styles: Sequence[Mapping[str, Any]] = [_style(number) for number in range(len(lines))]
     handles: Sequence[Line2D] = ()
     crowded = len(set(first)) < len(lines) or len(lines) > MOST_NAMES
     if crowded and any(len(set(of)) > 1 for of in settings.values()):
@@ -138,7 +138,7 @@ def quality_against(
 
 def _legend(
     settings: Settings,
-) -> tuple[Sequence[Named], Sequence[Line2D]]:
+) -> tuple[Sequence[Mapping[str, Any]], Sequence[Line2D]]:
     """The style of each line by its settings, and what a legend says of them: the first setting
     that differs has colours, the others markers."""
     first, *rest = (
@@ -227,7 +227,7 @@ def as_number(value: str) -> float | None:
         return None
 
 
-def _style(number: int) -> Values:
+def _style(number: int) -> dict[str, Any]:
     marker, colour = MARKERS[number % len(MARKERS)], COLOURS[number % len(COLOURS)]
     return {"marker": marker, "color": colour, "linestyle": "none"}
 
@@ -249,7 +249,7 @@ def _plot(height: float) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def frontier_plot(rows: Sequence[Named], path: Path) -> None:
+def frontier_plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Write a PNG: error of a frame against its time, log-log, one point per setting.
 
     The left panel shows the error against the ground truth, with the Pareto frontier as a
@@ -285,7 +285,7 @@ def frontier_plot(rows: Sequence[Named], path: Path) -> None:
 
 def _circle(axes: Axes, rows: pd.DataFrame, column: str) -> None:
     """Circle the points of `rows`, and name each on its left unless another name is there."""
-    style: Values = {"textcoords": "offset points", "size": 8, "ha": "right", "va": "top"}
+    style: dict[str, Any] = {"textcoords": "offset points", "size": 8, "ha": "right", "va": "top"}
     names: list[np.ndarray] = []
     for setting, ms, error in zip(rows["setting"], rows["ms"], _rms(rows[column]), strict=True):
         place = (ms, error)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from bench.kinds import Choices, Names, Say, Texts
+from bench.kinds import Say
 from bench.results import COLUMNS, Store, content_key
 from reports.runs import (
     Repeated,
@@ -56,7 +56,7 @@ class Lines:
     def runs(self) -> list[Run]:
         return [run for line in self.lines for run in line.runs]
 
-    def frame(self, metrics: Names) -> pd.DataFrame:
+    def frame(self, metrics: Sequence[str]) -> pd.DataFrame:
         """A row each: settings, number of seeds, means of metrics and halves of their intervals."""
         figures: dict[str, Sequence[Any]] = {
             **self.settings,
@@ -104,7 +104,7 @@ def seedless(lines: Lines) -> list[str]:
     return found
 
 
-def differing(runs: Runs) -> Choices:
+def differing(runs: Runs) -> dict[str, list[str]]:
     """What `varied` finds, under short names: the symbol of the paper, or the last part."""
     columns = varied(runs)
     symbols = {name: of for run in runs for name, of in run.record.get("axes", {}).items()}
@@ -112,7 +112,7 @@ def differing(runs: Runs) -> Choices:
     return {short[name]: values for name, values in columns.items()}
 
 
-def shortened(names: Names) -> Texts:
+def shortened(names: Sequence[str]) -> dict[str, str]:
     """The last part of each of the `names` of settings or, if several columns end so, all of it."""
     ends = [*(name.rpartition(".")[2] for name in names), *TAKEN]
     return {
@@ -120,7 +120,7 @@ def shortened(names: Names) -> Texts:
     }
 
 
-def varied(runs: Runs) -> Choices:
+def varied(runs: Runs) -> dict[str, list[str]]:
     """The facts and the settings beside method and seed that differ between `runs`, with their
     values.
 
@@ -178,7 +178,7 @@ def _line_of(run: Run) -> str:
     return content_key({"settings": _settings(run), "where": list(map(str, run.conditions))})
 
 
-def _settings(run: Run) -> Texts:
+def _settings(run: Run) -> dict[str, str]:
     """The settings of a run by name, without seeds, as text; none for scored pictures."""
     config = run.config
     return {name: _text(name, of) for name, of in unseeded(config) if name not in HIDDEN}

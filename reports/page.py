@@ -6,7 +6,6 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
-from bench.kinds import Labels
 from bench.results import Store
 from reports import figures
 from reports.comparison import comparison, conditions_of, machines
@@ -50,7 +49,7 @@ def write_page(
     return publish(parts, folder, runs)
 
 
-def _heading(lines: Lines, failures: Labels) -> Parts:
+def _heading(lines: Lines, failures: Mapping[str, str]) -> Parts:
     """Title, the table of all lines, and how to read it."""
     runs, (methods, *varied) = lines.runs, lines.settings
     labels = ", ".join(dict.fromkeys(lines.settings[methods]))

@@ -11,7 +11,6 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from bench.kinds import Labels, Named
 from reports import figures
 from reports.claims import NOT_MEASURED, claim_table, finding_table
 from reports.images import Parts, Picture, frame_section, kept_frames
@@ -38,7 +37,7 @@ def _parts(
     tables: Sequence[PaperTable],
     measured: Measured,
     runs: Runs,
-    missing: Labels,
+    missing: Mapping[str, str],
 ) -> Parts:
     shown = PAGE if any(table.number is not None for table in tables) else _of_own(tables)
     yield f"# {shown['title']}"
@@ -73,7 +72,7 @@ def _parts(
     yield f"## Runs\n\nTheir keys in the store, and the commands:\n\n```\n{sources}\n```"
 
 
-def _of_own(tables: Sequence[PaperTable]) -> Named:
+def _of_own(tables: Sequence[PaperTable]) -> Mapping[str, Any]:
     """Title, plots and images of all lines, for tables that are not the paper's."""
     every = ((table.name, key, line) for table in tables for key, line in table.lines.items())
     lines = {line.label: (name, key) for name, key, line in every}
@@ -84,7 +83,7 @@ def _of_own(tables: Sequence[PaperTable]) -> Named:
     }
 
 
-def _plot(plot: Named, lines: TableLines) -> Parts:
+def _plot(plot: Mapping[str, Any], lines: TableLines) -> Parts:
     """A plot of `lines` with heading and caption, if any was measured."""
     if "metric" in plot:
         drawn = figures.quality_plot(lines, plot["metric"])

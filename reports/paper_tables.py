@@ -8,7 +8,6 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-from bench.kinds import Labels, Names, Numbers, Texts
 from bench.records import without
 from reports.claims import Claim, Comparison, apart, compare, gap, told
 from reports.comparison import line_table, machines, marked, shown_as, written
@@ -41,7 +40,7 @@ class Line:
     """
 
     label: str
-    job: Labels
+    job: Mapping[str, str]
     published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     every_seed: bool = False
     called: str = ""
@@ -63,17 +62,17 @@ class PaperTable:
 
     name: str
     title: str
-    metrics: Names
+    metrics: Sequence[str]
     lines: Mapping[str, Line]
-    data_sets: Names = ("",)
-    published_on: Labels = field(default_factory=dict)
-    beside: Names = ()
+    data_sets: Sequence[str] = ("",)
+    published_on: Mapping[str, str] = field(default_factory=dict)
+    beside: Sequence[str] = ()
     number: int | None = None
     notes: Sequence[str] = ()
     claims: Sequence[Claim] = ()
-    scenes: Names = ()
+    scenes: Sequence[str] = ()
     reference: str = ""
-    instead: Labels = field(default_factory=dict)
+    instead: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def called(self) -> str:
@@ -138,7 +137,7 @@ class Shown:
         """The data set; of the first block, which has the title of the table, ""."""
         return "" if self.data_set == self.table.data_sets[0] else self.data_set
 
-    def published(self, metric: str) -> Numbers:
+    def published(self, metric: str) -> dict[str, float]:
         """The paper's figures, by key, of the lines that have one."""
         figures = {key: line.published.get(self.data_set, {}) for key, line in self.lines.items()}
         return {key: of[metric] for key, of in figures.items() if metric in of}
@@ -154,7 +153,7 @@ def comparisons(table: PaperTable, measured: Measured) -> list[Comparison]:
     ]
 
 
-def measured_where(runs: Runs) -> Texts:
+def measured_where(runs: Runs) -> dict[str, str]:
     """Under which conditions, and on which machines, `runs` were measured."""
     return {**conditions(runs, (*COMMON, "seed", "commit")), "machine": machines(runs)}
 
@@ -228,7 +227,7 @@ def distance_table(block: Shown) -> Table:
     return _of_columns("Distances", "here (paper)", [reference, *runs.values()], columns)
 
 
-def _scenes(metrics: Names, lines: TableLines) -> Table:
+def _scenes(metrics: Sequence[str], lines: TableLines) -> Table:
     """Means over seeds, one line per scene and line."""
     shown = [
         Repeated(f"{scene}: {line.label}", line.by_scene[scene])

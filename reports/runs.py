@@ -16,7 +16,7 @@ import torch
 
 from bench.clock import OTHER
 from bench.errors import SteerbenchError
-from bench.kinds import Labels, Named, Names, Numbers, Say, Texts, Values
+from bench.kinds import Say
 from bench.metrics import psnr
 from bench.neighbours import Neighbours
 from bench.records import Record
@@ -49,7 +49,7 @@ class Run:
     label: str
     rows: pd.DataFrame = field(repr=False)
     read_frames: Callable[[], pd.DataFrame] = field(repr=False)
-    record: Named = field(repr=False)
+    record: Mapping[str, Any] = field(repr=False)
     pictures: Path = field(repr=False)
 
     @property
@@ -84,9 +84,9 @@ class Run:
         return math.fsum(figures) if figures else None
 
     @property
-    def parts(self) -> Numbers:
+    def parts(self) -> dict[str, float]:
         """The mean ms of each part of a frame, as the method groups its stages, the rest last."""
-        grouping: Labels = self.record.get("parts", {})
+        grouping: Mapping[str, str] = self.record.get("parts", {})
         found = dict.fromkeys((*grouping.values(), OTHER), 0.0)
         for metric, value in self.values.items():
             if metric.startswith(STAGE):
@@ -119,7 +119,7 @@ class Run:
         return str(self.record["command"])
 
     @property
-    def config(self) -> Named:
+    def config(self) -> Mapping[str, Any]:
         """Its settings; none of scored pictures."""
         return self.record["made_of"].get("config", {})
 
@@ -167,7 +167,7 @@ class Run:
         return float(np.mean(found)) if found else math.nan
 
     @property
-    def provenance(self) -> Texts:
+    def provenance(self) -> dict[str, str]:
         """Where the figures come from, except the command and the settings."""
         machine, record, row = self.record["machine"], self.record, self.facts
         memory = f"{machine['memory_bytes'] / 2**30:.0f} GiB"
@@ -200,7 +200,7 @@ class Run:
         return ", ".join((self.facts["commit"], *(f"{top} {of}" for top, of in others.items())))
 
     @property
-    def settings(self) -> Texts:
+    def settings(self) -> dict[str, str]:
         """The settings of the method by the names that one types; none for scored pictures."""
         method = self.config.get("method", {})
         named = ((name, str(value)) for name, value in flat({"method": method}))
@@ -253,7 +253,7 @@ class Repeated:
         return half_interval(np.array(self._figures(metric)))
 
     @property
-    def parts(self) -> Numbers:
+    def parts(self) -> dict[str, float]:
         """The mean ms of each part of a frame; see `Run.parts`."""
         of_runs = pd.DataFrame([run.parts for run in self.runs]).fillna(0.0)
         return {str(part): float(ms) for part, ms in of_runs.mean().items()}
@@ -319,7 +319,7 @@ def _label(command: object, rows: pd.DataFrame) -> str:
     return typed[-1].partition("=")[2] if typed else str(rows["method"].iloc[0])
 
 
-def flat(node: Named, before: str = "") -> Iterator[tuple[str, Any]]:
+def flat(node: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
     """The values of nested settings by the names that one types."""
     for name, value in node.items():
         if isinstance(value, Mapping) and value:
@@ -328,7 +328,7 @@ def flat(node: Named, before: str = "") -> Iterator[tuple[str, Any]]:
             yield f"{before}{name}", value
 
 
-def unseeded(config: Named) -> Iterator[tuple[str, Any]]:
+def unseeded(config: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """The `flat` settings of a run without its seed, and without those of its method, which have
     the same."""
     for name, value in flat(config):
@@ -390,7 +390,7 @@ def over_scenes(runs: Runs) -> Run:
         value=("value", lambda values: values.sum(skipna=False) / len(runs)),
         n=("n", "sum"),
     )
-    facts: Values = {**conditions(runs, list(map(str, runs[0].facts.index)))}
+    facts: dict[str, Any] = {**conditions(runs, list(map(str, runs[0].facts.index)))}
     facts["scene"] = f"mean of {', '.join(str(run.facts['scene']) for run in runs)}"
     facts["seed"] = runs[0].facts["seed"]
     key = facts["run"] = content_key({"mean of": [run.key for run in runs]})[:16]
@@ -401,7 +401,7 @@ def over_scenes(runs: Runs) -> Run:
     return Run(key, runs[0].label, rows, frames, _record(runs), runs[0].pictures)
 
 
-def _record(runs: Runs) -> Values:
+def _record(runs: Runs) -> dict[str, Any]:
     """The record of the first run, with the scenes, machines and missing figures of all."""
     records = [run.record for run in runs]
     machines = [record["machine"] for record in records]
@@ -427,12 +427,12 @@ def joined(values: Iterable[object]) -> str:
     return " / ".join(dict.fromkeys(map(str, values)))
 
 
-def conditions(runs: Runs, names: Names) -> Texts:
+def conditions(runs: Runs, names: Sequence[str]) -> dict[str, str]:
     """The facts `names` of `runs`, each with all of its values."""
     return {name: joined(run.facts[name] for run in runs) for name in names}
 
 
-def listed(values: Named) -> str:
+def listed(values: Mapping[str, Any]) -> str:
     """Names with their values, as text."""
     return ", ".join(
         f"{name} {' + '.join(value) or 'none' if isinstance(value, list) else value}"

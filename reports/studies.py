@@ -10,10 +10,11 @@ import statistics
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 from bench.clock import OTHER
 from bench.convergence import observed_order
-from bench.kinds import Numbers, Values, Words
+from bench.kinds import Words
 from reports.figures import frontier_plot
 from reports.images import Parts, Picture
 from reports.runs import Run, conditions, grouped
@@ -62,7 +63,7 @@ class Measured:
         return self.run.values.get(metric, math.nan)
 
     @property
-    def work(self) -> Numbers:
+    def work(self) -> dict[str, float]:
         return {
             metric.removeprefix(WORK): value
             for metric, value in self.run.values.items()
@@ -142,7 +143,7 @@ def on_frontier(lines: MeasuredLines) -> list[Measured]:
     return rated
 
 
-def _point(line: Measured) -> Values:
+def _point(line: Measured) -> dict[str, Any]:
     return {
         "setting": line.line.label,
         "knob": line.line.group,

@@ -12,7 +12,6 @@ from functools import partial
 
 import pandas as pd
 
-from bench.kinds import Names, Numbers
 from bench.results import COLD, STEADY
 
 NOT_AVAILABLE = "n/a"
@@ -48,7 +47,7 @@ class Table:
     the runs behind each line, or is empty."""
 
     title: str
-    columns: Names
+    columns: Sequence[str]
     lines: Rows
     sources: Rows = ()
 
@@ -136,7 +135,7 @@ def run_tables(rows: pd.DataFrame) -> list[Table]:
     return [table for table in (*tables, _memory(rows)) if table.lines]
 
 
-def _values(rows: pd.DataFrame, prefix: str = "") -> Numbers:
+def _values(rows: pd.DataFrame, prefix: str = "") -> dict[str, float]:
     """Figures of one run by metric, for metrics with `prefix`, which is removed from the names."""
     some = rows[rows["metric"].str.startswith(prefix)]
     return dict(zip(some["metric"].str.removeprefix(prefix), some["value"], strict=True))

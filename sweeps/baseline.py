@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.errors import SteerbenchError, explained, some, unexpected
-from bench.kinds import Named, Names, Say, Values, Words
+from bench.kinds import Say, Words
 from bench.records import made, read_record
 from bench.results import Store, existing_store
 from bench.sharing import whole
@@ -38,7 +38,7 @@ class Entry:
     subject: Sequence[str]
     command: str
     settings: Mapping[str, str]
-    seeds: Values  # the Run of each in a store, the Figures of each in a baseline
+    seeds: dict[str, Any]  # the Run of each in a store, the Figures of each in a baseline
 
     def differences(self, other: Entry) -> list[str]:
         """The names of the settings of `other` that are not as here."""
@@ -54,7 +54,7 @@ class Entry:
             return all(self._equal_below(word, other, apart) for word in words)
         return self.subject == other.subject
 
-    def _equal_below(self, word: str, other: Entry, apart: Names) -> bool:
+    def _equal_below(self, word: str, other: Entry, apart: Sequence[str]) -> bool:
         """Whether no setting that a typed `word` is about is `apart`; of a choice that is about
         none, such as an experiment, nothing is known."""
         typed = TYPED.match(word)
@@ -128,7 +128,7 @@ def read(path: Path) -> tuple[Limits, list[Entry]]:
         raise SteerbenchError(f"no baseline: {error}; {way}") from error
 
 
-def _limits(held: Named, where: str) -> dict[str, Limit]:
+def _limits(held: Mapping[str, Any], where: str) -> dict[str, Limit]:
     """The limits in a baseline, of metrics that exist, in their direction."""
     limits = {}
     known = limited([f"{metric}=0" for metric in held])  # refuses what is no metric

@@ -16,18 +16,18 @@ import re
 import signal
 import sys
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from bench.errors import SteerbenchError, unknown
-from bench.kinds import Named, Texts, Values, Words
+from bench.kinds import Words
 from bench.records import without
 from sweeps.processes import set_up
 
-COMMANDS: dict[str, Values] = tomllib.loads(
+COMMANDS: dict[str, dict[str, Any]] = tomllib.loads(
     (Path(__file__).parent / "commands.toml").read_text(encoding="utf-8")
 )
 """What commands.toml says of each command, by name."""
@@ -135,7 +135,7 @@ def parsed(argv: Words) -> argparse.Namespace:
     Among them are the name of the `command`, None if there was none, the innermost `parser`, and
     what was `typed`.
     """
-    overview: Texts = {}
+    overview: dict[str, str] = {}
     for name, about in COMMANDS.items():
         lines = overview.get(about["group"], f"{about['group']}\n")
         overview[about["group"]] = f"{lines}  {name:12}{about['purpose']}\n"
@@ -167,7 +167,7 @@ def parsed(argv: Words) -> argparse.Namespace:
     return options
 
 
-def _arguments(about: Named) -> Iterator[tuple[list[str], Values]]:
+def _arguments(about: Mapping[str, Any]) -> Iterator[tuple[list[str], dict[str, Any]]]:
     """The names and the options, as for `add_argument`, of each argument of a command."""
     include = about.get("include", [])
     if usual := about.get("settings"):
@@ -211,7 +211,7 @@ def config_dir(text: str) -> str:
 
 
 SEVERAL = {"action": "append", "default": []}
-TYPES: dict[str, Values] = {
+TYPES: dict[str, dict[str, Any]] = {
     "path": {"type": Path},
     "count": {"type": count, "metavar": "N"},
     "positive": {"type": positive},

@@ -23,7 +23,6 @@ from omegaconf.errors import OmegaConfBaseException
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable, unexpected, unknown
 from bench.isolation import as_begun, fit
-from bench.kinds import Named, Values
 from bench.protocol import EvaluationProtocol
 from bench.provenance import Stamp, stamp
 from bench.records import coerced, fits
@@ -259,14 +258,14 @@ def as_declared(node: Any) -> Any:
     return {name: coerced(as_declared(value), hints.get(name, Any)) for name, value in node.items()}
 
 
-def _hints(target: Any) -> Values:
+def _hints(target: Any) -> dict[str, Any]:
     # Types of inherited dataclass fields must be looked up in the modules of its bases.
     plain = inspect.isclass(target) and not is_dataclass(target)
     return get_type_hints(target.__init__ if plain else target)
 
 
 def check_settings(
-    target: Any, settings: Named, prefix: str = "", given: Collection[str] = ()
+    target: Any, settings: Mapping[str, Any], prefix: str = "", given: Collection[str] = ()
 ) -> None:
     """Raise `SteerbenchError` unless `target` accepts these settings, by name and type.
 

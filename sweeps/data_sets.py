@@ -8,7 +8,6 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from bench.errors import SteerbenchError
-from bench.kinds import Labels, Names
 from bench.records import read_json
 from bench.scenes.blender import camera_file
 from bench.scenes.files import data_folder, frames_of
@@ -29,7 +28,7 @@ def data_set_of(scene: str) -> str:
     return next(wanted, FIRST)
 
 
-def data_sets(scenes: Names) -> list[str]:
+def data_sets(scenes: Sequence[str]) -> list[str]:
     """The data sets of `scenes`, in the paper's order."""
     there = {data_set_of(scene) for scene in scenes}
     return [name for name in DATA_SETS if name in there]
@@ -45,7 +44,7 @@ class DataSet:
 
     layout: str
     scenes: Mapping[str, Path]
-    missing: Labels
+    missing: Mapping[str, str]
 
 
 def find(path: str) -> DataSet:

@@ -3,7 +3,7 @@
 from typing import Any
 
 from bench.errors import SteerbenchError, unknown
-from bench.kinds import Choices, Words
+from bench.kinds import Words
 from bench.study import Axis
 from sweeps.overrides import choices, loaded, taken
 
@@ -20,7 +20,7 @@ def experiment(name: str, words: Words = ()) -> Any:
     return loaded(files[name]) or {}
 
 
-def grid(declared: Any) -> Choices:
+def grid(declared: Any) -> dict[str, list[str]]:
     """The settings that an experiment varies, each with its values, by what its file holds."""
     params = declared.get("hydra", {}).get("sweeper", {}).get("params") or {}
     words = [f"{name}={values}" for name, values in params.items()]

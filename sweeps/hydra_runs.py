@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, flag_override
 
 from bench.errors import unexpected
-from bench.kinds import Labels, Words
+from bench.kinds import Words
 from sweeps.overrides import CONFIGS, as_typed, explain, further, hint, of_hydra, settled, taken
 
 if TYPE_CHECKING:  # these load torch, which --help and completion do not need
@@ -117,7 +117,7 @@ def _named(found: Sequence[tuple[Job, str]]) -> list[Job]:
     ]
 
 
-def label(method: str, varied: Labels) -> str:
+def label(method: str, varied: Mapping[str, str]) -> str:
     """The label of a job among others: its method, and what it has of the settings that vary."""
     from reports.lines import shortened
 

@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable, explained, reason, some, unexpected
 from bench.isolation import Guard, as_begun, put_back
-from bench.kinds import Named, Values, Words
+from bench.kinds import Words
 from bench.measure import MethodFailed, Task, measure, train
 from bench.neighbours import Neighbours
 from bench.provenance import (
@@ -62,7 +62,7 @@ AUTOMATIC = {"device": DEVICE, "backend": re.compile("reference|cpu|gpu")}
 """Settings that may be "auto", and what they can become in a key."""
 
 
-def described(config: DictConfig) -> Values:
+def described(config: DictConfig) -> dict[str, Any]:
     """The settings that determine a run; equal for equal jobs.
 
     Left out are: locations, except the last part of a scene's folder, which rows show; `split`,
@@ -84,7 +84,7 @@ def described(config: DictConfig) -> Values:
     return kept
 
 
-def job_key(settings: Named, turns: str) -> str:
+def job_key(settings: Mapping[str, Any], turns: str) -> str:
     """Equal for jobs with the same `settings` (see `described`) and the same `turns`; raises
     SteerbenchError if a number is infinite or NaN."""
     try:
@@ -116,7 +116,7 @@ class Job:
     turns: str = ""
 
     @cached_property
-    def settings(self) -> Values:
+    def settings(self) -> dict[str, Any]:
         return described(self.config)
 
     @cached_property
@@ -261,7 +261,7 @@ class _Ready:
     job: Job
     method: Method
     task: Task
-    parts: Named
+    parts: Mapping[str, Any]
     loaded: frozenset[str]  # the names of all modules before
     left: Sequence[str]  # what runs before it have left in modules of others
 
@@ -299,7 +299,7 @@ def _ready(jobs: Jobs, log: Log) -> list[_Ready]:
     if any(each.task.budget != ready[0].task.budget for each in ready):
         raise SteerbenchError("budget: expected the same for all that is measured in turns")
     keys = [content_key(each.parts) for each in ready]
-    shared: Values = {"beside": sorted(keys)}
+    shared: dict[str, Any] = {"beside": sorted(keys)}
     if ready[0].task.protocol.compared:
         shared["compared_with"] = keys[0]
     return [replace(each, parts={**each.parts, **shared}) for each in ready]
@@ -341,19 +341,19 @@ def _prepared(job: Job, log: Log) -> _Ready:
     return _Ready(job, method, task, parts, loaded, left)
 
 
-def became(settings: Named, method: Method, scene: Scene) -> Values:
+def became(settings: Mapping[str, Any], method: Method, scene: Scene) -> dict[str, Any]:
     """`settings` with what "auto" stands for on this machine, and what `method` leaves to the scene
     as it is for this one: who types the same has the same run."""
     shown = method.settings()
     automatic = {
         name: shown[name] for name, form in AUTOMATIC.items() if form.fullmatch(shown[name])
     }
-    decided: Named = {}
+    decided: Mapping[str, Any] = {}
     if hasattr(method, "decided"):
         decided = method.decided(scene)
 
-    def resolved(node: Named, before: str) -> Values:
-        found: Values = {}
+    def resolved(node: Mapping[str, Any], before: str) -> dict[str, Any]:
+        found: dict[str, Any] = {}
         for name, value in node.items():
             if isinstance(value, Mapping):
                 found[name] = resolved(value, f"{before}{name}.")
@@ -366,7 +366,7 @@ def became(settings: Named, method: Method, scene: Scene) -> Values:
     return resolved(settings, "")
 
 
-def _read_by(method: Method, trajectory: Trajectory, settings: Named) -> list[str]:
+def _read_by(method: Method, trajectory: Trajectory, settings: Mapping[str, Any]) -> list[str]:
     """The checksums of the files that a method and a path read, and of those whose names are
     settings of the method."""
     named = [Path(text) for _, text in flat(settings["method"]) if isinstance(text, str)]
@@ -440,7 +440,7 @@ def _measure(ready: Sequence[_Ready], guard: Guard, log: Log) -> None:
     for each in ready:
         each.job.store.remove(each.run)
     for each, measurement in zip(ready, measurements, strict=True):
-        record: Values = {
+        record: dict[str, Any] = {
             **measurement.record,
             "command": shlex.join(each.job.command),
             "scene_path": scene_folder(each.job.config),

@@ -28,7 +28,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from yaml import YAMLError
 
 from bench.errors import SteerbenchError, reason, unexpected, unknown
-from bench.kinds import Choices, Named, Texts, Values, Words
+from bench.kinds import Words
 
 CONFIGS = Path(__file__).parent / "configs"
 FLAGS = ("--config-dir", "-cd")
@@ -106,7 +106,7 @@ def variants(words: Words) -> Callable[[Words], DictConfig]:
     return varied
 
 
-def swept(words: Words) -> Choices:
+def swept(words: Words) -> dict[str, list[str]]:
     """The values of every setting with several values (seed=0,1,2); the last word for it counts.
 
     SteerbenchError if a word cannot be read.
@@ -271,7 +271,7 @@ def choices(group: str, words: Words = ()) -> dict[str, Path]:
     return dict(sorted(found.items()))
 
 
-def described(group: str, words: Words = ()) -> Texts:
+def described(group: str, words: Words = ()) -> dict[str, str]:
     """Every choice of `group`, including folders named in `words`, with its description: the first
     comment that is not a Hydra directive (`# @package`)."""
     comments = {}
@@ -290,7 +290,7 @@ def loaded(path: Path) -> Any:
         raise unexpected(path, "a YAML file of settings", reason(error)) from error
 
 
-def target_of(node: Named | DictConfig) -> Any:
+def target_of(node: Mapping[str, Any] | DictConfig) -> Any:
     """The class or function that `_target_` names; SteerbenchError if it cannot be imported."""
     try:
         return pkgutil.resolve_name(node["_target_"])
@@ -301,7 +301,7 @@ def target_of(node: Named | DictConfig) -> Any:
         ) from error
 
 
-def engine_kinds(words: Words) -> Values:
+def engine_kinds(words: Words) -> dict[str, Any]:
     """The class of each engine by name; torch, the standard, comes first."""
     files = sorted(choices("engine", words).items(), key=lambda file: (file[0] != "torch", file))
     return {name: target_of(loaded(path)) for name, path in files}

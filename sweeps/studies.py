@@ -4,12 +4,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
+from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
 
 from bench.errors import SteerbenchError, unknown
-from bench.kinds import Named, Names, Texts, Words
+from bench.kinds import Words
 from bench.study import Axis, Study, Variant, study_of
 from reports.studies import StudyLine
 from sweeps import experiments
@@ -62,7 +63,7 @@ class Subject:
         return study_of(target)
 
     @property
-    def off(self) -> Texts:
+    def off(self) -> dict[str, str]:
         """By what is skipped, the word that switches this skipping off."""
         return {name: f"{setting}=false" for name, setting in self.study.skips.items()}
 
@@ -89,7 +90,7 @@ class Subject:
             yield StudyLine(self.name, group, each.name, each.settings)
 
 
-def accuracy(subject: Subject, only: Names, trained: bool) -> Iterator[StudyLine]:
+def accuracy(subject: Subject, only: Sequence[str], trained: bool) -> Iterator[StudyLine]:
     """Every knob, beside two that all of them are compared with: everything off, if the method
     declares what that is, and nothing changed. All use the same training, but those of `trained`
     knobs."""
@@ -133,7 +134,7 @@ def breakdown(subject: Subject) -> Iterator[StudyLine]:
     yield from subject.lines("parts", variants)
 
 
-def scaling(subject: Subject, only: Names) -> Iterator[StudyLine]:
+def scaling(subject: Subject, only: Sequence[str]) -> Iterator[StudyLine]:
     """Frame sizes, numbers of threads and the axes of the method, each measured alone."""
     config = subject.config
     most = config.budget.threads or torch.get_num_threads()
@@ -168,7 +169,7 @@ def _points(axis: Axis) -> list[tuple[float, Variant]]:
     ]
 
 
-def chosen(names: Names | Named, parts: Names, kind: str) -> list[str]:
+def chosen(names: Sequence[str] | Mapping[str, Any], parts: Sequence[str], kind: str) -> list[str]:
     """Those of `names` that have any of `parts` in them; all without parts."""
     for part in parts:
         if not any(part in name for name in names):
@@ -225,7 +226,7 @@ class StudyJob(Job):
     line: StudyLine
 
 
-def jobs_of(study: str, found: Sequence[Subject], options: Named) -> Iterator[StudyJob]:
+def jobs_of(study: str, found: Sequence[Subject], options: Mapping[str, Any]) -> Iterator[StudyJob]:
     """The jobs of all lines; those of a group in turns, if the study compares times."""
     for subject in found:
         varied = variants(subject.words)

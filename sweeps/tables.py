@@ -10,7 +10,7 @@ from itertools import product
 from typing import Any
 
 from bench.errors import SteerbenchError, unexpected, unknown
-from bench.kinds import Named, Names, Numbers, Values, Words
+from bench.kinds import Words
 from bench.records import without
 from reports.claims import Claim, by_ratio
 from reports.comparison import shown_as
@@ -24,8 +24,8 @@ from sweeps.overrides import choices, setting
 def chosen(
     name: str | None = None,
     words: Words = (),
-    methods: Names = (),
-    data_sets: Names = (FIRST,),
+    methods: Sequence[str] = (),
+    data_sets: Sequence[str] = (FIRST,),
 ) -> list[PaperTable]:
     """The table called `name`, or those of the paper, with the paper's figures on `data_sets`.
 
@@ -53,7 +53,7 @@ def chosen(
     ]
 
 
-def _table(name: str, whole: Any, data_sets: Names) -> PaperTable:
+def _table(name: str, whole: Any, data_sets: Sequence[str]) -> PaperTable:
     """What an experiment declares below `table`, with the figures on those of `data_sets` that
     there are any of."""
     where, declared = f"experiment {name}: table", whole.get("table")
@@ -89,8 +89,8 @@ def _table(name: str, whole: Any, data_sets: Names) -> PaperTable:
 
 
 def _jobs(
-    said: Named, label: str | None, grid: Mapping[str, Sequence[str]], where: str
-) -> dict[str, Values]:
+    said: Mapping[str, Any], label: str | None, grid: Mapping[str, Sequence[str]], where: str
+) -> dict[str, dict[str, Any]]:
     """The job and the label of each line by key: of lines for which a `job` is `said`; if for none,
     of each job of the grid, whose key is made of its values."""
     jobs = {
@@ -115,7 +115,9 @@ def _words(job: Any) -> Any:
     return {x: "null" if of is None else str(of) for x, of in texts.items()}
 
 
-def _figures(published: Sequence[float | None], metrics: Names, where: str) -> Numbers:
+def _figures(
+    published: Sequence[float | None], metrics: Sequence[str], where: str
+) -> dict[str, float]:
     """The figures of a line by metric, from a list with None for those that are not there."""
     if len(published) != len(metrics):
         expected = f"{len(metrics)} figures, one for each of metrics"
@@ -125,7 +127,7 @@ def _figures(published: Sequence[float | None], metrics: Names, where: str) -> N
     return {**figures, "frame_ms": 1000 / figures["fps"]} if "fps" in figures else figures
 
 
-def _claim(declared: Named, lines: Mapping[str, Line], where: str) -> Claim:
+def _claim(declared: Mapping[str, Any], lines: Mapping[str, Line], where: str) -> Claim:
     """A claim about lines that an experiment declares as `rising` or as `alike`."""
     own = without(declared, ("rising", "alike"))
     check_settings(Claim, own, where, ("lines", "alike"))
@@ -138,7 +140,7 @@ def _claim(declared: Named, lines: Mapping[str, Line], where: str) -> Claim:
     return Claim(lines=keys, alike="alike" in declared, **own)
 
 
-def _by_data_set(declared: Any) -> Named:
+def _by_data_set(declared: Any) -> Mapping[str, Any]:
     return declared if isinstance(declared, dict) else {FIRST: declared}
 
 

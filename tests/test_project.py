@@ -48,7 +48,7 @@ def closure(requirements: list[str]) -> Iterator[Requirement]:
                 ]
 
 
-MOST_NODES = {"product": 277_000, "tests": 184_500}
+MOST_NODES = {"product": 276_800, "tests": 182_700}
 """Nodes of the syntax tree without docstrings, so that lines are free: lower these."""
 
 

@@ -1,6 +1,7 @@
 """Loads NeRF-Synthetic: `transforms_{train,val,test}.json` beside RGBA pictures."""
 
-from bench.kinds import AnyPath
+from pathlib import Path
+
 from bench.records import read_json
 from bench.scenes.assemble import assemble, cube, describe_splits, hull_box, parse_box
 from bench.scenes.files import data_folder
@@ -11,7 +12,7 @@ HALF_EXTENT = 1.5  # the objects of NeRF-Synthetic lie in [-1.5, 1.5]^3
 
 
 def load(
-    path: AnyPath,
+    path: str | Path,
     *,
     downscale: int = 1,
     background: str = "white",

@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from bench.errors import optional, unexpected
-from bench.kinds import AnyPath, Names
 from bench.scenes.assemble import (
     Box,
     assemble,
@@ -37,7 +36,7 @@ STRAY = 0.01  # share of the points, at either end of an axis, that the box may 
 
 
 def load(
-    path: AnyPath,
+    path: str | Path,
     *,
     images: str = "images",
     model: str | None = None,
@@ -140,7 +139,7 @@ def pictures_below(folder: Path) -> list[Path]:
     return [file for file in folder.rglob("*") if bare(file.name) != file.name]
 
 
-def in_order(full: Path, names: Names, folder: Path) -> list[Path | None]:
+def in_order(full: Path, names: Sequence[str], folder: Path) -> list[Path | None]:
     """The pictures in `folder` in the order of `names`, as LLFF's images_8 are paired with images.
 
     Where the folder `full` has all `names`, its other pictures count, too: those that COLMAP did

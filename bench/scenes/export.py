@@ -2,13 +2,13 @@
 
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 from PIL import Image
 
 from bench.cameras import move_camera
-from bench.kinds import Json, Labels, Numbers
 from bench.scenes.blender import camera_file
 from bench.scenes.files import opengl_to_opencv
 from bench.threads import in_parallel
@@ -25,7 +25,7 @@ def picture_file(split: str, number: int) -> str:
     return f"{split}/r_{number}.png"
 
 
-def write_blender(scene: Scene, folder: Path, files: Labels, log: Log) -> None:
+def write_blender(scene: Scene, folder: Path, files: Mapping[str, str], log: Log) -> None:
     """Write splits of `scene` in NeRF-Synthetic's layout into the empty `folder`.
 
     `files` says of which split the cameras in each `transforms_NAME.json` are: several names may
@@ -54,7 +54,7 @@ def write_blender(scene: Scene, folder: Path, files: Labels, log: Log) -> None:
         (folder / camera_file(name)).write_text(json.dumps(record, indent=1) + "\n")
 
 
-def _transforms(cameras: list[Camera], split: str) -> Json:
+def _transforms(cameras: list[Camera], split: str) -> Mapping[str, object]:
     lenses = [_lens(camera) for camera in cameras]
     alike = all(lens == lenses[0] for lens in lenses)
     frames = []
@@ -72,6 +72,6 @@ def _transforms(cameras: list[Camera], split: str) -> Json:
     return {**angle, **lenses[0], "frames": frames}
 
 
-def _lens(camera: Camera) -> Numbers:
+def _lens(camera: Camera) -> dict[str, float]:
     sizes = {"w": camera.width, "h": camera.height}
     return {**sizes, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from bench.errors import SteerbenchError, not_there, unexpected
-from bench.kinds import AnyPath
 from bench.scenes.remarks import Remarks
 
 SMALLEST_ANGLE = 1e-9  # of view in radians: below any telescope's, but its tangent is not 0
@@ -22,7 +21,7 @@ ORTHONORMAL_TOLERANCE = 1e-3  # largest entry of R^T R - I; poses have at least 
 ROUNDED_TOLERANCE = 0.02  # the same of rotations with two digits, put right if a line says so
 
 
-def data_folder(path: AnyPath) -> Path:
+def data_folder(path: str | Path) -> Path:
     """The data set's folder with all links resolved; SteerbenchError if it is not a folder."""
     root = Path(path).expanduser()
     if not root.is_dir():
@@ -117,7 +116,7 @@ def numbers_of(value: object, count: int, where: str) -> list[float]:
     return [number(x, where) for x in value]
 
 
-def numbers(text: str, where: AnyPath) -> list[list[float]]:
+def numbers(text: str, where: str | Path) -> list[list[float]]:
     """The numbers of a text, line by line, without empty lines."""
     try:
         lines = (line.split() for line in text.splitlines())

@@ -10,7 +10,6 @@ from pathlib import Path, PurePosixPath
 from unicodedata import normalize
 
 from bench.errors import unexpected
-from bench.kinds import AnyPath, Names
 from bench.types import Log
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -45,7 +44,9 @@ def in_any_case(path: Path, there: There = os.path.isfile) -> Path | None:
     return next(filter(there, like), None)
 
 
-def found(root: Path, name: str, where: AnyPath, kind: str, there: There = os.path.isfile) -> Path:
+def found(
+    root: Path, name: str, where: str | Path, kind: str, there: There = os.path.isfile
+) -> Path:
     """What is called `name` in `root`, in any case of letters; raises if that is not `there`."""
     path = in_any_case(root / tidy(name), there)
     if path is None:
@@ -61,7 +62,7 @@ def _children(folder: Path | None) -> list[Path]:
         return []
 
 
-def find_all(root: Path, names: Names) -> list[Path | None]:
+def find_all(root: Path, names: Sequence[str]) -> list[Path | None]:
     """The picture of each of `names` from the folder `root`; None if there is none.
 
     It is called like that, perhaps with "/" for "\\"; or in another case of letters, or with an
@@ -95,7 +96,7 @@ def find_all(root: Path, names: Names) -> list[Path | None]:
 
 def report(
     root: Path,
-    names: Names,
+    names: Sequence[str],
     files: Sequence[Path | None],
     where: str,
     log: Log,

@@ -8,7 +8,6 @@ from pathlib import Path
 import torch
 
 from bench.errors import unexpected
-from bench.kinds import AnyPath
 from bench.records import read_text
 from bench.scenes.assemble import MARGIN, Box, assemble, describe_splits
 from bench.scenes.files import data_folder, number, numbers, rigid_pose, whole_number
@@ -26,7 +25,7 @@ release of SteerNeRF, which has them from there."""
 PICTURE_NAME = re.compile(r"[012]_.*\.(png|jpg|jpeg)", re.IGNORECASE)
 
 
-def load(path: AnyPath, *, downscale: int = 1, background: str = "white", log: Log) -> Scene:
+def load(path: str | Path, *, downscale: int = 1, background: str = "white", log: Log) -> Scene:
     """Read the scene folder `path`; for `downscale` and `background` see `blender.load`.
 
     Pictures and poses are named 0_* (train), 1_* (val) and 2_* (test); poses have OpenCV axes.

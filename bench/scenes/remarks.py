@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from bench.kinds import AnyPath, Say
+from bench.kinds import Say
 from bench.scenes.images import ScaledView
 
 OFF_CENTRE = 0.4  # of half a picture, from its middle: a doubtful principal point
@@ -18,7 +18,7 @@ class Remarks:
     def __init__(self) -> None:
         self._kinds: dict[str, list[str]] = {}
 
-    def add(self, where: AnyPath, kind: str, got: object) -> None:
+    def add(self, where: str | Path, kind: str, got: object) -> None:
         self._kinds.setdefault(kind, []).append(f"{where}: {kind}: {got}")
 
     def add_unread(self, where: Path, levels: Sequence[Mapping], known: Container[str]) -> None:

@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from bench.errors import unexpected
-from bench.kinds import Named, Names
 from bench.records import read_text
 from bench.scenes.files import describe, whole_number
 from bench.scenes.images import View
@@ -20,7 +20,9 @@ Lists = tuple[Path, Mapping[str, Sequence[str]]]
 SPLITS = ("train", "val", "test")
 
 
-def read_lists(root: Path, split: str | None, record: Named, where: Path) -> Lists | None:
+def read_lists(
+    root: Path, split: str | None, record: Mapping[str, Any], where: Path
+) -> Lists | None:
     """The names in the lines of the file `split`: of test pictures, or of others if it is called
     train* or val*; without it train_filenames ... in `record`, the file `where`; None: no lists."""
     if split is None:
@@ -67,7 +69,7 @@ def divide(
 
 
 def _as_listed(
-    names: Names, file: Path, lists: Mapping[str, Sequence[str]], log: Log
+    names: Sequence[str], file: Path, lists: Mapping[str, Sequence[str]], log: Log
 ) -> dict[str, set[int]]:
     """The positions in `names` that each split lists; a split without a list has what is left."""
     whole = [bare(name) for name in names]

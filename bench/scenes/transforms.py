@@ -11,7 +11,6 @@ from torch import Tensor
 
 from bench.cameras import scale_camera
 from bench.errors import unexpected
-from bench.kinds import AnyPath
 from bench.records import read_json
 from bench.scenes.assemble import Box, assemble, box_of_cameras, describe_splits, space_of, tight
 from bench.scenes.files import (
@@ -61,7 +60,7 @@ KNOWN = {*OTHER_TERMS, *READ.split(), *HARMLESS.split()}
 
 
 def load(
-    path: AnyPath,
+    path: str | Path,
     *,
     split: str | None = None,
     split_every: int = 8,

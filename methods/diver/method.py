@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench.kinds import Sizes
 from bench.study import Axis, Study, Variant, turned
 from bench.types import Budget, Probe, Rays, Scene
 from methods.diver.kernels.segments import Corners, Layers, render_segments
@@ -54,7 +53,7 @@ class Baked:
         )
         self.across, self.view_bias = across.clone(), decoder.view.bias + along @ bias[1:]
 
-    def sizes(self) -> Sizes:
+    def sizes(self) -> dict[str, int]:
         """Bytes of the features, of a bit per cell that marks voxels, and of the decoder."""
         decoder = (*vars(self.layers).values(), self.across, self.view_bias)
         return {
@@ -126,5 +125,5 @@ class Diver(Student):
 
         return self.baked.occupancy, render
 
-    def sizes(self) -> Sizes:
+    def sizes(self) -> dict[str, int]:
         return self.baked.sizes()

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bench.kinds import Numbers
 from bench.types import Budget, Rays, Scene
 from methods.diver.kernels.segments import as_intervals
 from methods.diver.model import CornerModel
@@ -49,7 +48,7 @@ class DiverTraining(PixelTraining):
         self.moments = AdamState.like(model.table.detach())
         self.grad = torch.zeros_like(model.table)
 
-    def advance(self) -> Numbers:
+    def advance(self) -> dict[str, float]:
         if self.step == max(int(self.options.prune_at * self.steps), 1):
             self._prune()
         return super().advance()

@@ -8,7 +8,7 @@ reprojection and the field do not use an engine.
 import importlib
 import tempfile
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import ClassVar, Literal
@@ -17,7 +17,6 @@ import torch
 from torch import Tensor, nn
 
 from bench.errors import Unavailable, explained, install_command
-from bench.kinds import Json, Names
 from bench.provenance import digest, libraries
 from bench.sharing import check_sums, missing, write_sums
 from bench.types import Log
@@ -45,7 +44,7 @@ class Engine(ABC):
 
     name: ClassVar[str]  # as shown in rows
     precisions: ClassVar[tuple[Precision, ...]]
-    libraries: ClassVar[Names] = ()  # distributions that the constructor loads
+    libraries: ClassVar[Sequence[str]] = ()  # distributions that the constructor loads
 
     def __init__(self, precision: Precision = "fp32", calibration: Calibration = "frames") -> None:
         if precision not in self.precisions:
@@ -85,7 +84,7 @@ class Engine(ABC):
         """Number of frames whose inputs `build` needs. If it is 1, only their shapes are read."""
         return CALIBRATION if self.precision == "int8" and not self.uncalibrated else 1
 
-    def key(self) -> Json:
+    def key(self) -> Mapping[str, object]:
         """Everything that the built network depends on, besides the network and its inputs."""
         kind = type(self)
         return {

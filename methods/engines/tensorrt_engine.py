@@ -7,6 +7,7 @@ leave the bias in float32 (https://docs.nvidia.com/deeplearning/tensorrt, "Expli
 """
 
 import warnings
+from collections.abc import Mapping
 from copy import deepcopy
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +18,6 @@ import torch
 from torch import Tensor, nn
 
 from bench.errors import SteerbenchError, Unavailable
-from bench.kinds import Json, Values
 from bench.types import Log, SomeTensors
 from methods import engines
 from methods.engines import Built, Calibration, Engine, Folder, Precision, Samples
@@ -56,7 +56,7 @@ class TensorRt(Engine):
                 "device=cuda, and CUDA_VISIBLE_DEVICES to choose among several"
             )
 
-    def key(self) -> Json:
+    def key(self) -> Mapping[str, object]:
         """As of any engine, and the model of the GPU: plans are valid for one."""
         return {**super().key(), "gpu": torch.cuda.get_device_name()}
 
@@ -134,7 +134,7 @@ def _quantise(exported: Path, samples: SomeTensors, path: Path, *, uncalibrated:
     )
 
 
-def _fixed_ranges(prepared: Path) -> Values:
+def _fixed_ranges(prepared: Path) -> dict[str, Any]:
     """Options of the quantiser that set the ranges of `engines.largest`, whatever the samples
     contain. A tensor padded with zeros keeps its range."""
     import onnx

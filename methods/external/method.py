@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from bench.errors import SteerbenchError, explained, some, unexpected
-from bench.kinds import Json, Labels, Named, Size, Sizes, Texts, Values
+from bench.kinds import Size
 from bench.provenance import code_sha256, computed_by, files_at, sums_of
 from bench.records import read_record, without
 from bench.results import content_key
@@ -33,7 +33,7 @@ from methods.external.worker import Header, Worker
 
 WORKERS = Path(__file__).with_name("workers")  # those that come with steerbench
 
-UNTOLD: Values = {
+UNTOLD: dict[str, Any] = {
     **{"device": "cpu", "precision": "unknown", "memory": 0},
     **{"can": [], "knobs": {}, "files": [], "packages": {}},
 }
@@ -47,9 +47,9 @@ class External:
 
     command: str
     python: str | None
-    options: Named
+    options: Mapping[str, Any]
     files: list[str]
-    environment: Labels
+    environment: Mapping[str, str]
     lock: str | None
     folders: list[str]
     start_s: float
@@ -123,7 +123,7 @@ class External:
         return [*given, *words, *map(Path, self._about["files"])]
 
     @cached_property
-    def _packages(self) -> Json:
+    def _packages(self) -> Mapping[str, object]:
         """The versions of what its environment holds."""
         if self.lock is None:
             return self._about["packages"]
@@ -135,7 +135,7 @@ class External:
             raise SteerbenchError(f"method.lock: {self.lock}: {why}") from error
         return {"lock": done.stdout}
 
-    def settings(self) -> Texts:
+    def settings(self) -> dict[str, str]:
         """What rows show, and a hash of its environment for the key of a run."""
         device, precision = self._about["device"], self._about["precision"]
         if device != "cpu" and not (device.startswith("cuda") and torch.cuda.is_available()):
@@ -179,7 +179,7 @@ class External:
         if "load" in can:
             self._load({**job, "state": str(folder / "state")}, log)
 
-    def _load(self, job: Json, log: Log) -> None:
+    def _load(self, job: Mapping[str, object], log: Log) -> None:
         told, _ = self._worker.ask("load", self.start_s, job)
         for note in told.get("notes") or ():
             log.info(f"{self.name}: {note}")
@@ -190,7 +190,7 @@ class External:
         del self._worker
         self._worker.ask("settings", self.start_s, {"options": self.options})
 
-    def _key(self, job: Json) -> Json:
+    def _key(self, job: Mapping[str, object]) -> Mapping[str, object]:
         knobs = self._about["knobs"]
         return {
             **job,
@@ -206,7 +206,7 @@ class External:
             **computed_by(write_blender),
         }
 
-    def _train(self, folder: Path, job: Json, log: Log) -> float:
+    def _train(self, folder: Path, job: Mapping[str, object], log: Log) -> float:
         """Let it train on the scene as files, and put what it stores into `folder`; the seconds."""
         pictures = [
             {"file": picture_file("train", number), **self._described(camera)}
@@ -239,7 +239,7 @@ class External:
         write_sums(folder)
         return seconds
 
-    def _described(self, camera: Camera) -> Json:
+    def _described(self, camera: Camera) -> Mapping[str, object]:
         """A camera in scene units, as the protocol has it."""
         names = ("width", "height", "fx", "fy", "cx", "cy")
         pose = data_camera(self._scene, camera).c2w.tolist()
@@ -291,7 +291,7 @@ class External:
     def _expect(self, holds: bool, expected: str, got: object) -> None:
         self._worker.expect(holds, "render", expected, got)
 
-    def sizes(self) -> Sizes:
+    def sizes(self) -> dict[str, int]:
         """The bytes of its components. Asked last: what it has loaded meanwhile is known now."""
         told, _ = self._worker.ask("sizes", self.frame_s, {})
         sizes: Any = told.get("sizes")

@@ -6,17 +6,18 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from typing import Any
 
 import numpy as np
 import torch
 
 from bench.errors import SteerbenchError, Unavailable
-from bench.kinds import Json, Labels, Values, Words
+from bench.kinds import Words
 from steerbench_worker import VARIABLE, VERSION, Channel
 
-Header = Values
+Header = dict[str, Any]
 
 END_S = 10.0  # a process that has been told to close is killed after so many seconds
 
@@ -28,7 +29,7 @@ class Worker:
     Whatever it does wrong is one SteerbenchError with its name and its last words. It is killed
     then, and so are the processes that it has started."""
 
-    def __init__(self, command: Words, limit_s: float, variables: Labels) -> None:
+    def __init__(self, command: Words, limit_s: float, variables: Mapping[str, str]) -> None:
         self.name = command[-1]  # until it tells one
         self._output = tempfile.TemporaryFile()  # noqa: SIM115  it is closed by `_end`
         here, there = socket.socketpair()
@@ -65,7 +66,7 @@ class Worker:
         self,
         message: str,
         limit_s: float,
-        fields: Json | None = None,
+        fields: Mapping[str, object] | None = None,
         progress: Callable[[Header], object] | None = None,
     ) -> tuple[Header, dict[str, np.ndarray]]:
         """Send a message, unless `fields` are None; the header and the arrays of its answer. Before

@@ -7,7 +7,6 @@ from typing import Literal
 import torch
 
 from bench.cameras import place_camera
-from bench.kinds import Sizes, Texts
 from bench.provenance import computed_by
 from bench.study import Axis, Study, Variant, turned
 from bench.threads import torch_threads
@@ -102,9 +101,9 @@ class GaussianSplatting(OnField):
         with probe.stage("finish"):
             return FeatureFrame.of(camera, pixels, self.background).picture()
 
-    def sizes(self) -> Sizes:
+    def sizes(self) -> dict[str, int]:
         plain = sum(4 * x.numel() for x in self.gaussians.parameters())
         return {"gaussians": plain if self.stored == "fp32" else stored_bytes(self.gaussians)}
 
-    def settings(self) -> Texts:
+    def settings(self) -> dict[str, str]:
         return super().settings() | {"field_precision": "fp32"}

@@ -15,7 +15,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from bench.cameras import place_camera, scale_camera
-from bench.kinds import Numbers
 from bench.types import Camera, NullProbe, Scene, TwoTensors, composite
 from methods.gaussians.kernels.projection import covariances
 from methods.gaussians.kernels.ssim import ssim
@@ -94,7 +93,7 @@ class GaussianTraining(loop.Training):
         groups = [{"params": [parameter], "lr": rate} for parameter, rate in rates]
         return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
-    def advance(self) -> Numbers:
+    def advance(self) -> dict[str, float]:
         options = self.options
         gaussians = self.gaussians
         share = self.step / self.steps

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.kinds import Sizes
 from bench.types import Probe, TwoTensors
 from methods.kernels import multiplies_bf16
 from methods.kernels.encode import HashGrid, SampleGradients, collect, encode, pack
@@ -141,7 +140,7 @@ class HashField(nn.Module):
         probe.count("table_reads", 8 * self.grid.levels * samples)
         probe.count("products", density * samples + features * shaded)
 
-    def sizes(self) -> Sizes:
+    def sizes(self) -> dict[str, int]:
         """Bytes of table and networks at the precision at which they are read."""
         width = 2 if self.precision == "bf16" else 4
         networks = sum(layer.numel() for layer in self.layers.values())

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 import torch
 
 from bench.cameras import place_camera
-from bench.kinds import Sizes
 from bench.study import turned
 from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
@@ -50,5 +49,5 @@ class InstantNgp(OnField):
         render = everywhere(field, occupancy, probe, sampling)
         return render_frame(camera, occupancy, self.background, probe, render).picture()
 
-    def sizes(self) -> Sizes:
+    def sizes(self) -> dict[str, int]:
         return self.trained.sizes()

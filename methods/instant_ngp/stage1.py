@@ -1,12 +1,12 @@
 """The trained field of a scene: trained once and shared by every method that builds on it."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import torch
 
-from bench.kinds import Json, Sizes, Texts, Values
 from bench.provenance import computed_by
 from bench.study import Study, turned
 from bench.types import DEVICE, Budget, Log, Scene
@@ -69,7 +69,7 @@ class Setup:
         """Random numbers of the seed."""
         return torch.Generator(device).manual_seed(self.seed)
 
-    def settings(self, method: type) -> Texts:
+    def settings(self, method: type) -> dict[str, str]:
         """What a row of `method` shows of how it ran, of one without a 2D network."""
         multiplied = self.precision == "fp32" or multiplies_bf16(self.device.type)
         return {
@@ -85,7 +85,7 @@ class Setup:
         grid = self.grid.of(scene) if isinstance(self.grid, SuitedGrid) else self.grid
         return replace(self, grid=grid)
 
-    def key(self, scene: Scene, budget: Budget) -> Json:
+    def key(self, scene: Scene, budget: Budget) -> Mapping[str, object]:
         """Everything the trained field depends on."""
         march_step = self.training.sampling(budget).step / STEP
         return {
@@ -123,10 +123,10 @@ class OnField(Checked):
     def reset(self) -> None:
         """Do nothing: every frame stands alone."""
 
-    def settings(self) -> Texts:
+    def settings(self) -> dict[str, str]:
         return self.setup.settings(type(self))
 
-    def decided(self, scene: Scene) -> Values:
+    def decided(self, scene: Scene) -> dict[str, Any]:
         """What settings that are left to the scene become for it, by the names that one types."""
         return {"method.grid.log2_table": self.setup.suited(scene).grid.log2_table}
 
@@ -147,7 +147,7 @@ class TrainedField:
         """Where the field may hold matter."""
         return self.grid.occupancy
 
-    def sizes(self) -> Sizes:
+    def sizes(self) -> dict[str, int]:
         """Bytes of table, networks and occupancy bits."""
         return self.field.sizes() | {"occupancy": self.occupancy.cells.numel() // 8}
 

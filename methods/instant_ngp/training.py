@@ -9,7 +9,6 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from bench.kinds import Numbers
 from bench.types import Budget, Rays, Scene, SteerbenchError, TwoTensors
 from methods.instant_ngp.field import HashField
 from methods.instant_ngp.pixels import REFRESHED, ErrorMap, PixelBatches
@@ -121,7 +120,7 @@ class PixelTraining(loop.Training, ABC):
         """The learning rate of the next step."""
         return self.options.rate * loop.cosine(self.step / self.steps, self.options.final_rate)
 
-    def advance(self) -> Numbers:
+    def advance(self) -> dict[str, float]:
         numbers, alike = self._numbers()
         rays, colours = self.batches.at(numbers)
         target, background = self._target(colours)
@@ -199,7 +198,7 @@ class FieldTraining(PixelTraining):
         self.rays = options.rays or self.rays
         self.optimiser = FieldOptimiser(field)
 
-    def advance(self) -> Numbers:
+    def advance(self) -> dict[str, float]:
         if self.step % EVERY == 0:
             times = 4 if self.step < GRID_YOUTH_STEPS else 1
             self.grid.update(self.field, self.generator, times * self.options.grid_samples)

@@ -4,6 +4,7 @@ import difflib
 import importlib
 import importlib.util
 import os
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -13,14 +14,13 @@ from typing import Any
 import torch
 
 from bench.errors import Unavailable
-from bench.kinds import Names, Texts
 from bench.provenance import sources
 
 BACKENDS = ("reference", "cpu", "gpu")
 
 
 @cache
-def availability() -> Texts:
+def availability() -> dict[str, str]:
     """For each backend, "" if it can be used here, otherwise why not and how to get it."""
     reasons = dict.fromkeys(BACKENDS, "")
     if importlib.util.find_spec("triton") is None:
@@ -107,7 +107,7 @@ def _computing(kernel: str, backend: str, device: torch.device) -> str:
 
 
 @cache
-def served(kernel: str) -> Names:
+def served(kernel: str) -> Sequence[str]:
     """The backends that implement `kernel`, a package."""
     folder = Path(*importlib.import_module(kernel).__path__)
     return tuple(name for name in BACKENDS if (folder / f"{name}.py").exists())

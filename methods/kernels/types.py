@@ -6,7 +6,7 @@ An `Occupancy` says where samples may lie, `Samples` are `Intervals` on rays wit
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar, Self
@@ -16,7 +16,6 @@ from scipy.ndimage import distance_transform_cdt
 from torch import Tensor
 from torch.nn import functional
 
-from bench.kinds import Names
 from bench.types import Rays, SomeTensors, ThreeTensors, check_shape, rows
 
 BRICK = 4  # cells along the side of a brick; its 64 cells are one word of `Occupancy.words`
@@ -144,7 +143,7 @@ class Intervals:
     offsets: Tensor  # [R + 1] int64, ray r owns samples offsets[r] to offsets[r + 1]
     # Samples of the ray that has the most, or more than that; None: unknown, as `offsets` say.
     longest: int | None = field(default=None, kw_only=True)
-    of_a_sample: ClassVar[Names] = "t", "delta"  # what has a row for each sample
+    of_a_sample: ClassVar[Sequence[str]] = "t", "delta"  # what has a row for each sample
 
     def __len__(self) -> int:
         return len(self.t)
@@ -173,7 +172,7 @@ class Samples(Intervals):
     positions: Tensor  # [S, 3] in the unit cube
     resume: Tensor  # [R] int32, the step to resume from; -1 if the ray has no more samples
     encoded: Tensor | None = field(default=None, kw_only=True)  # [S, E] positions, by a field
-    of_a_sample: ClassVar[Names] = "t", "delta", "ray", "positions", "encoded"
+    of_a_sample: ClassVar[Sequence[str]] = "t", "delta", "ray", "positions", "encoded"
 
     def chosen(self, index: Tensor, offsets: Tensor, longest: int | None) -> Self:
         """As of `Intervals`, with no more to follow."""

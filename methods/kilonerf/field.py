@@ -7,7 +7,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.kinds import Sizes
 from bench.types import Probe, TwoTensors
 from methods.kernels.types import Occupancy, joined, offsets_of
 from methods.kilonerf.kernels.grouped_mlp import (
@@ -137,7 +136,7 @@ class KiloField(StudentField):
         density = sum(products[name] for name in ("in", "mid", "density"))
         probe.count("products", density * samples + (sum(products.values()) - density) * shaded)
 
-    def sizes(self) -> Sizes:
+    def sizes(self) -> dict[str, int]:
         """Bytes of the networks, and of the grid that holds their numbers."""
         parameters = sum(parameter.numel() for parameter in self.parameters())
         return {"networks": 4 * parameters, "network_grid": 2 * self.networks.numel()}

@@ -6,7 +6,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.kinds import Sizes
 from bench.types import Probe, TwoTensors
 from methods.instant_ngp.field import FieldPrecision
 from methods.kernels.corner_gather import CORNERS, corner_gather, trilinear
@@ -115,6 +114,6 @@ class NsvfField(NetworkField):
         probe.count("table_reads", CORNERS * samples)
         probe.count("products", density * samples + colour * shaded)
 
-    def sizes(self) -> Sizes:
+    def sizes(self) -> dict[str, int]:
         embeddings = self.embeddings.numel() * self.embeddings.element_size()
         return {"embeddings": embeddings, "network": super().sizes()["network"] - embeddings}

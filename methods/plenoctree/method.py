@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench.kinds import Sizes
 from bench.study import Axis, Study, Variant, turned
 from bench.types import Budget, Probe, Rays, Scene
 from methods.instant_ngp.pixels import PixelBatches
@@ -148,7 +147,7 @@ class PlenOctree(Student):
 
         return octree.occupancy, render
 
-    def sizes(self) -> Sizes:
+    def sizes(self) -> dict[str, int]:
         return self.octree.sizes(2 if self.stored == "fp16" else 4)
 
 

@@ -10,7 +10,6 @@ from typing import Annotated, Self
 import torch
 from torch import Tensor
 
-from bench.kinds import Sizes
 from bench.types import Rays, SteerbenchError
 from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import TrainedField
@@ -56,7 +55,7 @@ class Octree:
         voxels = Voxels(self.voxels.coordinates[shown], self.voxels.resolution)
         return replace(self, voxels=voxels, light=Light(density[shown], harmonics[shown]))
 
-    def sizes(self, width: int) -> Sizes:
+    def sizes(self, width: int) -> dict[str, int]:
         """Bytes of the values, `width` each, and of the index: a word for each brick of the cube;
         for each brick in use, a bit per leaf and the number of its first leaf."""
         values = self.light.density.numel() + self.light.harmonics.numel()

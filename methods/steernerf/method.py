@@ -7,7 +7,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from bench.kinds import Sizes, Texts
 from bench.provenance import digest
 from bench.study import Study, Variant, turned
 from bench.threads import torch_threads
@@ -130,10 +129,10 @@ class SteerNerf(OnField):
     def render(self, camera: Camera, probe: Probe) -> Frame:
         return self.pipeline.render(camera, self.buffer, self.rendering, probe)
 
-    def sizes(self) -> Sizes:
+    def sizes(self) -> dict[str, int]:
         return self.trained.sizes() | {"renderer2d": self.built.size}
 
-    def settings(self) -> Texts:
+    def settings(self) -> dict[str, str]:
         """Those of the field, with the engine and precision of the 2D renderer."""
         computed = self.engine.computed(self.setup.device)
         return super().settings() | {"engine": self.engine.name, "precision": computed}

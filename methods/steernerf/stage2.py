@@ -1,5 +1,6 @@
 """Stage 2: the 2D renderer and the field, trained together on patches (Section 3.4)."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 
@@ -7,7 +8,6 @@ import torch
 from torch.nn import functional
 
 from bench.errors import SteerbenchError
-from bench.kinds import Json, Numbers
 from bench.memory import MemoryMeter
 from bench.provenance import digest, libraries
 from bench.types import Budget, Log, Scene
@@ -38,7 +38,7 @@ class Stage2:
     renderer: partial[UNet]  # makes the 2D renderer for K, L and s
     joint: JointOptions  # how it is trained
 
-    def key(self, budget: Budget) -> Json:
+    def key(self, budget: Budget) -> Mapping[str, object]:
         """Everything that the training depends on, besides the field of stage 1."""
         return {
             "renderer_steps": budget.renderer_steps,
@@ -58,7 +58,7 @@ class Stage2:
 
 def train_stage2(
     trained: TrainedField, setup: Setup, stage2: Stage2, scene: Scene, budget: Budget, log: Log
-) -> tuple[Pipeline, Json, float, float]:
+) -> tuple[Pipeline, Mapping[str, object], float, float]:
     """Train `stage2` on the field that `setup` made for `scene`, or load the result of the same
     training. The field is widened to K features and changed in place. Returns the pipeline, the
     key of its weights, and the seconds and the peak memory of stage 2 up to them."""
@@ -121,7 +121,7 @@ class JointTraining(loop.Training):
         others = [x for x in parameters if x.dim() != 4]
         return {"adam": torch.optim.Adam(others, lr=rate, fused=True), "muon": Muon(weights, rate)}
 
-    def advance(self) -> Numbers:
+    def advance(self) -> dict[str, float]:
         """Take one step; return the error of the pictures. The density grid follows the field."""
         if self.trained and self.options.grid_samples and self.step % EVERY == 0:
             grid = self.trained.grid

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.kinds import Numbers, Sizes
 from bench.types import Budget, Log, Probe, Rays, Scene, TwoTensors
 from methods.instant_ngp.stage1 import TrainedField
 from methods.instant_ngp.training import PixelOptions, PixelTraining
@@ -57,7 +56,7 @@ class StudentField(nn.Module, Field):
         return next(self.parameters()).device
 
     @abstractmethod
-    def sizes(self) -> Sizes:
+    def sizes(self) -> dict[str, int]:
         """Bytes by component."""
 
 
@@ -96,7 +95,7 @@ class FieldStudent(Student):
     def renderer(self, probe: Probe) -> Renderer:
         return self.occupancy, everywhere(self.field, self.occupancy, probe, self.how)
 
-    def sizes(self) -> Sizes:
+    def sizes(self) -> dict[str, int]:
         return self.field.sizes() | {"occupancy": self.occupancy.cells.numel() // 8}
 
 
@@ -118,7 +117,7 @@ class StudentTraining(PixelTraining):
         parameters = self.field.parameters()
         self.optimiser = torch.optim.Adam(parameters, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
-    def advance(self) -> Numbers:
+    def advance(self) -> dict[str, float]:
         """Take one step; return its mean squared error, of opacities and colours or of pixels."""
         if self.step >= self.points_until:
             return super().advance()

@@ -1,6 +1,7 @@
 """A method whose model starts from a trained field, then learns from the photos."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import ClassVar
@@ -9,7 +10,6 @@ import torch
 
 from bench.cameras import place_camera
 from bench.errors import unexpected
-from bench.kinds import Labels, Names, Sizes, Texts
 from bench.provenance import computed_by
 from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
@@ -38,8 +38,8 @@ class Student(Checked, ABC):
 
     memory, train_s = 0, 0.0
     kind: ClassVar[str]  # name of its trained stage, for example "nerf"
-    model: ClassVar[Names] = ()  # its settings that its training depends on
-    computed: ClassVar[Labels] = {}  # what rows say of it but not of its teacher
+    model: ClassVar[Sequence[str]] = ()  # its settings that its training depends on
+    computed: ClassVar[Mapping[str, str]] = {}  # what rows say of it but not of its teacher
     contracts: ClassVar[bool] = True  # whether it can be trained in contracted space
     study = MARCHED
 
@@ -56,7 +56,7 @@ class Student(Checked, ABC):
         """The cells that may show anything, and what renders the pixels that may see them."""
 
     @abstractmethod
-    def sizes(self) -> Sizes:
+    def sizes(self) -> dict[str, int]:
         """Bytes of what is rendered, by component."""
 
     @torch.no_grad()
@@ -95,5 +95,5 @@ class Student(Checked, ABC):
     def reset(self) -> None:
         """Do nothing: every frame stands alone."""
 
-    def settings(self) -> Texts:
+    def settings(self) -> dict[str, str]:
         return {**self.teacher.settings(type(self)), **self.computed}

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.kinds import Sizes
 from bench.types import TwoTensors
 from methods.instant_ngp.field import FieldPrecision
 from methods.kernels import multiplies_bf16
@@ -96,7 +95,7 @@ class NetworkField(StudentField):
         pairs = zip(geometry.split(CHUNK), encoded.split(CHUNK), strict=True)
         return torch.cat([self.colours_together(*pair) for pair in pairs])
 
-    def sizes(self) -> Sizes:
+    def sizes(self) -> dict[str, int]:
         return {"network": sum(x.numel() * x.element_size() for x in self.parameters())}
 
 

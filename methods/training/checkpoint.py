@@ -13,7 +13,6 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from bench.errors import reason
-from bench.kinds import Numbers
 from bench.sharing import whole
 from bench.types import SteerbenchError
 from methods.kernels.adam import AdamState
@@ -35,7 +34,7 @@ def write(path: Path, tensors: Tensors, figures: Mapping[str, float]) -> None:
         raise SteerbenchError(f"{path}: cannot write the checkpoint: {error}") from error
 
 
-def read(path: Path) -> tuple[Tensors, Numbers]:
+def read(path: Path) -> tuple[Tensors, dict[str, float]]:
     """Read the tensors and figures of a file; raise `SteerbenchError` if it is damaged, or was not
     written by `write`."""
     try:

@@ -10,7 +10,6 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor
 
-from bench.kinds import Numbers
 from bench.memory import MemoryMeter
 from bench.provenance import digest
 from bench.sharing import missing
@@ -23,7 +22,7 @@ LOOK_EVERY = 10
 
 CHECKPOINT_S = 20.0  # seconds between checkpoints: the most that a killed training loses
 
-Asked = Callable[[], Numbers]
+Asked = Callable[[], dict[str, float]]
 """Tells the errors of a step, by label; the host waits if they have not arrived yet."""
 
 
@@ -109,7 +108,7 @@ def _drive(training: Training, finished: Path, label: str, log: Log) -> None:
         log.info(f"going on from step {training.step} of {unfinished}")
     saved = time.monotonic()
     began = saved - training.seconds
-    means: Numbers = {}
+    means: dict[str, float] = {}
     with log.progress(label, training.steps) as progress:
         progress.advance(training.step)
         while training.step < training.steps:
@@ -153,7 +152,7 @@ def load(training: Training, path: Path, done: bool = False) -> None:
         training.peak_bytes = figures["peak_bytes"]
 
 
-def look(training: Training, errors: Callable[[], Tensors], tensors: Tensors) -> Numbers:
+def look(training: Training, errors: Callable[[], Tensors], tensors: Tensors) -> dict[str, float]:
     """Return the `errors` of a step as numbers; raise `SteerbenchError` if one is not finite, with
     the names of the `tensors` that are not. On a GPU this happens every `LOOK_EVERY` steps, with
     the errors that were requested the time before, which have arrived meanwhile; in all other steps
@@ -180,7 +179,7 @@ def _ask(errors: Tensors) -> Asked:
     if together.device.type == "cuda":
         arrived = torch.cuda.current_stream(together.device).record_event()
 
-    def tell() -> Numbers:
+    def tell() -> dict[str, float]:
         if arrived is not None:
             arrived.synchronize()
         return dict(zip(labels, values.tolist(), strict=True))

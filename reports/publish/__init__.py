@@ -24,7 +24,6 @@ from markdown_it import MarkdownIt
 from PIL import Image
 
 from bench.errors import explained
-from bench.kinds import Texts, Values
 from bench.sharing import whole
 from reports.comparison import COST, shown_as, written
 from reports.images import ZOOM, ComparedFrame, Part, Picture, still_images
@@ -105,7 +104,7 @@ def html_page(parts: Sequence[Part], runs: Runs) -> str:
     `runs` are those whose keys occur in tables and marks.
     """
     origins = {run.key: _origin(run) for run in runs}
-    headings: Texts = {}
+    headings: dict[str, str] = {}
     return TEMPLATES.get_template("page.html").render(
         title=str(parts[0]).partition("\n")[0].lstrip("# "),
         parts=[_html(part, origins, headings) for part in parts],
@@ -115,7 +114,7 @@ def html_page(parts: Sequence[Part], runs: Runs) -> str:
     )
 
 
-def _origin(run: Run) -> Texts:
+def _origin(run: Run) -> dict[str, str]:
     line = Repeated(run.label, [run])
     figures = [
         f"{shown_as(metric).name} {written(line, metric)}"
@@ -132,7 +131,7 @@ def _origin(run: Run) -> Texts:
     }
 
 
-def _html(part: Part, origins: dict[str, Texts], headings: Texts) -> str:
+def _html(part: Part, origins: dict[str, dict[str, str]], headings: dict[str, str]) -> str:
     """A part of the page as HTML; adds its second-level headings to `headings`, by id."""
     match part:
         case Table():
@@ -194,7 +193,7 @@ def _uri(picture: np.ndarray) -> str:
     content = io.BytesIO()
     large = picture.shape[0] * picture.shape[1] > LOSSLESS_PIXELS
     quick = {"lossless": True, "method": 1}  # twice as fast as the default, 5 % larger
-    how: Values = {"quality": LOSSY_QUALITY} if large else quick
+    how: dict[str, Any] = {"quality": LOSSY_QUALITY} if large else quick
     Image.fromarray(picture).save(content, "webp", **how)
     return f"data:image/webp;base64,{base64.b64encode(content.getvalue()).decode()}"
 

@@ -6,11 +6,11 @@ A kernel is compiled by computing its cases, which covers all types of inputs.
 import argparse
 import os
 import sys
+from collections.abc import Sequence
 from concurrent.futures import as_completed
 from pathlib import Path
 
 from bench.console import ConsoleLog
-from bench.kinds import Names
 from methods import checks
 from methods.kernels.compilation import wrong_of
 from sweeps.overrides import composed, target_of
@@ -34,7 +34,7 @@ def main(options: argparse.Namespace) -> int:
     return int(bool(wrong))
 
 
-def needed(methods: Names) -> list[str]:
+def needed(methods: Sequence[str]) -> list[str]:
     """The modules of cases beside what the classes of `methods` import."""
     for method in methods:
         target_of(composed([f"method={method}"]).method)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
 from bench.errors import reason
-from bench.kinds import Labels, Texts, Words
+from bench.kinds import Words
 from sweeps.hydra_runs import run_hydra
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def _finish(ended: Sequence[tuple[Job, Ended]], form: str | None) -> None:
     from reports.runs import grouped, load_runs
     from sweeps.terminal import say_missing, write_page
 
-    def of(jobs: Sequence[tuple[Job, Ended]]) -> tuple[list[str], Texts]:
+    def of(jobs: Sequence[tuple[Job, Ended]]) -> tuple[list[str], dict[str, str]]:
         """Keys of the runs, equal ones once, and reasons of failed jobs by name."""
         failed = {job.name: reason(end.error) for job, end in jobs if end.error}
         return list(dict.fromkeys(end.run for _, end in jobs if end.run)), failed
@@ -73,7 +73,7 @@ def _finish(ended: Sequence[tuple[Job, Ended]], form: str | None) -> None:
         write_page(report, store, *of(some))
 
 
-def _show(runs: Runs, failed: Labels, form: str | None) -> None:
+def _show(runs: Runs, failed: Mapping[str, str], form: str | None) -> None:
     from reports.comparison import columns_of, comparison
     from reports.lines import as_lines, seedless
     from sweeps.terminal import note, show

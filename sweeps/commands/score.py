@@ -12,7 +12,6 @@ from bench import pictures as given
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, unknown
 from bench.isolation import as_begun
-from bench.kinds import AnyPath
 from bench.provenance import digest, libraries
 from bench.results import REPORTED, Store
 from reports.runs import Run, load_runs
@@ -33,13 +32,13 @@ def main(options: argparse.Namespace) -> int:
 
 @as_begun()
 def score(
-    pictures: AnyPath,
-    truth: AnyPath | None = None,
+    pictures: str | Path,
+    truth: str | Path | None = None,
     *settings: str,
     name: str | None = None,
     match: given.Match = "name",
     sequence: bool = False,
-    times: AnyPath | None = None,
+    times: str | Path | None = None,
 ) -> Run:
     """Score a folder of pictures as `steerbench score` does: against the folder `truth` or, without
     it, the split of the scene in `settings`, which are those of `steerbench run`.

@@ -23,7 +23,7 @@ from torch.nn import functional
 from bench.cameras import pack_camera
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, optional
-from bench.kinds import Names, Words
+from bench.kinds import Words
 from bench.metrics import as_bytes, psnr
 from bench.paths import write_path
 from bench.study import study_of
@@ -277,7 +277,9 @@ def _same(one: Camera, other: Camera) -> bool:
     return torch.equal(pack_camera(one), pack_camera(other))
 
 
-def _figures(painter: Painter, drawn: Sequence[Drawn], truth: Tensor | None, sides: Names) -> str:
+def _figures(
+    painter: Painter, drawn: Sequence[Drawn], truth: Tensor | None, sides: Sequence[str]
+) -> str:
     lines = []
     for side, method, picture in zip(sides, painter.methods, drawn, strict=False):
         quality = "" if truth is None else f", {psnr(picture.rgb, truth):.2f} dB"

@@ -15,7 +15,6 @@ from PIL import Image
 from torch import Tensor
 
 from bench.cameras import look_at, move_camera
-from bench.kinds import AnyPath
 from bench.provenance import digest
 from bench.scenes import blender
 from bench.scenes.embedded.models import MODELS
@@ -41,7 +40,7 @@ def load(
     downscale: int = 1,
     background: str = "white",
     bounds: str | list = "auto",
-    root: AnyPath = "outputs/scenes",  # holds a folder for each scene
+    root: str | Path = "outputs/scenes",  # holds a folder for each scene
     log: Log,
 ) -> Scene:
     """Read an embedded scene; write it first if it does not exist yet.

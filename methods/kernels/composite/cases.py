@@ -20,7 +20,6 @@ from bench.case import (
     on_backends,
     placed,
 )
-from bench.kinds import Values
 from methods.kernels.composite import Visibility, composite, visibility
 from methods.kernels.dispatch import served
 from methods.kernels.types import Intervals, Pixels, offsets_of
@@ -29,7 +28,7 @@ INF = math.inf
 
 DEPTH = 2.0  # largest t of the samples; values and gradients of pixels are at most 1
 
-KINDS: dict[str, Values] = {
+KINDS: dict[str, dict[str, Any]] = {
     "no ray": {"rays": 0, "most": 0},
     "rays without samples": {"rays": 5, "most": 0},
     "one sample a ray": {"rays": 7, "most": 1},

@@ -11,7 +11,6 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from bench.case import U32, Bound, Case, Cases, Operation, Property, Random, placed
-from bench.kinds import Values
 from bench.types import Rays
 from methods.kernels.dispatch import served
 from methods.kernels.march import LEAST_STEP, MAX_SAMPLES, march
@@ -148,7 +147,7 @@ def _agreements() -> Cases:
     near = random.share(129)
     everywhere = torch.tensor([-torch.inf, torch.inf]).expand(129, 2)
     start = random.whole(-1, 100, 129).int()
-    kinds: dict[str, tuple[Rays, str, Values]] = {
+    kinds: dict[str, tuple[Rays, str, dict[str, Any]]] = {
         "no ray": (some_rays(0), "dust", {}),
         "one ray": (some_rays(1), "dust", {}),
         "inside and outside": (some_rays(129), "dust", {}),

@@ -6,6 +6,7 @@ the exit from a voxel and the entry into its neighbour have exactly the same t. 
 determined by the planes that it has crossed, so that every backend finds the same segments.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
@@ -13,7 +14,6 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from bench.kinds import Names
 from bench.types import Rays, check_shape
 from methods.kernels.dispatch import implementation
 from methods.kernels.types import Intervals, check_rays, clearance, expect
@@ -88,7 +88,7 @@ class Crossings(Intervals):
     far: Tensor  # [S] t where it leaves; for touching voxels it equals `near` of the next one
     ray: Tensor  # [S] int32, the ray that a crossing belongs to
     voxel: Tensor  # [S] int32 row of `Voxels.coordinates`
-    of_a_sample: ClassVar[Names] = "t", "delta", "near", "far", "ray", "voxel"
+    of_a_sample: ClassVar[Sequence[str]] = "t", "delta", "near", "far", "ray", "voxel"
 
 
 def walk(rays: Rays, voxels: Voxels, *, backend: str = "auto") -> Crossings:

@@ -4,11 +4,11 @@ voxel; rays that hit faces, edges and corners, or come from far."""
 import math
 from collections.abc import Iterator
 from functools import partial
+from typing import Any
 
 import torch
 
 from bench.case import Bound, Case, Cases, Given, Operation, Property, Random, on_backends, placed
-from bench.kinds import Values
 from bench.types import Rays
 from methods.kernels.dispatch import served
 from methods.kernels.march.cases import SPECIAL, cells, slab_lengths, some_rays, special_rays
@@ -28,7 +28,7 @@ def cases() -> Cases:
 
 
 def _agreements() -> Iterator[Case]:
-    kinds: dict[str, Values] = {
+    kinds: dict[str, dict[str, Any]] = {
         "no ray": {"count": 0},
         "one ray": {"count": 1},
         "inside and outside": {},

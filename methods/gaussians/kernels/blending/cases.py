@@ -18,7 +18,6 @@ from bench.case import (
     on_backends,
     placed,
 )
-from bench.kinds import Values
 from methods.gaussians.kernels.blending import LARGEST_ALPHA, blend
 from methods.gaussians.kernels.projection import LEAST_ALPHA, Ellipses
 from methods.kernels.composite import STOP
@@ -98,7 +97,7 @@ def draw(count: int, width: int, height: int, size: int = 1, stop: float = 0.0) 
     conics = torch.stack((variances[:, 1], -tilt, variances[:, 0]), dim=1) / area[:, None]
     opacities = 0.9 * rand(count)
     reach = 2 * (opacities / LEAST_ALPHA).clamp(min=1).log()
-    drawn: Values = {
+    drawn: dict[str, Any] = {
         "centres": centres,
         "conics": conics,
         "depth": 1 + rand(count),

@@ -21,7 +21,6 @@ from bench.case import (
     placed,
 )
 from bench.cases import CAMERAS
-from bench.kinds import Numbers
 from bench.types import Camera
 from methods.gaussians.kernels.projection import (
     BLUR,
@@ -124,7 +123,7 @@ def _slopes_error(backend: str, device: str, precision: str) -> float:
     return largest_error(got, (exact / width, conics, z, extents / width))
 
 
-HIDDEN: dict[str, Numbers] = {
+HIDDEN: dict[str, dict[str, float]] = {
     "behind the camera": {"depth": -1.0},
     "at the camera": {"depth": 0.0},
     "too faint": {"opacity": LEAST_ALPHA / 2},
@@ -135,7 +134,7 @@ HIDDEN: dict[str, Numbers] = {
 }
 
 
-def _shown(changed: Numbers, backend: str, device: str, precision: str) -> float:
+def _shown(changed: dict[str, float], backend: str, device: str, precision: str) -> float:
     """How many numbers are shown, or have a gradient that is not finite."""
     depth = changed.get("depth", 1.0)
     shape = {
