@@ -316,10 +316,10 @@ def check_unchanged(loaded: Collection[str], *things: Any) -> None:
                 yield name
 
     late = sorted(foreign(sys.modules.keys() - loaded))
-    of_others = {str(path) for name, path in files.items() if name.partition("/")[0] not in OURS}
-    used = sorted(foreign(_used_by(of_others)))
+    modules = _modules_of_others(files)
+    used = sorted(foreign(_used_by(modules)))
     unknown = [*late, *used]
-    if changed := _patched(of_others):
+    if changed := _patched(modules):
         raise SteerbenchError(f"{changed} was replaced by code that no key holds: start again")
     if unknown:
         file = sys.modules[unknown[0]].__file__
@@ -332,14 +332,20 @@ def check_unchanged(loaded: Collection[str], *things: Any) -> None:
         )
 
 
-def _used_by(files: Collection[str]) -> set[str]:
-    """The names of the modules whose things the modules in `files` have as global names."""
+def _modules_of_others(files: Mapping[str, Path]) -> list[ModuleType]:
+    """The loaded modules of others among `sources`."""
+    others = {str(path) for name, path in files.items() if name.partition("/")[0] not in OURS}
+    loaded = list(sys.modules.values())
+    return [module for module in loaded if getattr(module, "__file__", None) in others]
+
+
+def _used_by(modules: Iterable[ModuleType]) -> set[str]:
+    """The names of the modules whose things `modules` have as global names."""
     names: set[str] = set()
-    for module in list(sys.modules.values()):
-        if getattr(module, "__file__", None) in files:
-            for thing in vars(module).values():
-                name = thing.__name__ if isinstance(thing, ModuleType) else None
-                names.add(str(name or getattr(thing, "__module__", None)))
+    for module in modules:
+        for thing in vars(module).values():
+            name = thing.__name__ if isinstance(thing, ModuleType) else None
+            names.add(str(name or getattr(thing, "__module__", None)))
     return names - {"__main__"}
 
 
@@ -350,14 +356,11 @@ FIRST_SEEN: WeakKeyDictionary[ModuleType, dict[str, object]] = WeakKeyDictionary
 def left_behind(*things: Any) -> list[str]:
     """What modules and classes of others among the `sources` of `things` hold that is not as this
     process found it: a run before has left it there, where it may change this one."""
-    files = sources(*things).items()
-    of_others = {str(path) for name, path in files if name.partition("/")[0] not in OURS}
     found: list[str] = []
-    for module in list(sys.modules.values()):
-        if getattr(module, "__file__", None) in of_others:
-            now = _state_of(module, module.__name__)
-            then = FIRST_SEEN.setdefault(module, now)
-            found += (name for name in now | then if now.get(name) != then.get(name))
+    for module in _modules_of_others(sources(*things)):
+        now = _state_of(module, module.__name__)
+        then = FIRST_SEEN.setdefault(module, now)
+        found += (name for name in now | then if now.get(name) != then.get(name))
     return sorted(found)
 
 
@@ -379,15 +382,14 @@ def _state_of(owner: Any, place: str) -> dict[str, object]:
     return held
 
 
-def _patched(files: Collection[str]) -> str:
-    """The name of a method, of a class in `files`, whose function a notebook or a script made."""
-    for module in list(sys.modules.values()):
-        if getattr(module, "__file__", None) in files:
-            for name, thing in vars(module).items():
-                members = vars(thing) if isinstance(thing, type) else {}
-                for member, value in members.items():
-                    if isinstance(value, FunctionType) and value.__module__ == "__main__":
-                        return f"{name}.{member}"
+def _patched(modules: Iterable[ModuleType]) -> str:
+    """The name of a method, of a class in `modules`, whose function a notebook or a script made."""
+    for module in modules:
+        for name, thing in vars(module).items():
+            members = vars(thing) if isinstance(thing, type) else {}
+            for member, value in members.items():
+                if isinstance(value, FunctionType) and value.__module__ == "__main__":
+                    return f"{name}.{member}"
     return ""
 
 
